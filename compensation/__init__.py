@@ -1,0 +1,1 @@
+"""Offline: marker centres, drift models, validation and the report, from recorded sessions only."""

@@ -1,0 +1,1 @@
+"""Everything that touches a device; the fake devices live in drivers.sim."""

@@ -1,0 +1,144 @@
+"""The one place that reads time or sleeps.
+
+An instant is an int, ns since the epoch; a duration is a float of seconds. Physics, poll periods, soaks and experiment
+time-outs run on a Clock; wire time-outs are real seconds and never do. Mixing the two is the classic trap: a 1 s
+Modbus time-out at x1000 is 1 ms.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+import time
+from collections.abc import Awaitable, Callable, Generator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Protocol
+
+NS_PER_S = 1_000_000_000
+
+# Loop turns without a hold before virtual time may move: a woken coroutine needs one turn to run, and a hand-over
+# through a queue or an event one more each; tests/drivers/test_clock.py chains four of them.
+QUIET_TURNS = 6
+
+
+class Clock(Protocol):
+    """Time as the stand sees it."""
+
+    def now_ns(self) -> int:
+        """ns since the epoch; never goes back."""
+        ...
+
+    async def sleep_until(self, time_ns: int) -> None:
+        """Return at or after `time_ns`; at once when it has passed."""
+        ...
+
+    def hold(self) -> AbstractContextManager[None]:
+        """Virtual time stands still inside: a transaction, a grab, a commit is under way."""
+        ...
+
+
+def seconds_ns(duration_s: float) -> int:
+    """A duration in s as a whole number of ns."""
+    return round(duration_s * NS_PER_S)
+
+
+class WallClock:
+    """The host's clock: the epoch read once, then the monotonic counter, so that a step of the host's time is not
+    a step of ours."""
+
+    def __init__(self) -> None:
+        self._epoch_ns = time.time_ns() - time.monotonic_ns()  # noqa: TID251 - the one place that reads time
+
+    def now_ns(self) -> int:
+        """ns since the epoch."""
+        return self._epoch_ns + time.monotonic_ns()
+
+    async def sleep_until(self, time_ns: int) -> None:
+        """Sleep to an absolute deadline."""
+        await asyncio.sleep(max(0, time_ns - self.now_ns()) / NS_PER_S)
+
+    def hold(self) -> AbstractContextManager[None]:
+        """Real time cannot be held."""
+        return nullcontext()
+
+
+class FollowedClock:
+    """The simulator's end of virtual time: it stands where the daemon last put it."""
+
+    def __init__(self, start_ns: int) -> None:
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """The last time it was told."""
+        return self._now_ns
+
+    def follow(self, time_ns: int) -> None:
+        """Move to `time_ns`; ValueError when that would go back."""
+        if time_ns < self._now_ns:
+            raise ValueError(f"time cannot go back from {self._now_ns} to {time_ns}")
+        self._now_ns = time_ns
+
+
+class VirtualClock:
+    """Time that jumps to the earliest sleeper as soon as nobody holds it.
+
+    Sleepers are woken one at a time, in order of (deadline, order of going to sleep), each only after all that the
+    one before set in motion has come to rest. So a run is repeatable to the byte, however the host schedules threads.
+    Before time moves, `advance(time_ns)` tells the simulator and waits for its answer.
+    """
+
+    def __init__(self, start_ns: int, advance: Callable[[int], Awaitable[None]] | None = None) -> None:
+        self._now_ns = start_ns
+        self._advance = advance
+        self._holds = 0
+        self._sleepers: list[tuple[int, int, asyncio.Future[None]]] = []
+        self._order = itertools.count()
+        self._changed = asyncio.Event()
+
+    def now_ns(self) -> int:
+        """The present virtual instant."""
+        return self._now_ns
+
+    async def sleep_until(self, time_ns: int) -> None:
+        """Wait for virtual time to reach `time_ns`; even a past deadline takes its turn."""
+        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._sleepers, (max(time_ns, self._now_ns), next(self._order), future))
+        self._changed.set()
+        await future
+
+    @contextmanager
+    def hold(self) -> Generator[None]:
+        """Virtual time stands still inside."""
+        self._holds += 1
+        try:
+            yield
+        finally:
+            self._holds -= 1
+            self._changed.set()
+
+    async def run(self) -> None:
+        """Drive time until cancelled; run it as a task beside whatever sleeps on this clock."""
+        while True:
+            await self._quiet()
+            deadline_ns, _, future = heapq.heappop(self._sleepers)
+            if future.done():  # cancelled while asleep
+                continue
+            if deadline_ns > self._now_ns:
+                if self._advance is not None:
+                    await self._advance(deadline_ns)
+                self._now_ns = deadline_ns
+            if not future.done():
+                future.set_result(None)
+
+    async def _quiet(self) -> None:
+        """Return when someone sleeps, nobody holds, and it has been so for QUIET_TURNS turns of the loop."""
+        quiet_turns = 0
+        while quiet_turns < QUIET_TURNS:
+            if self._holds or not self._sleepers:
+                quiet_turns = 0
+                self._changed.clear()
+                await self._changed.wait()
+            else:
+                quiet_turns += 1
+                await asyncio.sleep(0)

@@ -1,0 +1,110 @@
+"""Ends of a wire for byte-protocol fakes: a pseudo-terminal behind a path, or a TCP port; no protocol here.
+
+An engine is made per connection and has one method, `feed(data) -> bytes`: bytes in, reply bytes out, state kept in
+between. Wire time is real time; what a reply says comes from the plant at the simulated time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import threading
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from drivers.sim.faults import LinkFaults
+
+
+class Engine(Protocol):
+    """One protocol conversation."""
+
+    def feed(self, data: bytes) -> bytes:
+        """Take bytes as they came; return what to send back now, b"" for nothing."""
+        ...
+
+
+class PtyWire:
+    """A serial port: `path` becomes a symlink to a fresh pseudo-terminal in raw mode; replug by making a new one."""
+
+    def __init__(self, path: Path, engine: Engine, faults: LinkFaults) -> None:
+        self._path = path
+        self._engine = engine
+        self._faults = faults
+        self._master, self._slave = os.openpty()  # the slave stays open, or reads fail while no driver is connected
+        tty.setraw(self._slave)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(self._slave))
+        self._stop_read, self._stop_write = os.pipe()
+        self._thread = threading.Thread(target=self._serve, name=f"pty {path.name}", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            ready, _, _ = select.select([self._master, self._stop_read], [], [])
+            if self._stop_read in ready:
+                return
+            try:
+                request = os.read(self._master, 4096)
+            except OSError:
+                return
+            for piece in self._faults.apply(request, self._engine.feed(request)):
+                os.write(self._master, piece)
+
+    def close(self) -> None:
+        """Unplug: the symlink goes and an open driver gets an I/O error."""
+        with contextlib.suppress(OSError):
+            os.write(self._stop_write, b"x")
+        self._thread.join()
+        self._path.unlink(missing_ok=True)
+        for descriptor in (self._master, self._slave, self._stop_read, self._stop_write):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+class TcpWire:
+    """A TCP server; every connection gets its own engine from `make_engine`."""
+
+    def __init__(self, host: str, port: int, make_engine: Callable[[], Engine], faults: LinkFaults) -> None:
+        self._make_engine = make_engine
+        self._faults = faults
+        self._server = socket.create_server((host, port))
+        self.port: int = self._server.getsockname()[1]
+        self._connections: set[socket.socket] = set()
+        self._lock = threading.Lock()
+        threading.Thread(target=self._accept, name=f"tcp {self.port}", daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = self._server.accept()
+            except OSError:
+                return
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with self._lock:
+                self._connections.add(connection)
+            threading.Thread(target=self._serve, args=(connection,), name=f"tcp {self.port}", daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        engine = self._make_engine()
+        with contextlib.suppress(OSError), connection:
+            while request := connection.recv(65536):
+                for piece in self._faults.apply(request, engine.feed(request)):
+                    connection.sendall(piece)
+        with self._lock:
+            self._connections.discard(connection)
+
+    def close(self) -> None:
+        """Stop listening and drop every connection."""
+        with contextlib.suppress(OSError):
+            self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)

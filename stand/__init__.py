@@ -1,0 +1,1 @@
+"""The daemon: hub, guard, scheduler, recorder, sessions and the command line."""

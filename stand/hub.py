@@ -1,0 +1,79 @@
+"""Where every reading, frame, event and step mark passes once: publish, latest, subscribe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from drivers.interface import Frame, Reading
+
+
+class StepState(StrEnum):
+    """Where a step of the plan is."""
+
+    STARTED = "started"
+    DONE = "done"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class StepMark:
+    """A step of the plan began or ended. `parameters` are the step's own fields as JSON-able values."""
+
+    time_ns: int
+    step_id: str
+    index: int
+    kind: str
+    state: StepState
+    parameters: dict[str, object] = field(default_factory=dict[str, object])
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something worth knowing later: a fault, a gap, a trip, the end of a run. level: info, warning or error."""
+
+    time_ns: int
+    level: str
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What one poll of one device gave, together."""
+
+    device: str
+    time_ns: int
+    readings: tuple[Reading, ...]
+
+
+Item = Batch | Frame | Event | StepMark
+Subscriber = Callable[[Item], None]
+
+
+class Hub:
+    """Keeps the latest reading of each channel and hands each item to every subscriber, in order of subscription.
+
+    Subscribers must return at once (enqueue, count, compare); whoever does slow work has a queue of its own.
+    """
+
+    def __init__(self) -> None:
+        self._latest: dict[str, Reading] = {}
+        self._subscribers: list[Subscriber] = []
+
+    def subscribe(self, subscriber: Subscriber) -> None:
+        """Call `subscriber(item)` for every item published from now on."""
+        self._subscribers.append(subscriber)
+
+    def publish(self, item: Item) -> None:
+        """Remember the readings of a batch, then hand the item on."""
+        if isinstance(item, Batch):
+            for reading in item.readings:
+                self._latest[reading.channel] = reading
+        for subscriber in self._subscribers:
+            subscriber(item)
+
+    def latest(self, channel: str) -> Reading | None:
+        """The last reading of `channel`, or None when there was none yet."""
+        return self._latest.get(channel)
