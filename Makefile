@@ -1,0 +1,39 @@
+# Two commands do everything: `make demo` and `make test`; each sets up what is missing first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
+PEER_PACKAGES := aravis-tools-cli aravis-tools
+
+.PHONY: setup demo test nightly bench clean
+
+setup: $(VENV)/installed
+	@sh .ci/system-packages $(RUNTIME_PACKAGES)
+
+demo: setup
+	$(BIN)/stand demo
+
+test: setup
+	@sh .ci/system-packages $(PEER_PACKAGES)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest
+
+nightly: setup
+	@sh .ci/system-packages $(PEER_PACKAGES)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m nightly
+
+bench: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.bench
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "thermostand needs Python 3.11 or newer; name it with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || sh .ci/system-packages python3-venv
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,peers]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) demo run

@@ -1,0 +1,62 @@
+"""The simulator's control socket: time, truth and faults. One JSON object a line in, one out.
+
+    {"do": "advance", "now_ns": N}              -> {"now_ns": N}       virtual time moves to N
+    {"do": "state"}                             -> {"air_degC": ...}   the plant's true state
+    {"do": "optics"}                            -> {"centres_px": [[x, y], ...]}   noise-free marker centres
+    {"do": "fault", "name": S, "value": V}      -> {"name": S}         one of drivers.sim.laboratory.FAULTS
+
+Anything wrong is answered with {"error": sentence}.
+"""
+
+from __future__ import annotations
+
+import json
+
+from drivers.sim.faults import LinkFaults
+from drivers.sim.laboratory import FAULTS, Laboratory
+from drivers.sim.wire import TcpWire
+
+
+class ControlEngine:
+    """One control conversation."""
+
+    def __init__(self, laboratory: Laboratory) -> None:
+        self._laboratory = laboratory
+        self._pending = b""
+
+    def feed(self, data: bytes) -> bytes:
+        """Answer every complete line."""
+        *lines, self._pending = (self._pending + data).split(b"\n")
+        return b"".join(json.dumps(self._answer(line)).encode() + b"\n" for line in lines)
+
+    def _answer(self, line: bytes) -> dict[str, object]:
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise ValueError(f"expected an object, got {line[:80]!r}")
+            return self._perform({str(key): value for key, value in request.items()})
+        except (ValueError, KeyError, TypeError) as error:
+            return {"error": f"{type(error).__name__}: {error}"}
+
+    def _perform(self, request: dict[str, object]) -> dict[str, object]:
+        match request:
+            case {"do": "advance", "now_ns": int(now_ns)}:
+                self._laboratory.advance(now_ns)
+                return {"now_ns": now_ns}
+            case {"do": "state"}:
+                return dict(self._laboratory.state())
+            case {"do": "optics"}:
+                return {"centres_px": self._laboratory.true_centres_px()}
+            case {"do": "fault", "name": str(name), "value": value}:
+                if name not in FAULTS:
+                    raise ValueError(f"no fault {name!r}; there are {', '.join(sorted(FAULTS))}")
+                self._laboratory.inject(name, value)
+                return {"name": name}
+            case _:
+                raise ValueError(f"cannot understand {request}")
+
+
+def serve_control(laboratory: Laboratory) -> TcpWire:
+    """Listen on the laboratory's control address."""
+    host, port = laboratory.spec.control.removeprefix("tcp:").rsplit(":", 1)
+    return TcpWire(host, int(port), lambda: ControlEngine(laboratory), LinkFaults())

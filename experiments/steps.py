@@ -1,0 +1,140 @@
+"""The steps a plan is made of: data, not code. What performs them is the stand; what orders them, the scheduler.
+
+Every step has a stable id (position and parameters), so that a plan can be listed, priced, checked and, after an
+interruption, walked again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+
+
+class Role(StrEnum):
+    """What a capture is for; the fitter never sees VALIDATION frames, the validation never scores FIT frames."""
+
+    REFERENCE = "reference"
+    FIT = "fit"
+    VALIDATION = "validation"
+    WARM_UP = "warm_up"
+
+
+@dataclass(frozen=True, slots=True)
+class StartChamber:
+    """Give heat its permission and set the regulator running at `chamber_degC`."""
+
+    chamber_degC: float
+
+
+@dataclass(frozen=True, slots=True)
+class SetTemperature:
+    """A new chamber set-point; the next soak waits for what it does."""
+
+    chamber_degC: float
+
+
+@dataclass(frozen=True, slots=True)
+class StopChamber:
+    """Stop the regulator and withdraw the permission to heat and cool."""
+
+
+@dataclass(frozen=True, slots=True)
+class Soak:
+    """Let the camera come to equilibrium for `duration_s` from now."""
+
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class OpenFlap:
+    """Open the inspection flap and confirm it."""
+
+
+@dataclass(frozen=True, slots=True)
+class CloseFlap:
+    """Close the inspection flap and confirm it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """`frames` images, one every `interval_s`, each exposed for `exposure_s`; `chamber_degC` labels the set-point."""
+
+    frames: int
+    interval_s: float
+    exposure_s: float
+    role: Role
+    chamber_degC: float
+
+
+@dataclass(frozen=True, slots=True)
+class MoveTo:
+    """Move the axis named `axis` to `position` (mm or deg), approached from below."""
+
+    axis: str
+    position: float
+
+
+@dataclass(frozen=True, slots=True)
+class PowerCamera:
+    """Switch the camera's supply; switching on also waits until the camera answers."""
+
+    on: bool
+
+
+Step = StartChamber | SetTemperature | StopChamber | Soak | OpenFlap | CloseFlap | Capture | MoveTo | PowerCamera
+
+# What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves, camera boot.
+_FLAP_S = 3.0
+_MOVE_S = 15.0
+_CAMERA_BOOT_S = 5.0
+
+
+def estimate_s(step: Step) -> float:
+    """How long the step is expected to take on the stand's clock, s."""
+    match step:
+        case Soak():
+            return step.duration_s
+        case Capture():
+            return (step.frames - 1) * step.interval_s + step.exposure_s
+        case OpenFlap() | CloseFlap():
+            return _FLAP_S
+        case MoveTo():
+            return _MOVE_S
+        case PowerCamera():
+            return _CAMERA_BOOT_S if step.on else 0.0
+        case StartChamber() | SetTemperature() | StopChamber():
+            return 0.0
+
+
+def frames_of(step: Step) -> int:
+    """How many frames the step will record."""
+    return step.frames if isinstance(step, Capture) else 0
+
+
+def kind_of(step: Step) -> str:
+    """The step's name as recordings and listings show it."""
+    return type(step).__name__
+
+
+def parameters_of(step: Step) -> dict[str, object]:
+    """The step's fields as JSON-able values."""
+    return {name: str(value) if isinstance(value, Role) else value for name, value in asdict(step).items()}
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStep:
+    """A step at its place in the plan. `step_id` stays the same as long as place and parameters do."""
+
+    index: int
+    step_id: str
+    step: Step
+
+
+def number_steps(steps: Iterable[Step]) -> Iterator[PlannedStep]:
+    """Give each step its place (from 0) and its id."""
+    for index, step in enumerate(steps):
+        text = json.dumps([index, kind_of(step), parameters_of(step)], sort_keys=True)
+        yield PlannedStep(index, hashlib.sha256(text.encode()).hexdigest()[:12], step)

@@ -1,0 +1,158 @@
+"""The composition root: configuration -> devices, stand, guard and pollers, wired to one hub and one clock."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+import usb.backend
+
+from drivers.bus import Bus, LineSettings
+from drivers.camera import Camera, CameraSettings, TemperatureFeature
+from drivers.clock import Clock
+from drivers.flap import Flap, FlapSettings
+from drivers.interface import ConfigError, Sensor
+from drivers.registers import load_register_map
+from drivers.regulator import Regulator
+from drivers.relays import Relays
+from drivers.stage import Axis, AxisSettings
+from drivers.thermometers import ThermometerChannel, Thermometers
+from stand.compressor import CompressorLimits
+from stand.config import StandConfig, packaged
+from stand.guard import Guard
+from stand.hub import Hub
+from stand.interlocks import Fault, safety_rules
+from stand.poller import Poller
+from stand.stand import Devices, Limits, Stand
+
+
+@dataclass(frozen=True, slots=True)
+class Assembly:
+    """A stand with everything around it, not yet opened."""
+
+    config: StandConfig
+    hub: Hub
+    clock: Clock
+    bus: Bus
+    devices: Devices
+    stand: Stand
+
+    def pollers(self) -> tuple[Poller, ...]:
+        """One per device, in the order in which they are read when several are due at one instant."""
+        config, devices = self.config, self.devices
+        timed: list[tuple[Sensor, float]] = [
+            (devices.regulator, config.regulator.poll_s),
+            (devices.thermometers, config.thermometers.poll_s),
+            (devices.relays, config.relays.poll_s),
+            (devices.camera, config.camera.poll_s),
+            (devices.flap, config.flap.poll_s),
+            *((devices.axes[name], axis.poll_s) for name, axis in config.axes.items()),
+        ]
+        return tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
+
+    def guard(self, abort: Callable[[Fault], None]) -> Guard:
+        """The guard with the configured limits. The camera's own temperature may be missing (it is switched off before
+        a warm-up), so it is limited but not required."""
+        limits = self.config.guard
+        rules = safety_rules(
+            {
+                "regulator.pv": limits.max_air_degC,
+                "thermometers.air": limits.max_air_degC,
+                "thermometers.granite_inside": limits.max_granite_degC,
+                "camera.temperature": limits.max_camera_degC,
+            },
+            ("regulator.pv", "thermometers.air", "thermometers.granite_inside"),
+            limits.stale_after_s,
+        )
+        return Guard(self.stand, rules, self.hub, self.clock, limits.period_s, limits.heater_renew_s, abort)
+
+
+def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
+    """Make every device the configuration names; nothing is opened. ConfigError when a named file is missing."""
+    line = LineSettings(config.bus.baud, config.bus.parity, config.bus.stopbits)
+    bus = Bus("bus", config.bus.address, clock, line, config.bus.timeout_s)
+    devices = Devices(
+        regulator=Regulator(
+            "regulator",
+            bus,
+            load_register_map(packaged("registers", config.regulator.registers)),
+            clock,
+            unit=config.regulator.unit,
+        ),
+        relays=Relays(
+            "relays",
+            bus,
+            load_register_map(packaged("registers", config.relays.registers)),
+            {str(name): number for name, number in config.relays.channels.items()},
+            clock,
+            unit=config.relays.unit,
+        ),
+        thermometers=_thermometers(config, bus, clock),
+        axes={
+            str(name): Axis(name, AxisSettings(axis.address, axis.serial_number, axis.profile, axis.limits), clock)
+            for name, axis in config.axes.items()
+        },
+        flap=_flap(config, clock),
+        camera=Camera("camera", _camera_settings(config), clock),
+    )
+    compressor = CompressorLimits(**config.compressor.model_dump())
+    limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, compressor)
+    return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock))
+
+
+def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers:
+    channels = {
+        str(name): ThermometerChannel(
+            entry.channel, entry.offset_K, entry.polynomial, entry.certificate, entry.plausible_degC
+        )
+        for name, entry in config.thermometers.channels.items()
+    }
+    register_map = load_register_map(packaged("registers", config.thermometers.registers))
+    return Thermometers("thermometers", bus, register_map, channels, clock, unit=config.thermometers.unit)
+
+
+class _BackendModule(Protocol):
+    def get_backend(self, address: str) -> usb.backend.IBackend: ...
+
+
+def _flap(config: StandConfig, clock: Clock) -> Flap:
+    flap = config.flap
+    backend: usb.backend.IBackend | None = None
+    if flap.backend is not None and flap.backend_address is not None:
+        try:
+            module = cast("_BackendModule", importlib.import_module(flap.backend))
+        except ImportError as error:
+            raise ConfigError(f"flap.backend: no module {flap.backend!r} ({error})") from error
+        backend = module.get_backend(flap.backend_address)
+    settings = FlapSettings(flap.serial_number, flap.open_target, flap.closed_target, flap.tolerance, flap.travel_s)
+    return Flap("flap", settings, clock, backend)
+
+
+def _camera_settings(config: StandConfig) -> CameraSettings:
+    camera = config.camera
+    temperature = None
+    if camera.temperature is not None:
+        entry = camera.temperature
+        temperature = TemperatureFeature(
+            feature=entry.feature,
+            selector=entry.selector,
+            entry=entry.entry,
+            min_degC=entry.min_degC,
+            max_degC=entry.max_degC,
+        )
+    return CameraSettings(
+        address=camera.address,
+        serial_number=camera.serial_number,
+        pixel_format=camera.pixel_format,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        exposure_s=camera.exposure_s,
+        gain_dB=camera.gain_dB,
+        trigger=camera.trigger,
+        frame_rate_hz=camera.frame_rate_hz,
+        packet_size=camera.packet_size,
+        heartbeat_s=camera.heartbeat_s,
+        temperature=temperature,
+    )

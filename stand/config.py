@@ -1,0 +1,287 @@
+"""The stand's configuration: YAML -> frozen models. The same schema describes a laboratory and a simulated one; only
+addresses differ. A wrong key, unit or range is a ConfigError that names the file and the path in it.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import ipaddress
+import re
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, AwareDatetime, Field, model_validator
+
+from drivers.documents import Document, load_document
+from drivers.interface import ConfigError
+
+
+def _byte_address(address: str) -> str:
+    if re.fullmatch(r"serial:\S+", address) or re.fullmatch(r"tcp:[^:\s]+:\d{1,5}", address):
+        return address
+    raise ValueError("expected serial:PATH (such as serial:/dev/ttyUSB0) or tcp:HOST:PORT")
+
+
+def _ip_address(address: str) -> str:
+    try:
+        return str(ipaddress.IPv4Address(address))
+    except ValueError as error:
+        raise ValueError("expected an IPv4 address such as 192.168.1.10") from error
+
+
+ByteAddress = Annotated[str, AfterValidator(_byte_address)]
+IpAddress = Annotated[str, AfterValidator(_ip_address)]
+Seconds = Annotated[float, Field(gt=0)]
+PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]
+Unit = Annotated[int, Field(ge=1, le=247)]
+ThermometerName = Literal["granite_inside", "granite_outside", "artifact", "air", "laboratory"]
+RelayName = Literal["heater_enable", "compressor", "camera_power"]
+
+
+class BusConfig(Document):
+    """The RS-485 bus, by a serial adapter or behind a Modbus TCP gateway."""
+
+    address: ByteAddress
+    baud: int = Field(default=9600, ge=1200, le=921600)
+    parity: Literal["N", "E", "O"] = "E"
+    stopbits: Literal[1, 2] = 1
+    timeout_s: Seconds = 0.3
+
+
+class RegulatorConfig(Document):
+    """The chamber's heat/cool PID regulator; `registers` is a file in configs/registers."""
+
+    registers: str
+    unit: Unit
+    poll_s: PollPeriod_s = 1.0
+
+
+class RelaysConfig(Document):
+    """The relay board: which relay does what (0 is the first)."""
+
+    registers: str
+    unit: Unit
+    channels: dict[RelayName, Annotated[int, Field(ge=0, le=31)]]
+    poll_s: PollPeriod_s = 5.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        missing = {"heater_enable", "compressor", "camera_power"} - set(self.channels)
+        if missing:
+            raise ValueError(f"channels lacks {', '.join(sorted(missing))}")
+        if len(set(self.channels.values())) < len(self.channels):
+            raise ValueError("two channels share one relay")
+        return self
+
+
+class ThermometerConfig(Document):
+    """One Pt100: the module's channel and the sensor's calibration, degC = polynomial(raw degC) + offset."""
+
+    channel: int = Field(ge=0, le=15)
+    offset_K: float = 0.0
+    polynomial: tuple[float, ...] = (0.0, 1.0)
+    certificate: str = ""
+    plausible_degC: tuple[float, float] = (-40.0, 100.0)
+
+
+class ThermometersConfig(Document):
+    """The five contact thermometers on one RTD module."""
+
+    registers: str
+    unit: Unit
+    channels: dict[ThermometerName, ThermometerConfig]
+    poll_s: PollPeriod_s = 1.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        missing = {"granite_inside", "granite_outside", "artifact", "air", "laboratory"} - set(self.channels)
+        if missing:
+            raise ValueError(f"channels lacks {', '.join(sorted(missing))}")
+        if len({entry.channel for entry in self.channels.values()}) < len(self.channels):
+            raise ValueError("two thermometers share one channel")
+        return self
+
+
+class AxisConfig(Document):
+    """A stage behind a Standa XIMC controller; lengths in `unit`, software limits included."""
+
+    address: ByteAddress
+    serial_number: int = Field(ge=0)
+    profile: Literal["8MT160-300", "8MR151"]
+    limits: tuple[float, float]
+    poll_s: PollPeriod_s = 5.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.limits[0] >= self.limits[1]:
+            raise ValueError(f"limits {self.limits} are not in ascending order")
+        return self
+
+    @property
+    def unit(self) -> Literal["mm", "deg"]:
+        """The axis' unit."""
+        return "mm" if self.profile == "8MT160-300" else "deg"
+
+
+class FlapConfig(Document):
+    """The inspection flap's Pololu Jrk G2, found by its USB serial number.
+
+    backend: a module with `get_backend(address)` that gives a pyusb backend; none means libusb, the real bus.
+    """
+
+    serial_number: str
+    backend: str | None = None
+    backend_address: str | None = None
+    open_target: int = Field(default=3500, ge=0, le=4095)
+    closed_target: int = Field(default=500, ge=0, le=4095)
+    tolerance: int = Field(default=40, ge=1, le=500)
+    travel_s: Seconds = 5.0
+    poll_s: PollPeriod_s = 1.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if abs(self.open_target - self.closed_target) <= 2 * self.tolerance:
+            raise ValueError("open_target and closed_target are closer than twice the tolerance")
+        if (self.backend is None) != (self.backend_address is None):
+            raise ValueError("backend and backend_address go together")
+        return self
+
+
+class CameraTemperatureConfig(Document):
+    """Where the camera's own temperature is; without this section DeviceTemperature, then TemperatureAbs are tried."""
+
+    feature: str = "DeviceTemperature"
+    selector: str | None = "DeviceTemperatureSelector"
+    entry: str | None = "Sensor"
+    min_degC: float = -40.0
+    max_degC: float = 120.0
+
+
+class CameraConfig(Document):
+    """The GigE Vision camera, by IP address."""
+
+    address: IpAddress
+    serial_number: str | None = None
+    pixel_format: Literal["Mono8", "Mono12", "Mono16"] = "Mono8"
+    width_px: int | None = Field(default=None, ge=16)
+    height_px: int | None = Field(default=None, ge=16)
+    exposure_s: Seconds = 0.1
+    gain_dB: float = Field(default=0.0, ge=0)
+    trigger: Literal["software", "free_run"] = "software"
+    frame_rate_hz: float = Field(default=2.0, gt=0)
+    packet_size: int | None = Field(default=None, ge=220, le=16112)
+    heartbeat_s: float = Field(default=3.0, ge=0.5)
+    temperature: CameraTemperatureConfig | None = None
+    poll_s: PollPeriod_s = 1.0
+
+
+class LimitsConfig(Document):
+    """What no step and no operator may exceed."""
+
+    chamber_degC: tuple[float, float] = (-10.0, 60.0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.chamber_degC[0] >= self.chamber_degC[1]:
+            raise ValueError(f"chamber_degC {self.chamber_degC} is not in ascending order")
+        return self
+
+
+class GuardConfig(Document):
+    """When the guard makes the stand safe."""
+
+    period_s: Seconds = 1.0
+    max_air_degC: float = 65.0
+    max_granite_degC: float = 60.0
+    max_camera_degC: float = 85.0
+    stale_after_s: Seconds = 15.0
+    heater_hold_s: float = Field(default=15.0, ge=2.0, le=60.0)
+    heater_renew_s: float = Field(default=5.0, gt=0)
+
+    @model_validator(mode="after")
+    def _renewed_in_time(self) -> Self:
+        if self.heater_renew_s * 2 > self.heater_hold_s:
+            raise ValueError("heater_renew_s must be at most half of heater_hold_s, or one lost command cuts the heat")
+        return self
+
+
+class CompressorConfig(Document):
+    """The refrigeration compressor's own protection and when it is wanted (outputs of the regulator, %)."""
+
+    min_off_s: float = Field(default=300.0, ge=0)
+    min_on_s: float = Field(default=180.0, ge=0)
+    max_starts_per_h: int = Field(default=6, ge=1)
+    start_above_cool_percent: float = Field(default=20.0, gt=0, le=100)
+    stop_above_heat_percent: float = Field(default=60.0, gt=0, le=100)
+
+
+class RecordingConfig(Document):
+    """Where sessions go and how often telemetry is committed."""
+
+    directory: Path = Path("sessions")
+    frame_encoding: Literal["png", "raw"] = "png"
+    telemetry_commit_s: Seconds = 1.0
+
+
+class SimulationConfig(Document):
+    """The simulated laboratory behind these addresses; a real laboratory has no such section."""
+
+    control: Annotated[str, Field(pattern=r"^tcp:[^:\s]+:\d{1,5}$")]
+    start: AwareDatetime = datetime.fromisoformat("2026-01-01T18:00:00+00:00")
+    seed: int = Field(default=1, ge=0)
+    camera: Literal["modified", "unmodified"] = "modified"
+    laboratory_degC: float = Field(default=24.0, ge=-10, le=40)
+
+
+class StandConfig(Document):
+    """The whole file."""
+
+    name: str
+    operator: str = ""
+    target: str
+    bus: BusConfig
+    regulator: RegulatorConfig
+    relays: RelaysConfig
+    thermometers: ThermometersConfig
+    axes: dict[Literal["linear", "rotary"], AxisConfig] = Field(default_factory=dict)
+    flap: FlapConfig
+    camera: CameraConfig
+    limits: LimitsConfig = LimitsConfig()
+    guard: GuardConfig = GuardConfig()
+    compressor: CompressorConfig = CompressorConfig()
+    recording: RecordingConfig = RecordingConfig()
+    simulation: SimulationConfig | None = None
+
+    @model_validator(mode="after")
+    def _cross_checks(self) -> Self:
+        units = [self.regulator.unit, self.relays.unit, self.thermometers.unit]
+        if len(set(units)) < len(units):
+            raise ValueError(f"regulator, relays and thermometers need different units on one bus, not {units}")
+        if self.limits.chamber_degC[1] >= self.guard.max_air_degC:
+            raise ValueError("guard.max_air_degC must be above the upper limits.chamber_degC, or a normal run trips it")
+        slowest_s = max(self.regulator.poll_s, self.thermometers.poll_s, self.camera.poll_s)
+        if slowest_s * 2 > self.guard.stale_after_s:
+            raise ValueError(f"guard.stale_after_s must be at least twice the slowest safety poll ({slowest_s} s)")
+        return self
+
+
+def load_config(path: Path) -> StandConfig:
+    """The configuration file, checked."""
+    return load_document(path, StandConfig)
+
+
+def packaged(folder: Literal["", "registers", "recipes", "targets"], name: str) -> Path:
+    """The file `name` of the installed configs/`folder`, or `name` itself when that is a path that exists.
+
+    Raises ConfigError that lists what there is.
+    """
+    given = Path(name)
+    if given.is_file():
+        return given
+    root = Path(str(importlib.resources.files("configs"))) / folder
+    known = sorted(path.stem for path in root.glob("*.yaml"))
+    for candidate in (root / name, root / f"{name}.yaml"):
+        if candidate.is_file():
+            return candidate
+    raise ConfigError(f"{name}: no such file, and not one of those installed: {', '.join(known)}")

@@ -1,0 +1,62 @@
+"""Reads one device on its period and publishes what it gave; a failed read is a BAD reading, never an old value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.clock import Clock, seconds_ns
+from drivers.interface import DeviceError, Reading, Sensor, bad_reading
+from stand.hub import Batch, Event, Hub
+
+
+@dataclass
+class Poller:
+    """Polls `sensor` every `period_s` (absolute deadlines) until cancelled.
+
+    `first()` must succeed before `run()`: what it returns tells which channels to declare BAD when a later read fails.
+    """
+
+    sensor: Sensor
+    period_s: float
+    hub: Hub
+    clock: Clock
+
+    def __post_init__(self) -> None:
+        self._known: tuple[Reading, ...] = ()
+        self._failing = False
+
+    async def first(self) -> None:
+        """The first read, published; raises DeviceError, because a stand that cannot read does not start."""
+        self._publish(await self.sensor.read())
+
+    async def run(self) -> None:
+        """Poll until cancelled."""
+        period_ns = seconds_ns(self.period_s)
+        due_ns = self.clock.now_ns()
+        while True:
+            due_ns = max(due_ns + period_ns, self.clock.now_ns())  # a late poll is not made up for by a burst
+            await self.clock.sleep_until(due_ns)
+            await self._poll()
+
+    async def _poll(self) -> None:
+        try:
+            readings = await self.sensor.read()
+        except DeviceError as error:
+            self._lost(str(error))
+            return
+        if self._failing:
+            self._failing = False
+            self.hub.publish(Event(self.clock.now_ns(), "info", "device_back", f"{self.sensor.name} answers again"))
+        self._publish(readings)
+
+    def _publish(self, readings: tuple[Reading, ...]) -> None:
+        self._known = readings
+        self.hub.publish(Batch(self.sensor.name, self.clock.now_ns(), readings))
+
+    def _lost(self, reason: str) -> None:
+        now_ns = self.clock.now_ns()
+        if not self._failing:
+            self._failing = True
+            self.hub.publish(Event(now_ns, "warning", "device_lost", reason))
+        bad = tuple(bad_reading(reading.channel, reading.unit, now_ns, reason) for reading in self._known)
+        self.hub.publish(Batch(self.sensor.name, now_ns, bad))

@@ -1,0 +1,68 @@
+"""Progress of long work: a bar with the time left on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+# Plain output: a line each time this share of the work is done, so that a log stays readable.
+_PLAIN_STEP = 0.1
+
+
+class Report(Protocol):
+    """Called with the work done so far (same unit as the total) and what is being done now."""
+
+    def __call__(self, done: float, text: str) -> None:
+        """Show it."""
+        ...
+
+
+@contextmanager
+def progress(title: str, total: float) -> Generator[Report]:
+    """Show progress of `title` on standard error while inside; `total` in any unit."""
+    if sys.stderr.isatty():
+        with _bar(title, total) as report:
+            yield report
+    else:
+        yield _PlainLines(title, total)
+
+
+@contextmanager
+def _bar(title: str, total: float) -> Generator[Report]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[now]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=False) as bar:
+        task = bar.add_task(title, total=max(total, 1e-9), now="")
+
+        def report(done: float, text: str) -> None:
+            bar.update(task, completed=done, now=text)
+
+        yield report
+        bar.update(task, completed=max(total, 1e-9), now="")
+
+
+class _PlainLines:
+    def __init__(self, title: str, total: float) -> None:
+        self._title = title
+        self._total = max(total, 1e-9)
+        self._next = _PLAIN_STEP
+
+    def __call__(self, done: float, text: str) -> None:
+        share = done / self._total
+        if share + 1e-9 < self._next:
+            return
+        while self._next <= share + 1e-9:
+            self._next += _PLAIN_STEP
+        print(f"{self._title}: {min(share, 1.0):4.0%}  {text}", file=sys.stderr, flush=True)  # noqa: T201 - plain log

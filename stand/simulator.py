@@ -1,0 +1,123 @@
+"""Starts the simulated laboratory as a process of its own, and leads it through virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+
+from drivers.clock import seconds_ns
+from drivers.interface import ConfigError, Unreachable
+from stand.config import StandConfig
+
+_READY = "ready"
+_STOP_LIMIT_S = 5.0
+
+
+def laboratory_of(config: StandConfig, *, virtual: bool, seed: int | None) -> dict[str, object]:
+    """What the simulator is told: which fake answers where. ConfigError when the stand is not a simulated one."""
+    simulation = config.simulation
+    if simulation is None:
+        raise ConfigError(f"{config.name}: no `simulation` section; this is not a simulated laboratory")
+    return {
+        "virtual": virtual,
+        "control": simulation.control,
+        "start_ns": seconds_ns(simulation.start.timestamp()),
+        "seed": simulation.seed if seed is None else seed,
+        "camera_kind": simulation.camera,
+        "laboratory_degC": simulation.laboratory_degC,
+        "bus": config.bus.address,
+        "regulator_unit": config.regulator.unit,
+        "relays_unit": config.relays.unit,
+        "relay_channels": dict(config.relays.channels),
+        "thermometers_unit": config.thermometers.unit,
+        "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.channels.items()},
+        "axes": {
+            name: {"address": axis.address, "profile": axis.profile, "serial_number": axis.serial_number}
+            for name, axis in config.axes.items()
+        },
+        "flap": {"address": config.flap.backend_address, "serial_number": config.flap.serial_number},
+        "camera": {"address": config.camera.address, "serial_number": config.camera.serial_number},
+    }
+
+
+class Simulator:
+    """A running simulator process."""
+
+    def __init__(self, laboratory: Mapping[str, object]) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "drivers.sim"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # Ctrl-C reaches the daemon first, which makes the stand safe and then ends this
+        )
+        if self._process.stdin is None or self._process.stdout is None or self._process.stderr is None:
+            raise ValueError("the simulator was started without its pipes")
+        self._process.stdin.write(json.dumps(laboratory))
+        self._process.stdin.close()
+        if self._process.stdout.readline().strip() != _READY:
+            reason = self._process.stderr.read().strip().splitlines()
+            self.stop()
+            raise ConfigError(f"the simulator did not start: {reason[-1] if reason else 'it said nothing'}")
+
+    def stop(self) -> None:
+        """End the process; may be called twice."""
+        self._process.terminate()
+        try:
+            self._process.wait(_STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        for pipe in (self._process.stdout, self._process.stderr):
+            if pipe is not None:
+                pipe.close()
+
+
+class ControlSocket:
+    """The simulator's control socket: one JSON object a line in, one out."""
+
+    def __init__(self, address: str) -> None:
+        self._host, port = address.removeprefix("tcp:").rsplit(":", 1)
+        self._port = int(port)
+        self._reader: asyncio.StreamReader | None = None
+        self._writer: asyncio.StreamWriter | None = None
+
+    async def open(self) -> None:
+        """Connect; raises Unreachable."""
+        try:
+            self._reader, self._writer = await asyncio.open_connection(self._host, self._port)
+        except OSError as error:
+            raise Unreachable("simulator", f"nobody listens at {self._host}:{self._port} ({error})") from error
+
+    async def request(self, request: Mapping[str, object]) -> dict[str, object]:
+        """Send one request and return its answer; raises Unreachable when the simulator is gone or refuses."""
+        if self._reader is None or self._writer is None:
+            raise ValueError("the control socket is not open")
+        try:
+            self._writer.write(json.dumps(request).encode() + b"\n")
+            line = await self._reader.readline()
+        except OSError as error:
+            raise Unreachable("simulator", f"the control socket broke ({error})") from error
+        if not line:
+            raise Unreachable("simulator", "the simulator closed its control socket")
+        answer: dict[str, object] = json.loads(line)
+        if "error" in answer:
+            raise Unreachable("simulator", str(answer["error"]))
+        return answer
+
+    async def advance(self, now_ns: int) -> None:
+        """Put the simulated laboratory at `now_ns`."""
+        await self.request({"do": "advance", "now_ns": now_ns})
+
+    async def close(self) -> None:
+        """Let go; may be called twice."""
+        if self._writer is not None:
+            self._writer.close()
+            with suppress(OSError):
+                await self._writer.wait_closed()
+        self._writer = None

@@ -1,0 +1,201 @@
+"""The verbs an experiment's steps may use, and the one gate before them: the latch and the limits."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Mapping
+from dataclasses import dataclass, replace
+
+from drivers.camera import Camera
+from drivers.clock import Clock, seconds_ns
+from drivers.flap import Flap
+from drivers.interface import ConfigError, StandError, StandTripped, Unreachable
+from drivers.regulator import Regulator
+from drivers.relays import Relays
+from drivers.stage import Axis
+from drivers.thermometers import Thermometers
+from stand.compressor import CompressorLimits, CompressorState, decide
+from stand.hub import Event, Hub
+from stand.interlocks import Fault
+
+# Real seconds for all actuators together to reach their safe state; the dead-man relay drops by itself after that.
+_SAFE_LIMIT_S = 10.0
+_CAMERA_BOOT_LIMIT_S = 60.0
+_CAMERA_RETRY_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """Everything the stand is made of."""
+
+    regulator: Regulator
+    relays: Relays
+    thermometers: Thermometers
+    axes: Mapping[str, Axis]
+    flap: Flap
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What no step may exceed, and how the permissions to heat and cool are kept alive."""
+
+    chamber_degC: tuple[float, float]
+    hold_s: float
+    compressor: CompressorLimits
+
+
+class Stand:
+    """One stand. A latched fault closes the gate: every verb but make_safe raises StandTripped."""
+
+    def __init__(self, devices: Devices, limits: Limits, hub: Hub, clock: Clock) -> None:
+        self.devices = devices
+        self.fault: Fault | None = None
+        self._limits = limits
+        self._hub = hub
+        self._clock = clock
+        self._permitted = False
+        # After a start nobody knows when the compressor last ran: assume it was switched off just now.
+        self._compressor = CompressorState(running=False, since_ns=clock.now_ns())
+
+    def latch(self, fault: Fault) -> None:
+        """Close the gate until an operator clears it; the first fault stays."""
+        self.fault = self.fault or fault
+        self._permitted = False
+
+    async def start_chamber(self, chamber_degC: float) -> None:
+        """Permit heating and cooling, set the set-point, run the regulator."""
+        self._check(chamber_degC)
+        await self.devices.regulator.set_temperature(chamber_degC)
+        self._permitted = True
+        await self.renew_permits()
+        await self.devices.regulator.run()
+
+    async def set_temperature(self, chamber_degC: float) -> None:
+        """A new chamber set-point, degC; ConfigError outside the limits."""
+        self._check(chamber_degC)
+        await self.devices.regulator.set_temperature(chamber_degC)
+
+    async def stop_chamber(self) -> None:
+        """Stop the regulator; heating and cooling lose their permission at once."""
+        self._permitted = False
+        await self.devices.regulator.stop()
+        await self.devices.relays.switch("heater_enable", on=False)
+        await self._switch_compressor_off()
+
+    async def renew_permits(self) -> None:
+        """Re-arm the timed-on relays of the heater and the compressor; only the guard calls this, while all is well.
+
+        Both drop by themselves `hold_s` after the last call: a dead daemon neither heats nor cools.
+        """
+        if not self._permitted:
+            return
+        await self.devices.relays.hold_on("heater_enable", self._limits.hold_s)
+        wanted = decide(
+            self._compressor,
+            self._limits.compressor,
+            self._latest("regulator.mv_heat"),
+            self._latest("regulator.mv_cool"),
+            self._clock.now_ns(),
+        )
+        if wanted.running:
+            await self.devices.relays.hold_on("compressor", self._limits.hold_s)
+        elif self._compressor.running:
+            await self.devices.relays.switch("compressor", on=False)
+        if wanted.running != self._compressor.running:
+            text = "compressor started" if wanted.running else "compressor stopped"
+            self._hub.publish(Event(self._clock.now_ns(), "info", "compressor", text))
+        self._compressor = wanted
+
+    async def soak(self, duration_s: float) -> None:
+        """Wait, s."""
+        self._check()
+        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(duration_s))
+
+    async def open_flap(self) -> None:
+        """Open the flap and confirm it."""
+        self._check()
+        await self.devices.flap.move_open()
+
+    async def close_flap(self) -> None:
+        """Close the flap and confirm it; allowed after a trip too."""
+        await self.devices.flap.move_closed()
+
+    async def capture(self, frames: int, interval_s: float, exposure_s: float, step_id: str) -> None:
+        """`frames` images, one each `interval_s` by absolute deadlines; each published as soon as it is there."""
+        start_ns = self._clock.now_ns()
+        for number in range(frames):
+            self._check()
+            await self._clock.sleep_until(start_ns + number * seconds_ns(interval_s))
+            frame = await self.devices.camera.grab(exposure_s)
+            self._hub.publish(replace(frame, step_id=step_id))
+
+    async def move_to(self, axis: str, position: float) -> None:
+        """Move a stage (mm or deg), homing it first when it lost its scale."""
+        self._check()
+        if axis not in self.devices.axes:
+            raise ConfigError(
+                f"the plan moves axis {axis}, but this stand has {', '.join(self.devices.axes) or 'none'}"
+            )
+        stage = self.devices.axes[axis]
+        if not await stage.homed():
+            await stage.home()
+        await stage.move_to(position)
+
+    async def power_camera(self, *, on: bool) -> None:
+        """Switch the camera's supply; on: return when the camera is open and configured."""
+        self._check()
+        if not on:
+            await self.devices.camera.close()
+            await self.devices.relays.switch("camera_power", on=False)
+            return
+        await self.devices.relays.switch("camera_power", on=True)
+        await self._open_camera()
+
+    async def make_safe(self) -> None:
+        """Every actuator to its safe state, all at once, within a real-time limit; failures become events."""
+        self._permitted = False
+        devices = self.devices
+        actions = {
+            "regulator": devices.regulator.make_safe(),
+            "relays": devices.relays.make_safe(),
+            "flap": devices.flap.make_safe(),
+            **{name: axis.make_safe() for name, axis in devices.axes.items()},
+        }
+        await asyncio.gather(*(self._safely(name, action) for name, action in actions.items()))
+        if self._compressor.running:
+            self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
+
+    async def _safely(self, name: str, action: Awaitable[None]) -> None:
+        try:
+            async with asyncio.timeout(_SAFE_LIMIT_S):
+                await action
+        except (StandError, TimeoutError) as error:
+            text = f"{name} did not confirm its safe state: {str(error) or 'no answer in time'}"
+            self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text))
+
+    async def _open_camera(self) -> None:
+        deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S)
+        while True:
+            try:
+                return await self.devices.camera.open()
+            except Unreachable:
+                if self._clock.now_ns() >= deadline_ns:
+                    raise
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_CAMERA_RETRY_S))
+
+    async def _switch_compressor_off(self) -> None:
+        await self.devices.relays.switch("compressor", on=False)
+        if self._compressor.running:
+            self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
+
+    def _check(self, chamber_degC: float | None = None) -> None:
+        if self.fault is not None:
+            raise StandTripped(f"the stand is latched: {self.fault.text}")
+        low, high = self._limits.chamber_degC
+        if chamber_degC is not None and not low <= chamber_degC <= high:
+            raise ConfigError(f"chamber set-point {chamber_degC} degC is outside limits.chamber_degC {low}..{high}")
+
+    def _latest(self, channel: str) -> float:
+        reading = self._hub.latest(channel)
+        return float("nan") if reading is None else reading.value
