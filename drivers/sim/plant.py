@@ -1,0 +1,253 @@
+"""The one physics model behind every fake: chamber, stand and camera as a thermal network on a fixed time grid.
+
+`advance(now_ns)` and nothing else moves it. A front end does, for each request,
+
+    with plant.lock:
+        plant.advance(clock.now_ns())
+        ...                             # read outputs, set inputs
+
+Temperatures are in degC, heat capacities in J/K, conductances in W/K. The chamber is a chest freezer, 1.2 x 0.9 x 0.8 m:
+its evaporator is bonded to the liner and the fan-heater stirs the air. With these numbers it reaches -10 to +70 degC.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.sim.hysteresis import BoucWen
+from drivers.sim.optics import CameraKind, Nodes, Optics, Placement, optics_at
+
+NS_PER_S = 1_000_000_000
+STEP_s = 0.5
+STEP_ns = 500_000_000
+DAY_s = 86_400.0
+
+# Chamber
+AIR_J_K = 6_000.0  # 0.86 m3 of air, ducts and racks
+WALL_J_K = 40_000.0  # steel liner with the evaporator's tubes
+AIR_WALL_W_K = 60.0
+WALL_LABORATORY_W_K = 9.0  # the insulation
+FAN_W = 20.0
+FLAP_LEAK_W_K = 12.0  # exchange of air through the open flap
+HEATER_W = 2_000.0
+HEATER_J_K, HEATER_AIR_W_K = 500.0, 20.0  # lag 25 s
+COIL_J_K, COIL_WALL_W_K, COIL_AIR_W_K = 2_500.0, 38.0, 4.0  # lag 60 s
+COMPRESSOR_W = 600.0  # at an evaporator temperature of 0 degC
+COMPRESSOR_per_K = 0.012  # capacity gained per K of evaporator temperature (suction pressure)
+COMPRESSOR_MAX = 1.5  # of COMPRESSOR_W, limited by the motor
+CUT_OUT_degC = 85.0  # hard-wired, latching
+
+# Granite slab through the wall: lag inside over an hour
+GRANITE_J_K = 60_000.0
+GRANITE_AIR_W_K = 14.0
+GRANITE_INSIDE_OUTSIDE_W_K = 0.6
+GRANITE_LABORATORY_W_K = 9.0
+
+# Laboratory side
+LABORATORY_PEAK_s = 15.0 * 3600.0  # warmest time of the day, UTC
+ARTIFACT_LAG_s = 1_200.0
+ARTIFACT_FLAP_SHARE = 0.02  # of the chamber's excess reaches the target through the open flap
+
+# Thermometers' lags; the air near the camera feels its plume, the walls and the flap
+PROBE_LAG_s = 10.0
+NEAR_LAG_s = 40.0
+NEAR_BODY_SHARE, NEAR_WALL_SHARE, NEAR_FLAP_SHARE = 0.012, 0.03, 0.05
+
+# Camera: steady body +18.5 K, sensor +20 K, lens +16 K above the air at 24 degC
+CAMERA_W, SENSOR_W = 3.65, 0.9  # electronics in the body, sensor chip
+SENSOR_J_K, SENSOR_BODY_W_K = 25.0, 0.65
+BODY_J_K, BODY_AIR_W_K = 120.0, 0.19
+BODY_RADIATION_W_K = 0.03  # at a mean of 310 K
+BODY_GRANITE_W_K = 0.018
+BODY_LENS_W_K, LENS_AIR_W_K, LENS_J_K = 0.0440, 0.0078, 58.0
+
+TENSION_LIMITS_K = (4.0, 9.0)
+
+
+@dataclass(frozen=True)
+class PlantSpec:
+    """What one simulated laboratory is; plain fields, so that a stand file can carry them.
+
+    initial_degC: every node at the start, None for laboratory_degC. seed: irregularity of the unmodified camera's
+    joints. The remaining fields are those of `optics.Placement`.
+    """
+
+    camera: CameraKind = "modified"
+    seed: int = 1
+    laboratory_degC: float = 24.0
+    laboratory_swing_K: float = 0.4
+    initial_degC: float | None = None
+    camera_powered: bool = False
+    camera_roll_deg: float = 0.0
+    distance_mm: float = 826.0
+
+
+def _closed(time_ns: int) -> float:
+    return 0.0
+
+
+def _at_zero(time_ns: int) -> float:
+    return 0.0
+
+
+class Plant:
+    """The laboratory's state. Inputs and outputs are plain attributes; take `lock` around any use.
+
+    Inputs: heater_on_fraction (0..1 of the coming step), heater_enabled, compressor_on, camera_powered, flap_open_at
+    (0..1 at a time), linear_mm_at, rotary_deg_at, and cut_out_open (latches by itself; an operator resets it).
+    `on_step` callables get (time_ns of the step's begin, dt_s) before the heat of that step is integrated.
+    """
+
+    def __init__(self, spec: PlantSpec, start_ns: int) -> None:
+        self.spec = spec
+        self.lock = threading.RLock()
+        self.now_ns = start_ns
+        self.on_step: list[Callable[[int, float], None]] = []
+        self.heater_on_fraction = 0.0
+        self.heater_enabled = False
+        self.compressor_on = False
+        self.cut_out_open = False
+        self.flap_open_at: Callable[[int], float] = _closed
+        self.linear_mm_at: Callable[[int], float] = _at_zero
+        self.rotary_deg_at: Callable[[int], float] = _at_zero
+        self._camera_powered = spec.camera_powered
+        self.camera_power_on_ns: int | None = start_ns if spec.camera_powered else None
+        self.heater_W = 0.0
+
+        self.laboratory_degC = self._laboratory_degC(start_ns)
+        initial_degC = spec.laboratory_degC if spec.initial_degC is None else spec.initial_degC
+        self.bulk_air_degC = self.wall_degC = self.coil_degC = self.element_degC = initial_degC
+        self.chamber_degC = self.air_degC = self.granite_inside_degC = initial_degC
+        self.granite_outside_degC = self.artifact_degC = self.laboratory_degC
+        self.body_degC = self.sensor_degC = self.lens_degC = initial_degC
+        draw = random.Random(spec.seed)
+        limits_K = TENSION_LIMITS_K if spec.camera == "unmodified" else ()
+        self._joints = tuple(BoucWen(limit_K * draw.uniform(0.9, 1.1), draw.getrandbits(32)) for limit_K in limits_K)
+
+    @property
+    def camera_powered(self) -> bool:
+        """Whether the camera's supply is on; `camera_power_on_ns` keeps when it last came on."""
+        return self._camera_powered
+
+    @camera_powered.setter
+    def camera_powered(self, powered: bool) -> None:
+        if powered and not self._camera_powered:
+            self.camera_power_on_ns = self.now_ns
+        self._camera_powered = powered
+
+    @property
+    def compressor_running(self) -> bool:
+        """Whether the compressor turns: as commanded, it has no protection of its own."""
+        return self.compressor_on
+
+    def advance(self, now_ns: int) -> None:
+        """Integrate whole steps up to `now_ns`; an earlier time changes nothing."""
+        while self.now_ns + STEP_ns <= now_ns:
+            for callback in self.on_step:
+                callback(self.now_ns, STEP_s)
+            self._step()
+            self.now_ns += STEP_ns
+
+    def optics(self, time_ns: int) -> Optics:
+        """The true camera and target pose: temperatures of the last grid time, stage positions of `time_ns`."""
+        nodes = Nodes(
+            sensor_degC=self.sensor_degC,
+            body_degC=self.body_degC,
+            lens_degC=self.lens_degC,
+            granite_inside_degC=self.granite_inside_degC,
+            granite_outside_degC=self.granite_outside_degC,
+            artifact_degC=self.artifact_degC,
+            tensions_K=tuple(joint.tension_K for joint in self._joints),
+        )
+        placement = Placement(
+            linear_mm=self.linear_mm_at(time_ns),
+            rotary_deg=self.rotary_deg_at(time_ns),
+            camera_roll_deg=self.spec.camera_roll_deg,
+            distance_mm=self.spec.distance_mm,
+        )
+        return optics_at(self.spec.camera, nodes, placement)
+
+    def state(self) -> dict[str, float]:
+        """Every temperature, input and power by its attribute's name, at grid time; booleans as 0 or 1."""
+        names = (
+            "bulk_air_degC wall_degC coil_degC element_degC chamber_degC air_degC granite_inside_degC "
+            "granite_outside_degC artifact_degC laboratory_degC body_degC sensor_degC lens_degC heater_W "
+            "heater_on_fraction heater_enabled compressor_on cut_out_open camera_powered"
+        )
+        values = {name: float(getattr(self, name)) for name in names.split()}
+        values["flap_open"] = self.flap_open_at(self.now_ns)
+        values |= {f"tension_{index}_K": joint.tension_K for index, joint in enumerate(self._joints)}
+        return values
+
+    def _laboratory_degC(self, time_ns: int) -> float:
+        phase = 2.0 * math.pi * ((time_ns / NS_PER_S - LABORATORY_PEAK_s) % DAY_s) / DAY_s
+        return self.spec.laboratory_degC + self.spec.laboratory_swing_K * math.cos(phase)
+
+    def _step(self) -> None:
+        """One explicit Euler step; the fastest node (the probe, 10 s) is 20 steps slow. All flows use old values."""
+        flap_open = self.flap_open_at(self.now_ns)
+        laboratory = self._laboratory_degC(self.now_ns)
+        self._step_camera(flap_open, laboratory)
+        self._step_stand(flap_open, laboratory)
+        self._step_chamber(flap_open, laboratory)
+        self.laboratory_degC = laboratory
+
+    def _step_chamber(self, flap_open: float, laboratory: float) -> None:
+        air, wall, coil, element = self.bulk_air_degC, self.wall_degC, self.coil_degC, self.element_degC
+        if air > CUT_OUT_degC:
+            self.cut_out_open = True
+        heating = self.heater_enabled and not self.cut_out_open
+        self.heater_W = heater_W = HEATER_W * self.heater_on_fraction if heating else 0.0
+        pumped_W = 0.0
+        if self.compressor_on:
+            pumped_W = COMPRESSOR_W * min(COMPRESSOR_MAX, max(0.0, 1.0 + COMPRESSOR_per_K * coil))
+        from_element_W = HEATER_AIR_W_K * (element - air)
+        air_to_wall_W = AIR_WALL_W_K * (air - wall)
+        wall_to_coil_W = COIL_WALL_W_K * (wall - coil)
+        air_to_coil_W = COIL_AIR_W_K * (air - coil)
+        leak_W = FLAP_LEAK_W_K * flap_open * (air - laboratory)
+        to_granite_W = GRANITE_AIR_W_K * (air - self.granite_inside_degC)
+        camera_W = CAMERA_W + SENSOR_W if self._camera_powered else 0.0
+        gain_W = from_element_W + FAN_W + camera_W - air_to_wall_W - air_to_coil_W - leak_W - to_granite_W
+        self.bulk_air_degC = air + gain_W * (STEP_s / AIR_J_K)
+        wall_gain_W = air_to_wall_W - wall_to_coil_W - WALL_LABORATORY_W_K * (wall - laboratory)
+        self.wall_degC = wall + wall_gain_W * (STEP_s / WALL_J_K)
+        self.coil_degC = coil + (wall_to_coil_W + air_to_coil_W - pumped_W) * (STEP_s / COIL_J_K)
+        self.element_degC = element + (heater_W - from_element_W) * (STEP_s / HEATER_J_K)
+
+    def _step_stand(self, flap_open: float, laboratory: float) -> None:
+        air, inside, outside = self.bulk_air_degC, self.granite_inside_degC, self.granite_outside_degC
+        through_W = GRANITE_INSIDE_OUTSIDE_W_K * (inside - outside)
+        self.granite_inside_degC = inside + (GRANITE_AIR_W_K * (air - inside) - through_W) * (STEP_s / GRANITE_J_K)
+        to_laboratory_W = GRANITE_LABORATORY_W_K * (outside - laboratory)
+        self.granite_outside_degC = outside + (through_W - to_laboratory_W) * (STEP_s / GRANITE_J_K)
+        around_target = laboratory + ARTIFACT_FLAP_SHARE * flap_open * (air - laboratory)
+        self.artifact_degC += (around_target - self.artifact_degC) * (STEP_s / ARTIFACT_LAG_s)
+        self.chamber_degC += (air - self.chamber_degC) * (STEP_s / PROBE_LAG_s)
+        near_camera = (
+            air
+            + NEAR_BODY_SHARE * (self.body_degC - air)
+            + NEAR_WALL_SHARE * (self.wall_degC - air)
+            + NEAR_FLAP_SHARE * flap_open * (laboratory - air)
+        )
+        self.air_degC += (near_camera - self.air_degC) * (STEP_s / NEAR_LAG_s)
+
+    def _step_camera(self, flap_open: float, laboratory: float) -> None:
+        around, body, sensor, lens = self.air_degC, self.body_degC, self.sensor_degC, self.lens_degC
+        wall = self.wall_degC
+        electronics_W, chip_W = (CAMERA_W, SENSOR_W) if self._camera_powered else (0.0, 0.0)
+        mean = (0.5 * (body + wall) + 273.15) / 310.0
+        radiated_W = BODY_RADIATION_W_K * mean * mean * mean * (body - wall)
+        to_body_W = SENSOR_BODY_W_K * (sensor - body)
+        to_lens_W = BODY_LENS_W_K * (body - lens)
+        lost_W = BODY_AIR_W_K * (body - around) + radiated_W + BODY_GRANITE_W_K * (body - self.granite_inside_degC)
+        change_K = (electronics_W + to_body_W - to_lens_W - lost_W) * (STEP_s / BODY_J_K)
+        self.body_degC = body + change_K
+        self.sensor_degC = sensor + (chip_W - to_body_W) * (STEP_s / SENSOR_J_K)
+        self.lens_degC = lens + (to_lens_W - LENS_AIR_W_K * (lens - around)) * (STEP_s / LENS_J_K)
+        for joint in self._joints:
+            joint.step(change_K, STEP_s)
