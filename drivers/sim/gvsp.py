@@ -1,0 +1,154 @@
+"""GVSP, the stream protocol of GigE Vision, as bytes: both roles, no I/O.
+
+One image is one block: packet 0 is the leader, 1..n carry the pixels, n + 1 is the trailer. Everything is big endian
+but the pixels. The header has 8 bytes with 16-bit block ids, or 20 with 64-bit ones ("extended"); GigE Vision 2.0,
+chapters 23 to 25.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+OK = 0x0000
+RESENT = 0x0100
+UNAVAILABLE = 0x800C
+
+IP_UDP_HEADER_bytes = 28  # the packet size register counts them
+
+_SHORT = struct.Struct(">HHI")
+_EXTENDED = struct.Struct(">HHIQI")
+_EXTENDED_BIT = 0x80
+_LEADER = struct.Struct(">HHQIIIIIHH")
+_TRAILER = struct.Struct(">HHI")
+_IMAGE = 1
+
+
+class Kind(IntEnum):
+    """What a packet carries."""
+
+    LEADER = 1
+    TRAILER = 2
+    PAYLOAD = 3
+
+
+class PixelFormat(IntEnum):
+    """PFNC codes; Mono12 has two bytes a pixel, little endian."""
+
+    MONO8 = 0x01080001
+    MONO12 = 0x01100005
+
+
+class Malformed(ValueError):
+    """These bytes are no GVSP packet."""
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One packet as received; `data` is what follows the header."""
+
+    kind: Kind
+    block_id: int
+    packet_id: int
+    data: bytes = b""
+    status: int = OK
+    extended: bool = False
+
+    def encode(self) -> bytes:
+        """The datagram."""
+        return header(self.kind, self.block_id, self.packet_id, self.status, self.extended) + self.data
+
+
+def header_size(extended: bool) -> int:
+    """Bytes of a GVSP header."""
+    return _EXTENDED.size if extended else _SHORT.size
+
+
+def header(kind: Kind, block_id: int, packet_id: int, status: int, extended: bool) -> bytes:
+    """The header of one packet."""
+    if extended:
+        return _EXTENDED.pack(status, 0, (_EXTENDED_BIT | kind) << 24, block_id, packet_id)
+    return _SHORT.pack(status, block_id, kind << 24 | packet_id)
+
+
+def decode(datagram: bytes) -> Packet:
+    """The packet in a datagram; Malformed when it is too short or of an unknown kind."""
+    if len(datagram) < _SHORT.size:
+        raise Malformed(f"{len(datagram)} bytes are no GVSP header")
+    status, block_id, word = _SHORT.unpack_from(datagram)
+    extended = bool(word >> 24 & _EXTENDED_BIT)
+    packet_id = word & 0xFFFFFF
+    if extended:
+        if len(datagram) < _EXTENDED.size:
+            raise Malformed(f"{len(datagram)} bytes are no extended GVSP header")
+        status, _, word, block_id, packet_id = _EXTENDED.unpack_from(datagram)
+    kind = word >> 24 & ~_EXTENDED_BIT
+    if kind not in (Kind.LEADER, Kind.TRAILER, Kind.PAYLOAD):
+        raise Malformed(f"packet of kind {kind}")
+    return Packet(Kind(kind), block_id, packet_id, datagram[header_size(extended) :], status, extended)
+
+
+@dataclass(frozen=True)
+class Leader:
+    """What the leader says of an image; `timestamp` in ticks of the camera, sizes in px."""
+
+    timestamp: int
+    pixel_format: int
+    width: int
+    height: int
+    offset_x: int = 0
+    offset_y: int = 0
+
+    def encode(self) -> bytes:
+        """The data of the leader packet (36 bytes, no padding)."""
+        return _LEADER.pack(
+            0, _IMAGE, self.timestamp, self.pixel_format, self.width, self.height, self.offset_x, self.offset_y, 0, 0
+        )
+
+
+def decode_leader(data: bytes) -> Leader:
+    """The leader in the data of a leader packet; Malformed when short or no image."""
+    if len(data) < _LEADER.size:
+        raise Malformed(f"leader of {len(data)} bytes")
+    _, payload_type, timestamp, pixel_format, width, height, offset_x, offset_y, _, _ = _LEADER.unpack_from(data)
+    if payload_type != _IMAGE:
+        raise Malformed(f"payload of type {payload_type:#x}")
+    return Leader(timestamp, pixel_format, width, height, offset_x, offset_y)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One image cut into packets of `packet_size` bytes (IP and UDP header included), on demand.
+
+    `pixels` are the bytes of the image, rows from the top; they must not change while the block lives.
+    """
+
+    block_id: int
+    leader: Leader
+    pixels: memoryview
+    packet_size: int
+    extended: bool = False
+
+    @property
+    def data_size(self) -> int:
+        """Pixel bytes in every payload packet but the last."""
+        return self.packet_size - IP_UDP_HEADER_bytes - header_size(self.extended)
+
+    @property
+    def trailer_id(self) -> int:
+        """Packet id of the trailer, the highest of the block."""
+        return -(-len(self.pixels) // self.data_size) + 1
+
+    def packet(self, packet_id: int, status: int = OK) -> tuple[bytes, bytes | memoryview]:
+        """Header and data of one packet, for a gathering send; IndexError outside 0..trailer_id."""
+        if not 0 <= packet_id <= self.trailer_id:
+            raise IndexError(f"packet {packet_id} of {self.trailer_id + 1}")
+        if packet_id == 0:
+            kind, data = Kind.LEADER, self.leader.encode()
+        elif packet_id == self.trailer_id:
+            kind, data = Kind.TRAILER, _TRAILER.pack(0, _IMAGE, self.leader.height)
+        else:
+            begin = (packet_id - 1) * self.data_size
+            kind, data = Kind.PAYLOAD, self.pixels[begin : begin + self.data_size]
+        return header(kind, self.block_id, packet_id, status, self.extended), data

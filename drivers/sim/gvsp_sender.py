@@ -1,0 +1,235 @@
+"""Sends the packets of a camera: paced, lossy on demand, and once more when asked."""
+
+from __future__ import annotations
+
+import random
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+from drivers.sim import gvsp
+from drivers.sim.gvcp import Resend
+from drivers.sim.gvsp import Block
+
+Destination = tuple[str, int]
+
+KEPT_BLOCKS = 4
+_BURST_bytes = 32_768  # sent without a pause: well below the smallest receive buffer in use (212,992 bytes)
+_CATCH_UP_s = 0.002  # a stalled sender makes up for no more than this, or it would flood the receiver
+
+
+@dataclass
+class CameraFaults:
+    """What goes wrong on a camera; change at any time.
+
+    loss: probability 0..1 that a packet is lost, with the `burst` - 1 packets after it; seeded, so that a run repeats.
+    no_resend: capability bit off and requests ignored (the bit is read by clients at connect). silent_gvcp: the camera
+    neither hears nor answers. silent_gvsp: no stream packet leaves. unpaced: packets leave as fast as they can.
+    drop_leader, drop_trailer: missing from every frame until asked for again. trigger_twice: every software trigger
+    gives two frames. temperature: DeviceTemperature reads 0, is refused, or keeps its last value.
+    """
+
+    seed: int = 0
+    loss: float = 0.0
+    burst: int = 1
+    no_resend: bool = False
+    silent_gvcp: bool = False
+    silent_gvsp: bool = False
+    unpaced: bool = False
+    drop_leader: bool = False
+    drop_trailer: bool = False
+    trigger_twice: bool = False
+    temperature: Literal["zero", "access", "stuck"] | None = None
+
+
+@dataclass
+class StreamCounts:
+    """Totals since the camera was built: blocks begun, packets by fate."""
+
+    blocks: int = 0
+    packets: int = 0
+    lost: int = 0
+    resent: int = 0
+    unavailable: int = 0
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One packet to send."""
+
+    block: Block
+    packet_id: int
+    destination: Destination
+    status: int = gvsp.OK
+
+
+@dataclass
+class _Queue:
+    """What is left to do: the packets of the current block, and those asked for again, in order, each once."""
+
+    block: Iterator[_Job] | None = None
+    resends: dict[tuple[int, int], _Job] = field(default_factory=dict[tuple[int, int], _Job])
+    refusals: deque[tuple[bytes, Destination]] = field(default_factory=deque[tuple[bytes, Destination]])
+
+    def empty(self) -> bool:
+        return self.block is None and not self.resends and not self.refusals
+
+    def take(self, budget_bytes: int) -> list[_Job]:
+        """The next packets, repetitions first, about `budget_bytes` of them."""
+        jobs: list[_Job] = []
+        while budget_bytes > 0:
+            job = self._next()
+            if job is None:
+                break
+            jobs.append(job)
+            budget_bytes -= job.block.packet_size
+        return jobs
+
+    def _next(self) -> _Job | None:
+        if self.resends:
+            return self.resends.pop(next(iter(self.resends)))
+        if self.block is None:
+            return None
+        job = next(self.block, None)
+        if job is None:
+            self.block = None
+        return job
+
+
+class StreamSender:
+    """One thread that owns the sending side of the stream socket.
+
+    At most one block is under way; the last KEPT_BLOCKS can be asked for again. `pace_MBps` in 1e6 bytes/s.
+    """
+
+    def __init__(self, stream: socket.socket, faults: CameraFaults, pace_MBps: float) -> None:
+        self._socket = stream
+        self._faults = faults
+        self._pace_Bps = pace_MBps * 1e6
+        self._random = random.Random(faults.seed)
+        self._burst_left = 0
+        self._free_at_s = 0.0
+        self._gap_s = 0.0
+        self._wake = threading.Condition()
+        self._closed = threading.Event()
+        self._queue = _Queue()
+        self._kept: deque[tuple[Block, Destination]] = deque(maxlen=KEPT_BLOCKS)
+        self.counts = StreamCounts()
+        self._thread = threading.Thread(target=self._run, name="gvsp sender", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop at once; the socket stays open."""
+        self._closed.set()
+        with self._wake:
+            self._wake.notify_all()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def send(self, block: Block, destination: Destination, gap_s: float = 0.0) -> None:
+        """Send one block and return when its last packet has left (or it was abandoned).
+
+        `gap_s` is the pause that the client asked for between two packets (GevSCPD).
+        """
+        faults = self._faults
+        skipped = {0} if faults.drop_leader else set[int]()
+        if faults.drop_trailer:
+            skipped.add(block.trailer_id)
+        with self._wake:
+            self._kept.append((block, destination))
+            self._gap_s = gap_s
+            packet_ids = (packet_id for packet_id in range(block.trailer_id + 1) if packet_id not in skipped)
+            self._queue.block = (_Job(block, packet_id, destination) for packet_id in packet_ids)
+            self.counts.blocks += 1
+            self._wake.notify_all()
+            self._wake.wait_for(lambda: self._queue.block is None or self._closed.is_set())
+
+    def resend(self, resend: Resend) -> None:
+        """Queue packets once more; a block that is gone is answered by one UNAVAILABLE packet."""
+        if self._faults.no_resend:
+            return
+        with self._wake:
+            for block, destination in self._kept:
+                if block.block_id == resend.block_id:
+                    self._repeat(block, destination, resend)
+                    break
+            else:
+                self._refuse(resend)
+            self._wake.notify_all()
+
+    def abandon(self) -> None:
+        """Forget what is under way and what was kept."""
+        with self._wake:
+            self._queue = _Queue()
+            self._kept.clear()
+            self._wake.notify_all()
+
+    def _repeat(self, block: Block, destination: Destination, resend: Resend) -> None:
+        for packet_id in range(resend.first, min(resend.last, block.trailer_id) + 1):
+            job = _Job(block, packet_id, destination, gvsp.RESENT)
+            self._queue.resends.setdefault((block.block_id, packet_id), job)
+
+    def _refuse(self, resend: Resend) -> None:
+        if not self._kept:  # nobody to tell
+            return
+        _, destination = self._kept[-1]
+        kind = gvsp.Kind.PAYLOAD
+        header = gvsp.header(kind, resend.block_id, resend.first, gvsp.UNAVAILABLE, resend.extended)
+        self._queue.refusals.append((header, destination))
+
+    # -------------------------------------------------------------------------------------------------- the thread
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: not self._queue.empty() or self._closed.is_set())
+                if self._closed.is_set():
+                    return
+                refusals = list(self._queue.refusals)
+                self._queue.refusals.clear()
+                jobs = self._queue.take(_BURST_bytes)
+            for header, destination in refusals:
+                self.counts.unavailable += 1
+                self._transmit([header], destination)
+            for job in jobs:
+                self.counts.resent += job.status == gvsp.RESENT
+                self._transmit(job.block.packet(job.packet_id, job.status), job.destination)
+            self._pace(sum(job.block.packet_size for job in jobs), len(jobs))
+            with self._wake:
+                self._wake.notify_all()
+
+    def _transmit(self, parts: list[bytes] | tuple[bytes, bytes | memoryview], destination: Destination) -> None:
+        if self._faults.silent_gvsp:
+            return
+        if self._lost():
+            self.counts.lost += 1
+            return
+        self._socket.sendmsg(parts, [], 0, destination)
+        self.counts.packets += 1
+
+    def _lost(self) -> bool:
+        if self._burst_left > 0:
+            self._burst_left -= 1
+            return True
+        if self._faults.loss <= 0 or self._random.random() >= self._faults.loss:
+            return False
+        self._burst_left = self._faults.burst - 1
+        return True
+
+    def _pace(self, size_bytes: int, packets: int) -> None:
+        """Wait until the wire would be free again."""
+        if self._faults.unpaced:
+            return
+        now_s = time.monotonic()
+        self._free_at_s = (
+            max(self._free_at_s, now_s - _CATCH_UP_s) + size_bytes / self._pace_Bps + packets * self._gap_s
+        )
+        if self._free_at_s > now_s:
+            self._closed.wait(self._free_at_s - now_s)
