@@ -36,9 +36,10 @@ class Poller:
         while True:
             due_ns = max(due_ns + period_ns, self.clock.now_ns())  # a late poll is not made up for by a burst
             await self.clock.sleep_until(due_ns)
-            await self._poll()
+            await self.poll()
 
-    async def _poll(self) -> None:
+    async def poll(self) -> None:
+        """Read once and publish; a failed read is published as BAD readings."""
         try:
             readings = await self.sensor.read()
         except DeviceError as error:

@@ -1,0 +1,107 @@
+"""A byte link, serial or TCP: blocking, with real-time time-outs; used from one thread at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from dataclasses import dataclass
+from typing import Protocol
+
+import serial
+
+from drivers.interface import Unreachable
+
+
+class ByteLink(Protocol):
+    """What a byte protocol needs of its wire. All three raise Unreachable when the wire is gone."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`."""
+        ...
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has arrived, waiting at most `timeout_s` for the first byte; b"" when nothing came."""
+        ...
+
+    def close(self) -> None:
+        """Let go; may be called twice."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SerialSettings:
+    """Baud, data bits 8, parity N, stop bits."""
+
+    baud: int
+    stopbits: int
+
+
+def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
+    """Open `serial:PATH` (exclusively) or `tcp:HOST:PORT` for `device`; raises Unreachable."""
+    kind, _, place = address.partition(":")
+    if kind == "serial":
+        return _SerialLink(device, place, settings)
+    if kind == "tcp":
+        host, _, port = place.rpartition(":")
+        return _TcpLink(device, host, int(port))
+    raise ValueError(f"{device}: an address is serial:PATH or tcp:HOST:PORT, not {address!r}")
+
+
+class _SerialLink:
+    def __init__(self, device: str, path: str, settings: SerialSettings) -> None:
+        self._device = device
+        self._path = path
+        try:
+            self._port = serial.Serial(path, settings.baud, stopbits=settings.stopbits, exclusive=True)
+        except (serial.SerialException, OSError) as error:
+            raise Unreachable(device, f"cannot open {path} ({error})") from error
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except (serial.SerialException, OSError) as error:
+            raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
+
+    def read(self, timeout_s: float) -> bytes:
+        try:
+            self._port.timeout = timeout_s
+            first = self._port.read(1)
+            return first + self._port.read(self._port.in_waiting) if first else b""
+        except (serial.SerialException, OSError) as error:
+            raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
+
+    def close(self) -> None:
+        with contextlib.suppress(serial.SerialException, OSError):
+            self._port.close()
+
+
+class _TcpLink:
+    def __init__(self, device: str, host: str, port: int) -> None:
+        self._device = device
+        self._where = f"{host}:{port}"
+        try:
+            self._socket = socket.create_connection((host, port), timeout=1.0)
+        except OSError as error:
+            raise Unreachable(device, f"cannot connect to {self._where} ({error})") from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._socket.sendall(data)
+        except OSError as error:
+            raise Unreachable(self._device, f"{self._where} is gone ({error})") from error
+
+    def read(self, timeout_s: float) -> bytes:
+        try:
+            self._socket.settimeout(timeout_s)
+            data = self._socket.recv(4096)
+        except TimeoutError:
+            return b""
+        except OSError as error:
+            raise Unreachable(self._device, f"{self._where} is gone ({error})") from error
+        if not data:
+            raise Unreachable(self._device, f"{self._where} closed the connection")
+        return data
+
+    def close(self) -> None:
+        self._socket.close()

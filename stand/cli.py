@@ -1,0 +1,199 @@
+"""The `stand` command."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.clock import NS_PER_S, WallClock
+from drivers.interface import ConfigError, StandError
+from experiments.steps import kind_of, parameters_of
+from stand.config import StandConfig, load_config, packaged
+from stand.demo import run_demo
+from stand.estimate import PricedStep, price
+from stand.hub import Hub, Item, StepMark, StepState
+from stand.progress import progress
+from stand.recipe import Recipe, load_recipe
+from stand.run import Interrupted, Order, run_real, run_virtual
+from stand.simulator import Simulator, laboratory_of
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="Drive the thermal test stand: plan, run, simulate.\n\nExample: stand run overnight --config my-stand.yaml",
+)
+
+ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
+RecipeArgument = Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")]
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Where the session and the report go.")] = Path("demo"),
+) -> None:
+    """Run a simulated thermal cycle, fit the drift, and print what compensation gains.
+
+    Example: stand demo --out /tmp/demo
+    """
+    with _one_line_errors():
+        config, recipe = _config("simulated"), _recipe("demo")
+        order = _order(config, recipe)
+        with _run_progress(price(recipe[0].plan(), config[0])) as watch:
+            session = asyncio.run(run_virtual(order, out, None, watch))
+        for line in run_demo(session, out):
+            typer.echo(line)
+
+
+@app.command()
+def simulate(
+    config: Annotated[str, typer.Argument(help="A configuration with a `simulation` section.")] = "simulated",
+) -> None:
+    """The simulated laboratory in real time, until interrupted: every device answers at its configured address.
+
+    Example: stand simulate & stand run demo
+    """
+    with _one_line_errors():
+        stand_config, _ = _config(config)
+        simulator = Simulator(laboratory_of(stand_config, virtual=False, seed=None))
+        typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
+        try:
+            signal.sigwait({signal.SIGINT, signal.SIGTERM})
+        except KeyboardInterrupt:
+            pass
+        finally:
+            simulator.stop()
+
+
+@app.command()
+def plan(
+    recipe: RecipeArgument,
+    config: ConfigOption = "simulated",
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
+) -> None:
+    """The steps of a recipe with durations, frames, bytes and end time, without running anything.
+
+    Example: stand plan thermal-cycle --json
+    """
+    with _one_line_errors():
+        steps = price(_recipe(recipe)[0].plan(), _config(config)[0])
+        total_s = sum(step.duration_s for step in steps)
+        now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
+        end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
+        totals = {
+            "duration_s": total_s,
+            "frames": sum(step.frames for step in steps),
+            "bytes": round(sum(step.size_bytes for step in steps)),
+            "end": end,
+        }
+        if as_json:
+            typer.echo(json.dumps({"steps": [step.as_json() for step in steps], **totals}, indent=2))
+            return
+        for step in steps:
+            typer.echo(_line(step))
+        typer.echo(
+            f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
+            f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
+        )
+
+
+@app.command()
+def run(
+    recipe: RecipeArgument,
+    config: ConfigOption = "simulated",
+    out: Annotated[Path | None, typer.Option(help="Where the session goes; else recording.directory.")] = None,
+    virtual_time: Annotated[
+        bool, typer.Option("--virtual-time", help="As fast as it goes, with a simulated laboratory of its own.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="The simulated laboratory's seed (with --virtual-time).")] = None,
+) -> None:
+    """Run a recipe and record it; prints the session's folder.
+
+    Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions
+    """
+    with _one_line_errors():
+        if seed is not None and not virtual_time:
+            raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
+        config_file, recipe_file = _config(config), _recipe(recipe)
+        order = _order(config_file, recipe_file)
+        directory = out or config_file[0].recording.directory
+        with _run_progress(price(recipe_file[0].plan(), config_file[0])) as watch:
+            work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
+            session = asyncio.run(work)
+        typer.echo(session)
+
+
+def _config(name: str) -> tuple[StandConfig, str]:
+    path = packaged("", name)
+    return load_config(path), path.read_text(encoding="utf-8")
+
+
+def _recipe(name: str) -> tuple[Recipe, str]:
+    path = packaged("recipes", name)
+    return load_recipe(path), path.read_text(encoding="utf-8")
+
+
+def _order(config: tuple[StandConfig, str], recipe: tuple[Recipe, str]) -> Order:
+    target = packaged("targets", config[0].target).read_text(encoding="utf-8")
+    return Order(config[0], recipe[0], config[1], recipe[1], target)
+
+
+@contextmanager
+def _run_progress(steps: tuple[PricedStep, ...]) -> Generator[Callable[[Hub], None]]:
+    """Progress in expected seconds of the plan, moved on by the steps' marks."""
+    with progress("run", sum(step.duration_s for step in steps)) as report:
+        done_s = 0.0
+
+        def follow(item: Item) -> None:
+            nonlocal done_s
+            if isinstance(item, StepMark) and item.state is StepState.DONE:
+                done_s += steps[item.index].duration_s
+            if isinstance(item, StepMark):
+                report(done_s, f"{item.index + 1}/{len(steps)} {item.kind} {_parameters(item.parameters)}")
+
+        yield lambda hub: hub.subscribe(follow)
+
+
+@contextmanager
+def _one_line_errors() -> Generator[None]:
+    """Bad input ends with status 2, a stand that fails with 1, an interrupted run with 130; each with its sentence."""
+    try:
+        yield
+    except ConfigError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+    except Interrupted as error:
+        typer.echo(f"{error}; the stand is safe", err=True)
+        raise typer.Exit(130) from error
+    except (StandError, OSError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(1) from error
+
+
+def _line(step: PricedStep) -> str:
+    planned = step.planned
+    return (
+        f"{planned.index:4d}  {planned.step_id}  {kind_of(planned.step):<15s}"
+        f"{_parameters(parameters_of(planned.step)):<72s}{_hours(step.duration_s):>12s}"
+        + (f"{step.frames:6d} frames {step.size_bytes / 1e6:8.1f} MB" if step.frames else "")
+    )
+
+
+def _parameters(parameters: dict[str, object]) -> str:
+    return " ".join(f"{name}={value}" for name, value in parameters.items())
+
+
+def _hours(duration_s: float) -> str:
+    return str(timedelta(seconds=round(duration_s)))
+
+
+if __name__ == "__main__":
+    sys.exit(app())

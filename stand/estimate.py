@@ -1,0 +1,82 @@
+"""What a plan will take, before anything moves: time, frames, bytes; and whether this stand may do it at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from drivers.interface import ConfigError
+from experiments.steps import (
+    Capture,
+    MoveTo,
+    PlannedStep,
+    SetTemperature,
+    StartChamber,
+    estimate_s,
+    frames_of,
+    kind_of,
+    parameters_of,
+)
+from stand.config import StandConfig
+
+# Recorded bytes per pixel and second, measured on simulated sessions (README, Decisions): PNG of a target image at
+# 1 DN of noise, raw 8 bit, and telemetry with every device polled at 1 Hz.
+_BYTES_PER_PIXEL = {"png": 0.36, "raw": 1.0}
+_TELEMETRY_BYTES_PER_S = 650.0
+_SENSOR_PX = (2448, 2048)
+
+
+@dataclass(frozen=True, slots=True)
+class PricedStep:
+    """A step with its expected duration (s), frames and recorded bytes."""
+
+    planned: PlannedStep
+    duration_s: float
+    frames: int
+    size_bytes: float
+
+    def as_json(self) -> dict[str, object]:
+        """One entry of `stand plan --json`."""
+        return {
+            "index": self.planned.index,
+            "id": self.planned.step_id,
+            "kind": kind_of(self.planned.step),
+            "parameters": parameters_of(self.planned.step),
+            "duration_s": self.duration_s,
+            "frames": self.frames,
+            "bytes": round(self.size_bytes),
+        }
+
+
+def price(plan: Iterable[PlannedStep], config: StandConfig) -> tuple[PricedStep, ...]:
+    """Every step priced; ConfigError naming the first step that goes outside the stand's limits."""
+    width_px = config.camera.width_px or _SENSOR_PX[0]
+    height_px = config.camera.height_px or _SENSOR_PX[1]
+    frame_bytes = width_px * height_px * _BYTES_PER_PIXEL[config.recording.frame_encoding]
+    priced: list[PricedStep] = []
+    for planned in plan:
+        _check(planned, config)
+        duration_s, frames = estimate_s(planned.step), frames_of(planned.step)
+        size_bytes = frames * frame_bytes + duration_s * _TELEMETRY_BYTES_PER_S
+        priced.append(PricedStep(planned, duration_s, frames, size_bytes))
+    return tuple(priced)
+
+
+def _check(planned: PlannedStep, config: StandConfig) -> None:
+    step = planned.step
+    where = f"step {planned.index} ({kind_of(step)})"
+    if isinstance(step, StartChamber | SetTemperature):
+        low, high = config.limits.chamber_degC
+        if not low <= step.chamber_degC <= high:
+            raise ConfigError(f"{where}: {step.chamber_degC} degC is outside limits.chamber_degC {low}..{high}")
+    if isinstance(step, MoveTo):
+        axis = next((axis for name, axis in config.axes.items() if name == step.axis), None)
+        if axis is None:
+            raise ConfigError(f"{where}: this stand has no axis {step.axis!r}, only {', '.join(config.axes) or 'none'}")
+        if not axis.limits[0] <= step.position <= axis.limits[1]:
+            raise ConfigError(
+                f"{where}: {step.position} {axis.unit} is outside the limits {axis.limits} of {step.axis}"
+            )
+    if isinstance(step, Capture) and step.frames > 1 and step.interval_s < 1 / config.camera.frame_rate_hz - 1e-9:
+        rate_hz = config.camera.frame_rate_hz
+        raise ConfigError(f"{where}: a frame every {step.interval_s} s is faster than camera.frame_rate_hz {rate_hz}")
