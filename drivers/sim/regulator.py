@@ -1,0 +1,353 @@
+"""A heating/cooling regulator on the bus: Omron E5CC, registers in two-byte mode, with a real PID inside.
+
+Source: communications manual H175, section 4 (functions, refusals, operation commands). The PID runs at every step of
+the plant; nothing depends on when the registers are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from enum import IntEnum
+from typing import Protocol
+
+from drivers.clock import seconds_ns
+from drivers.sim.modbus import (
+    ILLEGAL_ADDRESS,
+    ILLEGAL_VALUE,
+    OPERATION_ERROR,
+    Now,
+    Refusal,
+    Timeline,
+    answer,
+    echoes,
+    reads_words,
+    writes_one,
+    writes_words,
+)
+from drivers.sim.pid import OFF, Gains, Outputs, PidState, Side, on_time_ns, resume, start, step
+from drivers.sim.regulator_table import (
+    COOL_BAND,
+    COOL_DERIVATIVE,
+    COOL_INTEGRAL,
+    COOL_PERIOD,
+    DEAD_BAND,
+    HEAT_BAND,
+    HEAT_DERIVATIVE,
+    HEAT_INTEGRAL,
+    HEAT_PERIOD,
+    INPUT_SHIFT,
+    MV_AT_ERROR,
+    MV_AT_STOP,
+    MV_LOWER,
+    MV_UPPER,
+    PARAMETERS,
+    PT100_RANGE_DEGC,
+    SETPOINT,
+    Writable,
+    stored_at,
+    to_value,
+    to_word,
+)
+
+MOST_WORDS = 104
+SHORT_PERIODS_S = {-2: 0.1, -1: 0.2, 0: 0.5}  # coded values of the control period, else whole seconds
+
+
+class Chamber(Timeline, Protocol):
+    """What the regulator sees and moves of the plant."""
+
+    heater_on_fraction: float
+
+    @property
+    def chamber_degC(self) -> float:
+        """Temperature of the regulator's probe."""
+        ...
+
+
+class Mode(IntEnum):
+    """What the unit is in, by its bit in the high word of the status."""
+
+    RAM = 4
+    TUNING = 7
+    STOP = 8
+    WRITING = 9
+    MANUAL = 10
+
+
+DIFFERS_BIT = 5  # RAM differs from EEPROM
+
+
+class FakeRegulator:
+    """E5CC on the bus as unit `unit`. Powers up stopped, in backup mode, with communications writing disabled.
+
+    Faults: silent; compoway (the factory protocol is selected: no answer on Modbus); sensor_break; ad_error;
+    stuck_pv_degC (the PV stays there); pv_offset_K (the probe reads wrong); display_decimals other than 1;
+    setpoint_clamp_degC (a set point is acknowledged but stored inside these limits).
+    eeprom_writes counts worn cells. alpha: set-point filter coefficient, set on the panel.
+    """
+
+    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
+        self.unit = unit
+        self.alpha = 0.65
+        self.eeprom_writes = 0
+        self.silent = False
+        self.compoway = False
+        self.sensor_break = False
+        self.ad_error = False
+        self.stuck_pv_degC: float | None = None
+        self.pv_offset_K = 0.0
+        self.display_decimals = 1
+        self.setpoint_clamp_degC: tuple[float, float] | None = None
+        self._plant = plant
+        self._clock = clock
+        self._eeprom = {address: parameter.default for address, parameter in PARAMETERS.items()}
+        self._functions = {
+            0x03: reads_words(self._read, MOST_WORDS),
+            0x06: writes_one(self._write_one),
+            0x08: echoes,
+            0x10: writes_words(self._write, MOST_WORDS),
+        }
+        self._measurements = self._measured()
+        self._commands = self._operation_commands()
+        self._power_up()
+        plant.on_step.append(self._on_step)
+
+    # On the wire.
+
+    def handle(self, pdu: bytes) -> bytes | None:
+        """The reply to a request; None when silent and for a software reset."""
+        with self._now():
+            return None if self.silent or self.compoway else answer(pdu, self._functions)
+
+    def _read(self, address: int, count: int) -> list[int]:
+        first = stored_at(address)
+        if first not in PARAMETERS and first not in self._measurements:
+            raise Refusal(ILLEGAL_ADDRESS)
+        return [self._register(stored_at(each)) for each in range(address, address + count)]
+
+    def _register(self, address: int) -> int:
+        """One register; the holes between the known ones read as 0."""
+        if address in self._measurements:
+            return self._measurements[address]()
+        if address in PARAMETERS:
+            return to_word(self._ram[address], self._decimals(address))
+        return 0
+
+    def _measured(self) -> dict[int, Callable[[], int]]:
+        """The read-only registers; no current transformer is fitted, and status 2 has nothing to say."""
+        return {
+            0x2000: lambda: to_word(self._shown_degC(), self.display_decimals),
+            0x2001: self._status_low,
+            0x2002: lambda: self._register(SETPOINT),
+            0x2003: lambda: 0,
+            0x2004: lambda: to_word(self.outputs.heat_pct, 1),
+            0x2005: lambda: to_word(self.outputs.cool_pct, 1),
+            0x2406: self._status_low,
+            0x2407: self._status_high,
+            0x2408: lambda: 0,
+            0x2409: lambda: 0,
+            0x2410: lambda: self.display_decimals,
+        }
+
+    def _status_low(self) -> int:
+        heating = self._conducts(self.outputs.heat_pct, HEAT_PERIOD)
+        cooling = self._conducts(self.outputs.cool_pct, COOL_PERIOD)
+        return self.ad_error << 2 | self.sensor_break << 6 | heating << 8 | cooling << 9
+
+    def _status_high(self) -> int:
+        differs = self._ram != self._eeprom
+        return differs << DIFFERS_BIT | sum(1 << mode for mode in self._modes)
+
+    def _write_one(self, address: int, value: int) -> bool:
+        """FC 06: addresses 0x0000 and 0xFFFF take operation commands (H175 4-4-3)."""
+        if address in (0x0000, 0xFFFF):
+            return self._command(value)
+        self._write(address, [value])
+        return True
+
+    def _write(self, address: int, words: Sequence[int]) -> None:
+        """Write all or nothing; refused in the order of H175 4-1-3: address, value, operating state."""
+        addresses = [stored_at(each) for each in range(address, address + len(words))]
+        if not all(each in PARAMETERS for each in addresses):
+            raise Refusal(ILLEGAL_ADDRESS)
+        values = [to_value(word, self._decimals(each)) for each, word in zip(addresses, words, strict=True)]
+        for each, value in zip(addresses, values, strict=True):
+            if not PARAMETERS[each].low <= value <= PARAMETERS[each].high:
+                raise Refusal(ILLEGAL_VALUE)
+        if (
+            Mode.WRITING not in self._modes
+            or Mode.TUNING in self._modes
+            or not all(self._takes(each) for each in addresses)
+        ):
+            raise Refusal(OPERATION_ERROR)
+        for each, value in zip(addresses, values, strict=True):
+            self._store(each, value, keep=Mode.RAM not in self._modes)
+
+    def _takes(self, address: int) -> bool:
+        writable = PARAMETERS[address].writable
+        return writable is Writable.ALWAYS or (writable is Writable.STOPPED and Mode.STOP in self._modes)
+
+    def _store(self, address: int, value: float, *, keep: bool) -> None:
+        if address == SETPOINT and self.setpoint_clamp_degC is not None:
+            low, high = self.setpoint_clamp_degC
+            value = min(high, max(low, value))
+        self._ram[address] = value
+        if keep:
+            self._eeprom[address] = value
+            self.eeprom_writes += 1
+
+    def _decimals(self, address: int) -> int:
+        decimals = PARAMETERS[address].decimals
+        return self.display_decimals if decimals is None else decimals
+
+    # Operation commands (H175 4-4-3).
+
+    def _command(self, value: int) -> bool:
+        """Obey a command; False when it is not to be answered."""
+        command = self._commands.get(value)
+        if command is None:
+            raise Refusal(ILLEGAL_VALUE)
+        if value not in (0x0000, 0x0001) and Mode.WRITING not in self._modes:
+            raise Refusal(OPERATION_ERROR)
+        command()
+        return value != 0x0600
+
+    def _operation_commands(self) -> dict[int, Callable[[], None]]:
+        return {
+            0x0000: lambda: self._modes.discard(Mode.WRITING),
+            0x0001: lambda: self._modes.add(Mode.WRITING),
+            0x0100: lambda: self._modes.discard(Mode.STOP),
+            0x0101: self._stop,
+            0x0300: lambda: self._modes.discard(Mode.TUNING),
+            0x0301: self._tune,
+            0x0302: self._tune,
+            0x0400: lambda: self._modes.discard(Mode.RAM),
+            0x0401: lambda: self._modes.add(Mode.RAM),
+            0x0500: self._save,
+            0x0600: self._power_up,
+            0x0900: self._automatic,
+            0x0901: lambda: self._modes.add(Mode.MANUAL),
+            0x0B00: self._initialize,
+            0x0C0F: lambda: None,  # cancel alarm latches: there are none
+        }
+
+    def _stop(self) -> None:
+        self._modes |= {Mode.STOP}
+        self._modes -= {Mode.TUNING}
+        self._pid = None
+        self.outputs = _signed(self._ram[MV_AT_STOP])
+
+    def _tune(self) -> None:
+        """Only the status bit and the refusal of writes are played; it lasts until cancelled and tunes nothing."""
+        if self._modes & {Mode.STOP, Mode.MANUAL}:
+            raise Refusal(OPERATION_ERROR)
+        self._modes.add(Mode.TUNING)
+
+    def _automatic(self) -> None:
+        if Mode.MANUAL in self._modes and Mode.STOP not in self._modes:
+            self._pid = resume(self.outputs, self._ram[SETPOINT], self._pv_degC(), self._gains())
+        self._modes.discard(Mode.MANUAL)
+
+    def _save(self) -> None:
+        for address, value in self._ram.items():
+            if self._eeprom[address] != value:
+                self._store(address, value, keep=True)
+
+    def _initialize(self) -> None:
+        """Everything as delivered, the factory protocol included: the unit is gone from Modbus."""
+        self._eeprom = {address: parameter.default for address, parameter in PARAMETERS.items()}
+        self._power_up()
+        self.compoway = True
+
+    def _power_up(self) -> None:
+        self._ram = dict(self._eeprom)
+        self._modes = {Mode.STOP}
+        self._pid: PidState | None = None
+        self.outputs = OFF
+
+    # On the front panel and at the mains.
+
+    def power_cycle(self) -> None:
+        """Off and on again: RAM values, RAM mode and communications writing are gone, and it is stopped."""
+        with self._now():
+            self._power_up()
+
+    def press_stop(self) -> None:
+        """Somebody stops control with the keys."""
+        with self._now():
+            self._stop()
+
+    def press_manual(self, heat_pct: float) -> None:
+        """Somebody takes over with the keys and dials in a heating output, %."""
+        with self._now():
+            self._modes.add(Mode.MANUAL)
+            self.outputs = Outputs(heat_pct, 0.0)
+
+    def press_automatic(self) -> None:
+        """Somebody gives control back with the keys."""
+        with self._now():
+            self._automatic()
+
+    def press_setpoint(self, setpoint_degC: float) -> None:
+        """Somebody changes the set point with the keys; that is kept in EEPROM."""
+        with self._now():
+            self._store(SETPOINT, setpoint_degC, keep=True)
+
+    # Control.
+
+    @contextmanager
+    def _now(self) -> Generator[None]:
+        with self._plant.lock:
+            self._now_ns = self._clock.now_ns()
+            self._plant.advance(self._now_ns)
+            yield
+
+    def _on_step(self, time_ns: int, dt_s: float) -> None:
+        self.outputs = self._control(dt_s)
+        dt_ns = seconds_ns(dt_s)
+        on_ns = on_time_ns(time_ns, time_ns + dt_ns, self.outputs.heat_pct / 100, self._period_ns(HEAT_PERIOD))
+        self._plant.heater_on_fraction = on_ns / dt_ns
+
+    def _control(self, dt_s: float) -> Outputs:
+        if Mode.STOP in self._modes:
+            return _signed(self._ram[MV_AT_STOP])
+        if Mode.MANUAL in self._modes:
+            return self.outputs
+        if self.sensor_break or self.ad_error:
+            self._pid = None
+            return _signed(self._ram[MV_AT_ERROR])
+        pv_degC = self._pv_degC()
+        outputs, self._pid = step(self._pid or start(pv_degC), self._ram[SETPOINT], pv_degC, dt_s, self._gains())
+        return outputs
+
+    def _pv_degC(self) -> float:
+        if self.stuck_pv_degC is not None:
+            return self.stuck_pv_degC
+        return self._plant.chamber_degC + self.pv_offset_K + self._ram[INPUT_SHIFT]
+
+    def _shown_degC(self) -> float:
+        low_degC, high_degC = PT100_RANGE_DEGC
+        return high_degC if self.sensor_break else min(high_degC, max(low_degC, self._pv_degC()))
+
+    def _gains(self) -> Gains:
+        ram = self._ram
+        return Gains(
+            heat=Side(ram[HEAT_BAND], ram[HEAT_INTEGRAL], ram[HEAT_DERIVATIVE], ram[MV_UPPER]),
+            cool=Side(ram[COOL_BAND], ram[COOL_INTEGRAL], ram[COOL_DERIVATIVE], -ram[MV_LOWER]),
+            dead_band_K=ram[DEAD_BAND],
+            alpha=self.alpha,
+        )
+
+    def _period_ns(self, address: int) -> int:
+        coded = self._ram[address]
+        return seconds_ns(SHORT_PERIODS_S.get(int(coded), coded))
+
+    def _conducts(self, output_pct: float, period_address: int) -> bool:
+        """Whether a time-proportioned output is on at the instant of the request."""
+        return on_time_ns(self._now_ns, self._now_ns + 1, output_pct / 100, self._period_ns(period_address)) > 0
+
+
+def _signed(mv_pct: float) -> Outputs:
+    """A signed manipulated value (negative = cooling) as two outputs."""
+    return Outputs(max(0.0, mv_pct), max(0.0, -mv_pct))

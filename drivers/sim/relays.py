@@ -1,0 +1,196 @@
+"""A board of eight relays on the bus: Waveshare Modbus RTU Relay, protocol V2.
+
+Source: waveshare.com/wiki/Template:Modbus_RTU_Relay_Protocol_V2. The numbers of the version and address registers, and
+that a repeated timed-on starts its time again, were not confirmed on a board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+from drivers.clock import NS_PER_S
+from drivers.sim.modbus import (
+    ILLEGAL_ADDRESS,
+    ILLEGAL_VALUE,
+    Now,
+    Refusal,
+    Timeline,
+    answer,
+    reads_bits,
+    reads_words,
+    writes_bits,
+    writes_one,
+)
+
+RELAYS = 8
+ALL_RELAYS = 0x00FF
+TIMED_ON, TIMED_OFF = 0x0200, 0x0400
+TIMED_UNIT_NS = NS_PER_S // 10
+LONGEST_TIME = 0x7FFF
+ON, OFF, TOGGLE = 0xFF00, 0x0000, 0x5500
+ADDRESS_REGISTER, VERSION_REGISTER = 0x4000, 0x8000
+VERSION = 200  # V2.00
+
+
+class Contacts(Timeline, Protocol):
+    """What the relays switch in the plant."""
+
+    heater_enabled: bool
+    compressor_on: bool
+
+    @property
+    def camera_powered(self) -> bool:
+        """Whether the camera's supply is on."""
+        ...
+
+    @camera_powered.setter
+    def camera_powered(self, powered: bool) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Relay:
+    """One relay since its last command: `closed` until `until_ns`, then the opposite; None = for good."""
+
+    closed: bool = False
+    until_ns: int | None = None
+
+    def closed_at(self, time_ns: int) -> bool:
+        """Its state at a time after the command."""
+        return self.closed if self.until_ns is None or time_ns < self.until_ns else not self.closed
+
+
+class FakeRelays:
+    """The board as unit `unit`; `channels` says which relay, counted from 0, switches which contact of the plant:
+    heater_enable, compressor, camera_power. All relays are open at power-up.
+
+    Faults: silent; lost_writes (acknowledged, not done); welded (names of contacts that stay closed whatever the
+    coil does); rearms False (a repeated timed-on does not start its time again).
+    """
+
+    def __init__(self, plant: Contacts, clock: Now, unit: int, channels: Mapping[str, int]) -> None:
+        switches: dict[str, Callable[[bool], None]] = {
+            "heater_enable": self._enable_heater,
+            "compressor": self._run_compressor,
+            "camera_power": self._power_camera,
+        }
+        if not channels.keys() <= switches.keys() or not set(channels.values()) <= set(range(RELAYS)):
+            raise ValueError(f"relay channels {dict(channels)}: expected {', '.join(switches)} -> 0..{RELAYS - 1}")
+        self.unit = unit
+        self.silent = False
+        self.lost_writes = False
+        self.welded: set[str] = set()
+        self.rearms = True
+        self._plant = plant
+        self._clock = clock
+        self._channels = dict(channels)
+        self._switches = switches
+        self._relays = [Relay()] * RELAYS
+        self._functions = {
+            0x01: reads_bits(self._read_coils),
+            0x03: reads_words(self._read_registers),
+            0x05: writes_one(self._write_coil),
+            0x06: writes_one(self._write_register),
+            0x0F: writes_bits(self._write_coils),
+        }
+        plant.on_step.append(lambda time_ns, _: self._switch(time_ns))
+
+    def handle(self, pdu: bytes) -> bytes | None:
+        """The reply to a request."""
+        with self._now():
+            return None if self.silent else answer(pdu, self._functions)
+
+    def power_cycle(self) -> None:
+        """Off and on again: every relay is open."""
+        with self._now():
+            self._relays = [Relay()] * RELAYS
+            self._switch(self._now_ns)
+
+    def closed(self, channel: str) -> bool:
+        """Whether the contact of that name conducts now, which a welded one does whatever its coil says."""
+        with self._now():
+            return self._conducts(channel, self._now_ns)
+
+    def _read_coils(self, address: int, count: int) -> list[bool]:
+        _check_span(address, count)
+        return [relay.closed_at(self._now_ns) for relay in self._relays[address : address + count]]
+
+    def _write_coil(self, address: int, value: int) -> bool:
+        """FC 05: one relay, all of them, or one for a time; the reply always repeats the request."""
+        base, relay = address & 0xFF00, address & 0xFF
+        if base in (TIMED_ON, TIMED_OFF) and relay < RELAYS:
+            self._set_timed(relay, value, closed=base == TIMED_ON)
+        elif address < RELAYS or address == ALL_RELAYS:
+            if value not in (ON, OFF, TOGGLE):
+                raise Refusal(ILLEGAL_VALUE)
+            for each in range(RELAYS) if address == ALL_RELAYS else (address,):
+                self._set(each, Relay(not self._read_coils(each, 1)[0] if value == TOGGLE else value == ON))
+        else:
+            raise Refusal(ILLEGAL_ADDRESS)
+        self._switch(self._now_ns)
+        return True
+
+    def _set_timed(self, relay: int, time: int, *, closed: bool) -> None:
+        if not 1 <= time <= LONGEST_TIME:
+            raise Refusal(ILLEGAL_VALUE)
+        last = self._relays[relay]
+        runs = last.closed == closed and last.until_ns is not None and self._now_ns < last.until_ns
+        if self.rearms or not runs:
+            self._set(relay, Relay(closed, self._now_ns + time * TIMED_UNIT_NS))
+
+    def _write_coils(self, address: int, bits: Sequence[bool]) -> None:
+        _check_span(address, len(bits))
+        for relay, closed in enumerate(bits, address):
+            self._set(relay, Relay(closed))
+        self._switch(self._now_ns)
+
+    def _set(self, relay: int, state: Relay) -> None:
+        if not self.lost_writes:
+            self._relays[relay] = state
+
+    def _read_registers(self, address: int, count: int) -> list[int]:
+        values = {ADDRESS_REGISTER: self.unit, VERSION_REGISTER: VERSION}
+        if address not in values or count != 1:
+            raise Refusal(ILLEGAL_ADDRESS)
+        return [values[address]]
+
+    def _write_register(self, address: int, value: int) -> bool:
+        if address != ADDRESS_REGISTER:
+            raise Refusal(ILLEGAL_ADDRESS)
+        if not 1 <= value <= 255:
+            raise Refusal(ILLEGAL_VALUE)
+        self.unit = value
+        return True
+
+    # Behind the relays. A relay's state is a pure function of its last command and the time, so that a run does not
+    # depend on when the coils are read; the plant takes it over at the begin of each of its steps.
+
+    @contextmanager
+    def _now(self) -> Generator[None]:
+        with self._plant.lock:
+            self._now_ns = self._clock.now_ns()
+            self._plant.advance(self._now_ns)
+            yield
+
+    def _switch(self, time_ns: int) -> None:
+        for channel in self._channels:
+            self._switches[channel](self._conducts(channel, time_ns))
+
+    def _conducts(self, channel: str, time_ns: int) -> bool:
+        return channel in self.welded or self._relays[self._channels[channel]].closed_at(time_ns)
+
+    def _enable_heater(self, closed: bool) -> None:
+        self._plant.heater_enabled = closed
+
+    def _run_compressor(self, closed: bool) -> None:
+        self._plant.compressor_on = closed
+
+    def _power_camera(self, closed: bool) -> None:
+        self._plant.camera_powered = closed
+
+
+def _check_span(address: int, count: int) -> None:
+    if address + count > RELAYS:
+        raise Refusal(ILLEGAL_ADDRESS)
