@@ -122,16 +122,17 @@ def pad_sag_mm(temperature_degC: float) -> float:
 
 def modified_camera(nodes: Nodes) -> Camera:
     """Sensor between granite columns, lens on granite prisms, no link between them (paper, section 4)."""
-    carrier_mm = 11.4 * strain(nodes.sensor_degC, ALUMINIUM_per_K, 1000.0)  # the sensor slides up between its columns
-    barrel_mm = 3.6 * strain(nodes.lens_degC, ALUMINIUM_per_K, 320.0)  # the barrel lifts the axis off the prisms
+    carrier_mm = 11.2 * strain(nodes.sensor_degC, ALUMINIUM_per_K, 1000.0)  # the sensor slides up between its columns
+    barrel_mm = 4.6 * strain(nodes.lens_degC, ALUMINIUM_per_K, 320.0)  # the barrel lifts the axis off the prisms
     sag_mm = pad_sag_mm(nodes.lens_degC) - pad_sag_mm(REFERENCE_degC)
-    column_mm = 2.2 * strain(nodes.body_degC, ALUMINIUM_per_K, 700.0)  # the columns are not quite alike
+    column_mm = 2.6 * strain(nodes.body_degC, ALUMINIUM_per_K, 700.0)  # the columns are not quite alike
+    prism_mm = 0.5 * strain(nodes.lens_degC, ALUMINIUM_per_K, 320.0)  # nor are the prisms
     spacing = 0.8 * strain(nodes.granite_inside_degC, GRANITE_per_K, 900.0)  # columns and prisms share the base
     lens = strain(nodes.lens_degC, 4.5e-6, 800.0)
     sensor_warming_K = nodes.sensor_degC - REFERENCE_degC
-    bow_rad = 1.4e-6 * (nodes.granite_inside_degC - nodes.granite_outside_degC)
+    bow_rad = -1.8e-6 * (nodes.granite_inside_degC - nodes.granite_outside_degC)
     return Camera(
-        sensor_mm=(column_mm, carrier_mm - barrel_mm - sag_mm),
+        sensor_mm=(column_mm - prism_mm, carrier_mm - barrel_mm - sag_mm),
         stretch=spacing + lens,
         k1=-0.12 + 1.0e-5 * (nodes.lens_degC - REFERENCE_degC),
         sensor_tilt_rad=(6.0e-6 * sensor_warming_K, 1.5e-6 * sensor_warming_K),
@@ -148,8 +149,8 @@ def unmodified_camera(nodes: Nodes, camera_roll_rad: float) -> Camera:
     slack_K, grip_K = nodes.tensions_K if nodes.tensions_K else (0.0, 0.0)
     return Camera(
         sensor_mm=(
-            0.20 * housing_mm + 4.0e-5 * slack_K + 3.5e-5 * grip_K + droop_mm * math.sin(camera_roll_rad),
-            0.45 * housing_mm + board_mm + 9.0e-5 * slack_K + 6.0e-5 * grip_K + droop_mm * math.cos(camera_roll_rad),
+            0.28 * housing_mm + 5.0e-5 * slack_K + 4.0e-5 * grip_K + droop_mm * math.sin(camera_roll_rad),
+            0.30 * housing_mm + board_mm + 11.0e-5 * slack_K + 8.0e-5 * grip_K + droop_mm * math.cos(camera_roll_rad),
         ),
         stretch=strain(nodes.lens_degC, 4.5e-6, 800.0) + strain(nodes.body_degC, 7.0e-6, 320.0),
         k1=-0.12 + 1.0e-5 * (nodes.lens_degC - REFERENCE_degC),

@@ -6,8 +6,8 @@
         plant.advance(clock.now_ns())
         ...                             # read outputs, set inputs
 
-Temperatures are in degC, heat capacities in J/K, conductances in W/K. The chamber is a chest freezer, 1.2 x 0.9 x 0.8 m:
-its evaporator is bonded to the liner and the fan-heater stirs the air. With these numbers it reaches -10 to +70 degC.
+Temperatures are in degC, heat capacities in J/K, conductances in W/K. The chamber is a chest freezer of
+1.2 x 0.9 x 0.8 m; its evaporator is bonded to the liner and the fan-heater stirs the air. It reaches -10 to +70 degC.
 """
 
 from __future__ import annotations
@@ -30,15 +30,14 @@ DAY_s = 86_400.0
 AIR_J_K = 6_000.0  # 0.86 m3 of air, ducts and racks
 WALL_J_K = 40_000.0  # steel liner with the evaporator's tubes
 AIR_WALL_W_K = 60.0
-WALL_LABORATORY_W_K = 9.0  # the insulation
+WALL_LABORATORY_W_K = 8.0  # the insulation
 FAN_W = 20.0
 FLAP_LEAK_W_K = 12.0  # exchange of air through the open flap
 HEATER_W = 2_000.0
 HEATER_J_K, HEATER_AIR_W_K = 500.0, 20.0  # lag 25 s
 COIL_J_K, COIL_WALL_W_K, COIL_AIR_W_K = 2_500.0, 38.0, 4.0  # lag 60 s
-COMPRESSOR_W = 600.0  # at an evaporator temperature of 0 degC
-COMPRESSOR_per_K = 0.012  # capacity gained per K of evaporator temperature (suction pressure)
-COMPRESSOR_MAX = 1.5  # of COMPRESSOR_W, limited by the motor
+COMPRESSOR_W = 600.0  # at an evaporator of 0 degC and above, where the motor limits it
+COMPRESSOR_per_K = 0.010  # capacity lost per K of evaporator below that (suction pressure)
 CUT_OUT_degC = 85.0  # hard-wired, latching
 
 # Granite slab through the wall: lag inside over an hour
@@ -204,7 +203,7 @@ class Plant:
         self.heater_W = heater_W = HEATER_W * self.heater_on_fraction if heating else 0.0
         pumped_W = 0.0
         if self.compressor_on:
-            pumped_W = COMPRESSOR_W * min(COMPRESSOR_MAX, max(0.0, 1.0 + COMPRESSOR_per_K * coil))
+            pumped_W = COMPRESSOR_W * max(0.0, 1.0 + COMPRESSOR_per_K * min(0.0, coil))
         from_element_W = HEATER_AIR_W_K * (element - air)
         air_to_wall_W = AIR_WALL_W_K * (air - wall)
         wall_to_coil_W = COIL_WALL_W_K * (wall - coil)
