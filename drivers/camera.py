@@ -1,0 +1,171 @@
+"""The camera the stand knows: grab a frame, read its temperature.
+
+Nothing here waits on the wire by itself: `Connection` blocks, in the camera's own lane. When the camera is lost,
+`Unreachable` is raised until `open` is called again; that makes everything new and writes every setting again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+from drivers.aravis_library import AravisError
+from drivers.camera_connection import Connection, FrameCount, Shot
+from drivers.camera_settings import CameraSettings, EffectiveSettings, Identity, TemperatureFeature, device_error
+from drivers.clock import Clock, seconds_ns
+from drivers.interface import DeviceError, Frame, Reading, Unreachable, bad_reading
+from drivers.lane import Lane, Result
+
+__all__ = ["Camera", "CameraSettings", "EffectiveSettings", "Identity", "TemperatureFeature"]
+
+ATTEMPTS = 3  # frames in a row that may fail before the camera counts as lost
+
+
+class Camera:
+    """A GigE Vision camera under `name`; channels `<name>.image` and `<name>.temperature`."""
+
+    def __init__(self, name: str, settings: CameraSettings, clock: Clock) -> None:
+        self._name = name
+        self._settings = settings
+        self._clock = clock
+        self._lane: Lane | None = None
+        self._connection: Connection | None = None
+        self._lost = ""
+        self._frames = FrameCount()
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def name(self) -> str:
+        """The configured name."""
+        return self._name
+
+    @property
+    def identity(self) -> Identity:
+        """Vendor, model, serial number and version; Unreachable before `open`."""
+        return self._usable().identity
+
+    @property
+    def effective(self) -> EffectiveSettings:
+        """The settings as the camera took them; Unreachable before `open`."""
+        return self._usable().effective
+
+    def counters(self) -> dict[str, int]:
+        """Counted since the camera was made: frames, triggers, missed, stale, incomplete_*, wrong_size, opened,
+        control_lost, and Aravis' own n_*; a counter that never moved may be absent."""
+        return dict(self._counts)
+
+    async def open(self) -> None:
+        """Connect, check the serial number, write and compare all settings; forgets any earlier connection.
+
+        Unreachable: nobody answers. Refused: a setting is not taken, another camera, or another client is in control
+        (tried for the heartbeat and 2 s more, since it may be our own that died).
+        """
+        if self._lane is None:
+            self._lane = Lane(self._name, self._clock)
+        await self._call(self._connect)
+
+    async def close(self) -> None:
+        """Stop and let go of the camera; never raises, up to 7.5 s when it is dead."""
+        if self._lane is not None:
+            await self._lane.call(self._disconnect)
+            self._lane.close()
+            self._lane = None
+
+    async def start(self) -> None:
+        """Start acquisition, always on a new stream."""
+        await self._call(self._usable().start)
+
+    async def stop(self) -> None:
+        """Stop acquisition."""
+        await self._call(self._usable().stop)
+
+    async def grab(self, exposure_s: float | None = None) -> Frame:
+        """One complete frame that was exposed after the call; starts acquisition when it is not running.
+
+        `exposure_s` holds for this frame, the configured one otherwise. Incomplete frames are never used, the next
+        one is tried. Unreachable: control lost, or 3 failures in a row; Refused: exposure not taken.
+        """
+        connection = self._usable()
+        wanted_s = self._settings.exposure_s if exposure_s is None else exposure_s
+        if not connection.running:
+            await self._call(connection.start)
+        if self._settings.trigger == "software":
+            shot = await self._grab_triggered(connection, wanted_s)
+        else:
+            shot = await self._grab_free_running(connection, wanted_s)
+        return Frame(
+            channel=f"{self._name}.image",
+            image=shot.image,
+            time_ns=shot.start_ns + seconds_ns(shot.exposure_s / 2),
+            exposure_s=shot.exposure_s,
+            gain_dB=connection.effective.gain_dB,
+            camera_degC=shot.camera_degC,
+            block_id=shot.block_id,
+            camera_ticks=shot.camera_ticks,
+            dropped=shot.dropped,
+        )
+
+    async def read(self) -> tuple[Reading, ...]:
+        """(Reading("camera.temperature", 41.5, "degC", ...),), BAD with the reason when the camera has none or it
+        cannot be read; Unreachable when the camera is not open or lost."""
+        value_degC, reason = await self._call(self._usable().temperature)
+        self._usable()
+        channel, time_ns = f"{self._name}.temperature", self._clock.now_ns()
+        if reason:
+            return (bad_reading(channel, "degC", time_ns, reason),)
+        return (Reading(channel, value_degC, "degC", time_ns),)
+
+    async def _grab_triggered(self, connection: Connection, exposure_s: float) -> Shot:
+        for _ in range(ATTEMPTS):
+            shot = await self._call(connection.trigger, exposure_s)
+            self._usable()
+            if shot is not None:
+                return shot
+        raise self._lose(f"{ATTEMPTS} software triggers brought no complete frame")
+
+    async def _grab_free_running(self, connection: Connection, exposure_s: float) -> Shot:
+        """Sleep until the frame is due, then take it: virtual time moves only while nobody waits on a wire."""
+        called_ns = self._clock.now_ns()
+        await self._call(connection.prepare_free_run, exposure_s)
+        for _ in range(ATTEMPTS):
+            await self._clock.sleep_until(connection.next_frame_due_ns(max(called_ns, self._clock.now_ns())))
+            shot = await self._call(connection.next_free, called_ns)
+            self._usable()
+            if shot is not None:
+                return shot
+        raise self._lose(f"{ATTEMPTS} frame periods brought no complete frame")
+
+    async def _call(self, function: Callable[..., Result], *args: object) -> Result:
+        """In the lane; what Aravis reports leaves as a DeviceError."""
+        if self._lane is None:
+            raise Unreachable(self._name, "not open")
+        try:
+            return await self._lane.call(function, *args)
+        except AravisError as error:
+            raise device_error(self._name, error) from error
+
+    def _usable(self) -> Connection:
+        """The connection, or Unreachable until the next `open`."""
+        if self._connection is None:
+            raise Unreachable(self._name, "not open")
+        if self._connection.control_lost.is_set() and not self._lost:
+            self._counts["control_lost"] += 1
+            self._lose("control lost: the camera restarted, dropped us, or is silent")
+        if self._lost:
+            raise Unreachable(self._name, self._lost)
+        return self._connection
+
+    def _lose(self, reason: str) -> DeviceError:
+        self._lost = reason
+        return Unreachable(self._name, reason)
+
+    def _connect(self) -> None:
+        self._disconnect()
+        self._connection = Connection(self._name, self._settings, self._clock, self._frames, self._counts)
+        self._counts["opened"] += 1
+
+    def _disconnect(self) -> None:
+        connection, self._connection = self._connection, None
+        self._lost = ""
+        if connection is not None:
+            connection.close()
