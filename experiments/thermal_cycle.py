@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from experiments.steps import (
     Capture,
     CloseFlap,
+    MoveTo,
     OpenFlap,
     Role,
     SetTemperature,
@@ -41,6 +42,7 @@ class ThermalCycle(BaseModel):
     frames_per_point: int = Field(default=1, ge=1)
     interval_s: float = Field(default=0.5, gt=0)
     exposure_s: float = Field(default=0.1, gt=0)
+    table_position: dict[str, float] = Field(default_factory=dict)  # axis -> mm or deg, taken before anything else
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -57,6 +59,7 @@ class ThermalCycle(BaseModel):
 def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped and the flap closed."""
     yield CloseFlap()
+    yield from (MoveTo(axis, position) for axis, position in parameters.table_position.items())
     yield StartChamber(parameters.reference_degC)
     yield Soak(parameters.equilibrium_s)
     yield from _frames(parameters, parameters.reference_degC, Role.REFERENCE, parameters.reference_frames)

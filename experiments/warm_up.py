@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from experiments.steps import (
     Capture,
     CloseFlap,
+    MoveTo,
     OpenFlap,
     PowerCamera,
     Role,
@@ -35,6 +36,7 @@ class WarmUp(BaseModel):
     frames: int = Field(default=3600, ge=1)
     interval_s: float = Field(default=0.5, gt=0)
     exposure_s: float = Field(default=0.1, gt=0)
+    table_position: dict[str, float] = Field(default_factory=dict)  # axis -> mm or deg, taken before anything else
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -46,6 +48,7 @@ class WarmUp(BaseModel):
 def warm_up(parameters: WarmUp) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped, the flap closed and the camera on."""
     yield CloseFlap()
+    yield from (MoveTo(axis, position) for axis, position in parameters.table_position.items())
     yield PowerCamera(on=False)
     yield StartChamber(parameters.chamber_degC)
     yield Soak(parameters.cool_down_s)

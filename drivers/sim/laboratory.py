@@ -1,0 +1,207 @@
+"""One simulated laboratory: the plant, every fake device on its wire, and the faults that can be injected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.clock import FollowedClock, WallClock
+from drivers.documents import Document
+from drivers.interface import ConfigError
+from drivers.sim.camera import FakeCamera
+from drivers.sim.faults import LinkFaults
+from drivers.sim.flap import FakeFlap
+from drivers.sim.modbus import RtuEngine, TcpEngine
+from drivers.sim.optics import true_centres_px
+from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.regulator import FakeRegulator
+from drivers.sim.relays import FakeRelays
+from drivers.sim.scene import Scene, SceneSpec
+from drivers.sim.thermometers import FakeThermometers
+from drivers.sim.usb import UsbServer
+from drivers.sim.wire import Engine, PtyWire, TcpWire
+from drivers.sim.ximc import FakeAxis
+from drivers.sim.ximc_table import PROFILES
+
+
+class AxisSpec(Document):
+    """A stage: where its controller answers and which profile it was delivered with."""
+
+    address: str
+    profile: str
+    serial_number: int
+
+
+class EndpointSpec(Document):
+    """A device with an address and a serial number."""
+
+    address: str | None
+    serial_number: str | None
+
+
+class LaboratorySpec(Document):
+    """What the simulator process is told on its standard input."""
+
+    virtual: bool
+    control: str
+    start_ns: int = Field(ge=0)
+    seed: int
+    camera_kind: Literal["modified", "unmodified"]
+    laboratory_degC: float
+    bus: str
+    regulator_unit: int
+    relays_unit: int
+    relay_channels: dict[str, int]
+    thermometers_unit: int
+    thermometer_channels: dict[str, int]
+    axes: dict[Literal["linear", "rotary"], AxisSpec]
+    flap: EndpointSpec
+    camera: EndpointSpec
+
+
+class Laboratory:
+    """Everything, running; `advance` moves virtual time, in real time the plant follows the host's clock."""
+
+    def __init__(self, spec: LaboratorySpec) -> None:
+        self.spec = spec
+        self._followed = FollowedClock(spec.start_ns) if spec.virtual else None
+        self._clock = self._followed or WallClock()
+        plant_spec = PlantSpec(camera=spec.camera_kind, seed=spec.seed, laboratory_degC=spec.laboratory_degC)
+        self.plant = Plant(plant_spec, self._clock.now_ns())
+        self._scene = Scene(SceneSpec(), spec.seed)
+        self._closers: list[Callable[[], None]] = []
+        try:
+            self._build()
+        except OSError as error:
+            self.close()
+            raise ConfigError(
+                f"an address of the simulated laboratory cannot be used; is one running already? ({error})"
+            )
+        except BaseException:
+            self.close()
+            raise
+
+    def advance(self, now_ns: int) -> None:
+        """Virtual time moves to `now_ns`; ValueError in real time or backwards."""
+        if self._followed is None:
+            raise ValueError("this laboratory runs in real time")
+        with self.plant.lock:
+            self._followed.follow(now_ns)
+            self.plant.advance(now_ns)
+        self.camera.advance(now_ns)
+
+    def state(self) -> dict[str, float]:
+        """The plant's true state now."""
+        with self.plant.lock:
+            self.plant.advance(self._clock.now_ns())
+            return self.plant.state()
+
+    def true_centres_px(self) -> list[list[float]]:
+        """Noise-free marker centres (x, y), marker 1 first."""
+        with self.plant.lock:
+            now_ns = self._clock.now_ns()
+            self.plant.advance(now_ns)
+            return true_centres_px(self.plant.optics(now_ns)).tolist()
+
+    def inject(self, name: str, value: object) -> None:
+        """Set one of FAULTS; `value` as the fault's own attribute takes it."""
+        with self.plant.lock:
+            FAULTS[name](self, value)
+
+    def close(self) -> None:
+        """Take everything down, last built first."""
+        while self._closers:
+            self._closers.pop()()
+
+    def _build(self) -> None:
+        spec, plant, clock = self.spec, self.plant, self._clock
+        self.regulator = FakeRegulator(plant, clock, spec.regulator_unit)
+        self.relays = FakeRelays(plant, clock, spec.relays_unit, spec.relay_channels)
+        self.thermometers = FakeThermometers(
+            plant, clock, spec.thermometers_unit, spec.thermometer_channels, seed=spec.seed
+        )
+        units = (self.regulator, self.relays, self.thermometers)
+        framing = RtuEngine if spec.bus.startswith("serial:") else TcpEngine
+        self.bus_faults = self._listen(spec.bus, lambda: framing(units))
+        self.axes = {name: FakeAxis(plant, clock, PROFILES[axis.profile], axis.serial_number, name)
+                     for name, axis in spec.axes.items()}  # fmt: skip
+        self.axis_faults = {
+            name: self._listen(spec.axes[name].address, axis.engine) for name, axis in self.axes.items()
+        }
+        self.flap = FakeFlap(plant, clock, spec.flap.serial_number or "")
+        host, port = _host_and_port(spec.flap.address or "")
+        self._closers.append(UsbServer(host, port, [self.flap]).close)
+        self.camera = FakeCamera(
+            plant,
+            clock,
+            self._render,
+            spec.camera.address or "",
+            spec.camera.serial_number or "",
+            real_time=not spec.virtual,
+        )
+        self._closers.append(self.camera.close)
+        self.camera.start()
+
+    def _listen(self, address: str, make_engine: Callable[[], Engine]) -> LinkFaults:
+        faults = LinkFaults(seed=self.spec.seed)
+        if address.startswith("serial:"):
+            wire: PtyWire | TcpWire = PtyWire(Path(address.removeprefix("serial:")), make_engine(), faults)
+        else:
+            wire = TcpWire(*_host_and_port(address), make_engine, faults)
+        self._closers.append(wire.close)
+        return faults
+
+    def _render(self, time_ns: int, exposure_s: float, gain_dB: float) -> NDArray[np.uint8]:
+        with self.plant.lock:
+            self.plant.advance(time_ns if self._followed is None else self._clock.now_ns())
+            optics, flap_open = self.plant.optics(time_ns), self.plant.flap_open_at(time_ns)
+        return self._scene.render(optics, time_ns, exposure_s, gain_dB, flap_open)
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    kind, _, place = address.partition(":")
+    host, _, port = place.rpartition(":")
+    if kind != "tcp" or not port.isdigit():
+        raise ConfigError(f"laboratory: expected tcp:HOST:PORT, not {address!r}")
+    return host, int(port)
+
+
+def _open_thermometer(laboratory: Laboratory, value: object) -> None:
+    channels = laboratory.spec.thermometer_channels
+    laboratory.thermometers.open_channels = {channels[str(value)]} if value else set()
+
+
+def _sensor_break(laboratory: Laboratory, value: object) -> None:
+    laboratory.regulator.sensor_break = bool(value)
+
+
+def _pv_offset(laboratory: Laboratory, value: object) -> None:
+    laboratory.regulator.pv_offset_K = float(str(value))
+
+
+def _silent_bus(laboratory: Laboratory, value: object) -> None:
+    laboratory.bus_faults.silent = bool(value)
+
+
+def _flap_jam(laboratory: Laboratory, value: object) -> None:
+    laboratory.flap.jam_position = None if value is None else int(str(value))
+
+
+def _camera_loss(laboratory: Laboratory, value: object) -> None:
+    laboratory.camera.faults.loss = float(str(value))
+
+
+# Name -> how to break a link or a quantity; the value undoes it as None, false or 0.
+FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
+    "thermometer.open": _open_thermometer,  # the channel's name: its wire is broken
+    "regulator.sensor_break": _sensor_break,
+    "regulator.pv_offset_K": _pv_offset,  # the probe reads wrong by this much
+    "bus.silent": _silent_bus,
+    "flap.jam": _flap_jam,  # feedback counts at which it stops
+    "camera.loss": _camera_loss,  # share of stream packets lost
+}

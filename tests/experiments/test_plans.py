@@ -1,0 +1,96 @@
+import itertools
+
+import pytest
+from pydantic import ValidationError
+
+from experiments.steps import (
+    Capture,
+    CloseFlap,
+    OpenFlap,
+    PowerCamera,
+    Role,
+    SetTemperature,
+    Soak,
+    StartChamber,
+    StopChamber,
+    estimate_s,
+    number_steps,
+)
+from experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from experiments.warm_up import WarmUp, warm_up
+
+CYCLE = ThermalCycle(set_points_degC=(34.0, 44.0, 24.0), held_out_degC=(34.0,), cycles=2)
+
+
+def test_the_flap_is_open_for_captures_only():
+    is_open = False
+    for step in thermal_cycle(CYCLE):
+        match step:
+            case OpenFlap():
+                is_open = True
+            case CloseFlap():
+                is_open = False
+            case Capture():
+                assert is_open
+            case Soak():
+                assert not is_open
+            case _:
+                pass
+    assert not is_open
+
+
+def test_a_cycle_visits_every_set_point_with_its_role_and_ends_stopped():
+    captures = [step for step in thermal_cycle(CYCLE) if isinstance(step, Capture)]
+    assert [(step.chamber_degC, step.role) for step in captures] == [
+        (24.0, Role.REFERENCE),
+        *[(34.0, Role.VALIDATION), (44.0, Role.FIT), (24.0, Role.FIT)] * 2,
+    ]
+    assert isinstance(list(thermal_cycle(CYCLE))[-1], StopChamber)
+
+
+def test_each_dwell_follows_its_set_point():
+    steps = list(thermal_cycle(CYCLE))
+    for before, after in itertools.pairwise(steps):
+        if isinstance(before, SetTemperature):
+            assert after == Soak(CYCLE.dwell_s)
+
+
+def test_a_warm_up_powers_the_camera_right_before_the_first_frame():
+    steps = list(warm_up(WarmUp(frames=10)))
+    on = steps.index(PowerCamera(on=True))
+    assert isinstance(steps[on + 1], Capture)
+    assert isinstance(steps[on - 1], OpenFlap)
+    assert steps.index(PowerCamera(on=False)) < steps.index(StartChamber(24.0)) < on
+
+
+def test_ids_follow_place_and_parameters():
+    first = [planned.step_id for planned in number_steps(thermal_cycle(CYCLE))]
+    again = [planned.step_id for planned in number_steps(thermal_cycle(CYCLE))]
+    edited = CYCLE.model_copy(update={"set_points_degC": (34.0, 45.0, 24.0)})
+    changed = [planned.step_id for planned in number_steps(thermal_cycle(edited))]
+    assert first == again
+    assert len(set(first)) == len(first)
+    differing = [index for index, (one, other) in enumerate(zip(first, changed, strict=True)) if one != other]
+    kinds = [type(step) for step in thermal_cycle(edited)]
+    assert differing
+    assert {kinds[index] for index in differing} == {SetTemperature, Capture}
+
+
+def test_a_capture_lasts_from_its_first_to_its_last_frame():
+    assert estimate_s(Capture(5, 0.5, 0.1, Role.FIT, 24.0)) == pytest.approx(2.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"held_out_degC": (99.0,)}, "less than or equal to 70"),
+        ({"held_out_degC": (40.0,)}, "never visits"),
+        ({"held_out_degC": (24.0,)}, "reference"),
+        ({"interval_s": 0.05}, "does not fit"),
+        ({"dwell_minutes": 45}, "Extra inputs"),
+        ({"set_points_degC": (71.0,)}, "less than or equal to 70"),
+    ],
+)
+def test_impossible_parameters_are_refused_with_a_reason(change: dict[str, object], sentence: str):
+    with pytest.raises(ValidationError, match=sentence):
+        ThermalCycle.model_validate({"set_points_degC": (34.0, 24.0), **change})

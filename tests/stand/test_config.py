@@ -1,0 +1,75 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drivers.interface import ConfigError
+from stand.config import load_config, packaged
+from stand.recipe import load_recipe
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def changed(tmp_path: Path, path: str, value: object) -> Path:
+    data = yaml.safe_load((CONFIGS / "laboratory.yaml").read_text())
+    section = data
+    *parents, last = path.split(".")
+    for parent in parents:
+        section = section[parent]
+    section[last] = value
+    file = tmp_path / "changed.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return file
+
+
+@pytest.mark.parametrize("name", ["simulated", "laboratory"])
+def test_installed_configurations_are_valid(name: str):
+    assert load_config(packaged("", name)).name.startswith(name)
+
+
+@pytest.mark.parametrize("path", sorted((CONFIGS / "recipes").glob("*.yaml")), ids=lambda path: path.stem)
+def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
+    recipe = load_recipe(path)
+    assert recipe.name == path.stem
+    assert list(recipe.plan())
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "sentence"),
+    [
+        ("camera.pixle_format", "Mono8", "camera.pixle_format: unknown key"),
+        ("camera.address", "camera.local", "camera.address: expected an IPv4 address"),
+        ("camera.exposure_s", -1, "camera.exposure_s: Input should be greater than 0 (got -1)"),
+        ("camera.exposure_s", "100 ms", "camera.exposure_s: Input should be a valid number"),
+        ("bus.address", "/dev/ttyUSB0", "bus.address: expected serial:PATH"),
+        ("bus.parity", "even", "bus.parity: Input should be 'N', 'E' or 'O'"),
+        ("relays.unit", 1, "need different units on one bus"),
+        ("relays.channels", {"heater_enable": 0}, "relays: channels lacks camera_power, compressor"),
+        ("thermometers.channels.air.channel", 0, "thermometers: two thermometers share one channel"),
+        ("axes.linear.limits", [10, 0], "axes.linear: limits (10.0, 0.0) are not in ascending order"),
+        ("axes.vertical", {}, "axes.vertical"),
+        ("limits.chamber_degC", [-10, 80], "guard.max_air_degC must be above"),
+        ("guard.heater_renew_s", 10, "at most half of heater_hold_s"),
+        ("guard.stale_after_s", 1, "at least twice the slowest safety poll"),
+        ("flap.backend", "drivers.sim.usb", "backend and backend_address go together"),
+    ],
+)
+def test_a_wrong_entry_names_file_and_path(tmp_path: Path, path: str, value: object, sentence: str):
+    file = changed(tmp_path, path, value)
+    with pytest.raises(ConfigError) as caught:
+        load_config(file)
+    assert sentence in str(caught.value)
+    assert str(caught.value).startswith(str(file))
+
+
+@pytest.mark.parametrize("text", ["", "- a\n- b\n", "name: [", "\x00"])
+def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path, text: str):
+    file = tmp_path / "bad.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"bad\.yaml"):
+        load_config(file)
+
+
+def test_a_missing_file_lists_what_there_is():
+    with pytest.raises(ConfigError, match=r"thermal_cycle: no such file.*demo, thermal-cycle, warm-up"):
+        packaged("recipes", "thermal_cycle")
