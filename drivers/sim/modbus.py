@@ -213,7 +213,7 @@ class RtuEngine:
         for begin in range(len(self._buffer) - 3):
             length = _frame_length(self._buffer, begin)
             frame = self._buffer[begin : begin + length]
-            if len(frame) == length > 3 and crc16(frame[:-2]) == frame[-2:]:
+            if 0 < length == len(frame) and crc16(frame[:-2]) == frame[-2:]:
                 return begin, begin + length
         return None
 
@@ -225,8 +225,8 @@ def _frame_length(data: bytes, begin: int) -> int:
         return FIXED_LENGTHS[function]
     if function in COUNTED_FUNCTIONS:
         return 9 + data[begin + 6] if len(data) > begin + 6 else 0
-    # An unknown function deserves its exception reply: taken for a frame when all that has come has a good CRC.
-    return len(data) if begin == 0 else 0
+    # An unknown function deserves its exception reply: it is a frame when all that has come is one.
+    return len(data)
 
 
 class TcpEngine:
