@@ -20,7 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema, Statistics
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
@@ -41,6 +41,8 @@ _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
 _DATA_LENGTH = struct.Struct("<Q")
 _MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
+_FOOTER = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, begin of its offsets; a CRC follows
+_CRC = struct.Struct("<I")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,16 +108,22 @@ def _head(path: Path, file: BinaryIO, size: int) -> Head:
         opcode, length = _RECORD.unpack(file.read(_RECORD.size))
         if opcode not in (Opcode.HEADER, Opcode.ATTACHMENT, Opcode.METADATA):
             break
-        stream = _stream(file.read(min(length, size)))
+        content = file.read(min(length, size))
         if opcode == Opcode.ATTACHMENT:
-            attachment = Attachment.read(stream)
+            _check_crc(content[: -_CRC.size], *_CRC.unpack(content[-_CRC.size :]))
+            attachment = Attachment.read(_stream(content))
             attachments[attachment.name] = attachment.data.decode()
         elif opcode == Opcode.METADATA:
-            metadata = Metadata.read(stream)
+            metadata = Metadata.read(_stream(content))
             session = metadata.metadata if metadata.name == SESSION_METADATA else session
     if session is None:
         raise SessionError(f"{path}: not a segment of a thermostand session")
     return Head(session, attachments)
+
+
+def _check_crc(data: bytes | memoryview, crc: int) -> None:
+    if zlib.crc32(data) != crc:
+        raise ValueError("a CRC is wrong")
 
 
 def _stream(data: bytes | memoryview) -> ReadDataStream:
@@ -129,11 +137,13 @@ class _Walk:
         self._wanted = wanted
         self._schemas: dict[int, str] = {}
         self._topics: dict[int, str] = {}  # of the wanted channels
+        self.message_count = 0  # wanted or not
 
     def messages(self, chunk: memoryview) -> Iterator[Message]:
         """The wanted messages of a chunk."""
         for opcode, record in _records(_uncompressed(chunk)):
             if opcode == Opcode.MESSAGE:
+                self.message_count += 1
                 number, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
                 if number in self._topics:
                     yield Message(self._topics[number], sequence, time_ns, bytes(record[_MESSAGE.size :]))
@@ -153,12 +163,14 @@ def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterato
     """The messages of the wanted channels of a telemetry segment, in the order of the file."""
     with _reading(path):
         walk = _Walk(wanted)
-        for opcode, content in _records(memoryview(path.read_bytes())[len(MCAP0_MAGIC) :]):
+        for opcode, content in _records(memoryview(path.read_bytes())[len(MCAP0_MAGIC) : -len(MCAP0_MAGIC)]):
             if opcode == Opcode.CHUNK:
                 yield from walk.messages(content)
-            elif opcode == Opcode.DATA_END:
+            elif opcode == Opcode.STATISTICS:
+                if Statistics.read(_stream(content)).message_count != walk.message_count:
+                    break
                 return
-        raise SessionError(f"{path}: ends in the middle")
+        raise SessionError(f"{path}: does not hold the messages its index tells of")
 
 
 def _check_schema(topic: str, schema: str) -> None:
@@ -193,20 +205,35 @@ def _uncompressed(chunk: memoryview) -> memoryview:
         data = memoryview(zstandard.decompress(data))
     elif compression:
         raise ValueError(f"a chunk compressed with {compression!r}")
-    if len(data) != size or zlib.crc32(data) != crc:
-        raise ValueError("a chunk's CRC is wrong")
+    if len(data) != size:
+        raise ValueError("a chunk's size is wrong")
+    _check_crc(data, crc)
     return data
 
 
 def frame_places(path: Path) -> list[FramePlace]:
     """The frames of a segment, from its chunk index alone."""
     with _reading(path), path.open("rb") as file:
+        _check_summary(file, path.stat().st_size)
+        file.seek(0)
         summary = SeekingReader(file, record_size_limit=path.stat().st_size).get_summary()
         if summary is None or summary.statistics is None:
             raise SessionError(f"{path}: has no index")
         if summary.statistics.message_count != len(summary.chunk_indexes):
             raise SessionError(f"{path}: its chunks are not one frame each")
         return [_place(path, summary, index) for index in summary.chunk_indexes]
+
+
+def _check_summary(file: BinaryIO, size: int) -> None:
+    """ValueError when the index at the end of the file is damaged: its CRC covers it and the footer before the CRC."""
+    footer_bytes = _FOOTER.size + _CRC.size + len(MCAP0_MAGIC)
+    file.seek(max(0, size - footer_bytes))
+    _, _, begin, _ = _FOOTER.unpack(file.read(_FOOTER.size))
+    (crc,) = _CRC.unpack(file.read(_CRC.size))
+    if not len(MCAP0_MAGIC) <= begin <= size - footer_bytes:
+        raise ValueError("the index is not in the file")
+    file.seek(begin)
+    _check_crc(file.read(size - footer_bytes + _FOOTER.size - begin), crc)
 
 
 def _place(path: Path, summary: Summary, index: ChunkIndex) -> FramePlace:

@@ -137,6 +137,7 @@ class Segment:
         self._block = _Block()
         self._writer = Writer(self._block, chunk_size=CHUNK_BYTES, compression=form.compression)
         self._sink = CommitSink(self._part)
+        self._opening_bytes = 0  # what stands before the first message
         try:
             sync_folder(folder)
             self._channels = self._begin(form, number)
@@ -144,6 +145,7 @@ class Segment:
         except OSError:
             self.abandon()
             raise
+        self._opening_bytes = self._sink.committed_bytes
 
     def _begin(self, form: SeriesForm, number: int) -> dict[str, int]:
         """Header, attachments, metadata; schemas and channels go into the first chunk. Returns topic -> channel id."""
@@ -186,10 +188,10 @@ class Segment:
         sync_folder(self._part.parent)
 
     def abandon(self) -> None:
-        """Let go after an error: what was committed stays as `.part`; a file without a block is removed."""
+        """Let go after an error: what was committed stays as `.part`; a file without a message is removed."""
         with suppress(OSError):
             self._sink.close()
-        if not self._sink.committed_bytes:
+        if self._sink.committed_bytes <= self._opening_bytes:
             with suppress(OSError):
                 self._part.unlink()
 
@@ -201,14 +203,12 @@ class Series:
         self._folder = folder
         self._form = form
         self._segment: Segment | None = None
-        self._next_number = next_number(folder)
         self.troubles: deque[str] = deque()  # errors that were overcome, as sentences; another thread may take them
 
     def open(self, time_ns: int) -> Segment:
         """The open segment, begun when there is none; raises OSError."""
         if self._segment is None:
-            self._segment = Segment(self._folder, self._next_number, self._form, time_ns)
-            self._next_number += 1
+            self._segment = Segment(self._folder, next_number(self._folder), self._form, time_ns)
         return self._segment
 
     def commit(self, records: Sequence[Record], time_ns: int) -> None:

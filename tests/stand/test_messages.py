@@ -1,0 +1,218 @@
+import math
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.interface import Frame, Quality, Reading, SessionError, bad_reading
+from stand import messages
+from stand.hub import Batch, Event, StepMark, StepState
+from stand.images import decode_image, encode_image
+
+TIME_NS = 1_767_290_400_123_456_789
+
+
+def frame(image, **changes):
+    fields = {
+        "channel": "camera.image",
+        "time_ns": TIME_NS,
+        "exposure_s": 0.1,
+        "gain_dB": 1.5,
+        "camera_degC": 41.25,
+        "block_id": 2**40 + 7,
+        "camera_ticks": 123_456_789_012,
+        "dropped": 3,
+        "step_id": "cycle-1/capture-20",
+    }
+    return Frame(image=image, **(fields | changes))
+
+
+def round_trip(kind, batch):
+    encoder = messages.BatchEncoder(batch.device, messages.KINDS[kind])
+    return list(messages.decode_batch(encoder.topic, encoder.encode(batch), batch.time_ns))
+
+
+def same(left, right):
+    """Equal readings, where NaN equals NaN."""
+    key = [(r.channel, repr(r.value), r.unit, r.time_ns, r.quality, r.reason) for r in left]
+    return sorted(key) == sorted((r.channel, repr(r.value), r.unit, r.time_ns, r.quality, r.reason) for r in right)
+
+
+def test_temperatures_have_the_fields_and_values_a_viewer_expects():
+    readings = (Reading("pt.air", 23.98, "degC", TIME_NS), bad_reading("pt.artifact", "degC", TIME_NS, "sensor break"))
+    encoder = messages.BatchEncoder("pt", messages.KINDS["thermometers"])
+    message = messages.CLASSES["/sensors/temperature"].FromString(encoder.encode(Batch("pt", TIME_NS, readings)))
+    assert message.DESCRIPTOR.full_name == "thermostand.Temperatures"
+    assert [field.name for field in message.DESCRIPTOR.fields][:5] == [
+        "device",
+        "remarks",
+        "time_ns",
+        "granite_inside_degC",
+        "granite_inside_degC_quality",
+    ]
+    assert (message.device, message.air_degC, message.air_degC_quality) == ("pt", 23.98, 1)
+    assert math.isnan(message.artifact_degC)
+    assert message.artifact_degC_quality == 3
+    assert message.remarks[0].reason == "sensor break"
+    assert math.isnan(message.laboratory_degC), "what was not measured must not look like 0 degC"
+    assert message.laboratory_degC_quality == messages.ABSENT
+
+
+quality_and_value = st.one_of(
+    st.tuples(st.sampled_from([Quality.GOOD, Quality.STALE]), st.floats(allow_nan=False)),
+    st.just((Quality.BAD, math.nan)),
+)
+
+
+@st.composite
+def batches(draw):
+    """A kind and a batch of any part of its quantities, with strangers, reasons and times of their own."""
+    kind = draw(st.sampled_from(sorted(messages.KINDS)))
+    known = [(q.name, q.unit) for q in messages.KINDS[kind].quantities]
+    names = draw(st.lists(st.sampled_from([*known, ("humidity", "%"), (known[0][0], "K")]), unique=True))
+    readings = []
+    for name, unit in names:
+        quality, value = draw(quality_and_value)
+        time_ns = TIME_NS - draw(st.sampled_from([0, 0, 1, 10**9]))
+        reason = draw(st.sampled_from(["", "", "no answer within 0.3 s"]))
+        readings.append(Reading(f"dev.{name}", value, unit, time_ns, quality, reason))
+    return kind, Batch("dev", TIME_NS, tuple(readings))
+
+
+@given(batches())
+def test_no_batch_loses_anything(case):
+    kind, batch = case
+    assert same(round_trip(kind, batch), batch.readings)
+
+
+def test_two_axes_share_a_topic_and_keep_their_units_apart():
+    topic = messages.KINDS["axis"].topic
+    encoded = messages.BatchEncoder("rotary", messages.KINDS["axis"]).encode(
+        Batch("rotary", TIME_NS, (Reading("rotary.position", 12.5, "deg", TIME_NS),))
+    )
+    message = messages.CLASSES[topic].FromString(encoded)
+    assert message.position_deg == 12.5
+    assert math.isnan(message.position_mm)
+
+
+def test_nan_is_the_same_bytes_whatever_arithmetic_made_it():
+    encoder = messages.BatchEncoder("pt", messages.KINDS["thermometers"])
+    negative_nan = float(np.copysign(np.nan, -1.0))
+
+    def encode(nan):
+        return encoder.encode(Batch("pt", TIME_NS, (Reading("pt.air", nan, "degC", TIME_NS, Quality.BAD),)))
+
+    assert encode(negative_nan) == encode(math.nan)
+
+
+def test_one_instant_shared_by_a_batch_costs_no_remarks():
+    def size(time_ns):
+        readings = tuple(Reading(f"pt.{n}", 20.0, "degC", time_ns) for n in ("air", "artifact", "laboratory"))
+        return len(messages.BatchEncoder("pt", messages.KINDS["thermometers"]).encode(Batch("pt", TIME_NS, readings)))
+
+    assert size(TIME_NS - 5_000_000) - size(TIME_NS) == 9
+
+
+@given(
+    st.dictionaries(
+        st.text(), st.one_of(st.integers(-(2**53), 2**53), st.floats(allow_nan=False), st.text(), st.none())
+    ),
+    st.sampled_from(StepState),
+)
+def test_a_step_survives_the_round_trip(parameters, state):
+    mark = StepMark(TIME_NS, "cycle-1/soak-30", 17, "Soak", state, parameters)
+    assert messages.decode_step(messages.encode_step(mark), TIME_NS) == mark
+
+
+@given(st.text(), st.sampled_from(["info", "warning", "error"]))
+def test_an_event_survives_the_round_trip(text, level):
+    event = Event(TIME_NS, level, "frames_dropped", text)
+    assert messages.decode_event(messages.encode_event(event), TIME_NS) == event
+
+
+def test_an_event_is_a_line_in_the_viewers_log():
+    log = Log.FromString(messages.encode_log(Event(TIME_NS, "warning", "device_lost", "flap: no answer")))
+    assert (log.level, log.name, log.message) == (Log.WARNING, "device_lost", "flap: no answer")
+    assert log.timestamp.ToNanoseconds() == TIME_NS
+
+
+def test_the_table_pose_is_metres_and_a_turn_about_z():
+    pose = PoseInFrame.FromString(messages.encode_table_pose(TIME_NS, 250.0, 90.0)).pose
+    assert pose.position.x == 0.25
+    assert (pose.orientation.z, pose.orientation.w) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+
+
+def test_a_frame_description_survives_the_round_trip():
+    original = frame(np.zeros((2, 2), np.uint8))
+    meta = messages.decode_frame_meta(messages.encode_frame_meta(original))
+    for name in ("channel", "step_id", "block_id", "camera_ticks", "exposure_s", "gain_dB", "camera_degC", "dropped"):
+        assert getattr(meta, name) == getattr(original, name)
+
+
+@pytest.mark.parametrize(("encoding", "schema"), [("png", CompressedImage), ("raw", RawImage)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_images_are_lossless(encoding, schema, dtype):
+    image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (37, 53), dtype, endpoint=True)
+    data = encode_image(frame(image), encoding)
+    channel, decoded = decode_image(schema.DESCRIPTOR.full_name, data)
+    assert channel == "camera.image"
+    assert decoded.dtype == dtype
+    np.testing.assert_array_equal(decoded, image)
+
+
+def test_a_part_of_a_larger_image_is_recorded_as_it_looks():
+    whole = np.arange(100, dtype=np.uint8).reshape(10, 10)
+    part = whole[2:8, 1:9:2]
+    for encoding, schema in (("png", CompressedImage), ("raw", RawImage)):
+        np.testing.assert_array_equal(
+            decode_image(schema.DESCRIPTOR.full_name, encode_image(frame(part), encoding))[1], part
+        )
+
+
+def test_png_of_sensor_noise_comes_near_the_entropy():
+    rng = np.random.default_rng(7)
+    image = np.clip(np.round(rng.normal(120, 1.5, (512, 612))), 0, 255).astype(np.uint8)
+    png = CompressedImage.FromString(encode_image(frame(image), "png"))
+    assert png.format == "png"
+    assert image.size / len(png.data) > 2.3  # the noise allows 3.07
+
+
+@pytest.mark.parametrize("image", [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32)])
+def test_an_image_of_another_kind_is_a_programming_mistake(image):
+    with pytest.raises(ValueError, match="uint8 or uint16 of shape"):
+        encode_image(frame(image), "png")
+
+
+def bad_images():
+    good = RawImage.FromString(encode_image(frame(np.zeros((4, 6), np.uint8)), "raw"))
+    short = RawImage(width=6, height=4, step=6, encoding="mono8", data=good.data[:-1])
+    colour = RawImage(width=6, height=4, step=18, encoding="rgb8", data=bytes(72))
+    for message in (short, colour, CompressedImage(format="png", data=b"no png"), CompressedImage(format="png")):
+        yield type(message).DESCRIPTOR.full_name, message.SerializeToString()
+    yield "foxglove.RawImage", b"\xff\xff\xff"
+    yield "foxglove.Grid", good.SerializeToString()
+
+
+@pytest.mark.parametrize(("schema", "data"), list(bad_images()))
+def test_a_damaged_image_is_a_session_error(schema, data):
+    with pytest.raises(SessionError):
+        decode_image(schema, data)
+
+
+@given(st.binary(max_size=60))
+def test_random_bytes_are_a_message_or_a_session_error(data):
+    decoders = [
+        lambda: list(messages.decode_batch("/sensors/temperature", data, TIME_NS)),
+        lambda: messages.decode_step(data, TIME_NS),
+        lambda: messages.decode_event(data, TIME_NS),
+        lambda: messages.decode_frame_meta(data),
+    ]
+    for decode in decoders:
+        with suppress(SessionError):
+            decode()

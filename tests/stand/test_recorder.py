@@ -1,0 +1,291 @@
+import asyncio
+import math
+import random
+import resource
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap_protobuf.decoder import DecoderFactory
+
+from drivers.clock import NS_PER_S, VirtualClock
+from drivers.interface import Frame, Reading, SessionError, bad_reading
+from stand.hub import Batch, Event, Hub, StepMark, StepState
+from stand.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.segment import CommitSink
+from stand.session import Session
+
+START_NS = 1_767_290_400 * NS_PER_S
+INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "virtual")
+ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\n"}
+SETTINGS = RecordingSettings()
+DEVICES = {
+    "thermometers": "thermometers",
+    "regulator": "regulator",
+    "relays": "relays",
+    "camera": "camera",
+    "linear": "axis",
+    "rotary": "axis",
+    "flap": "flap",
+}
+
+
+def batch(device, time_ns, **values):
+    units = {"position": {"linear": "mm", "rotary": "deg"}.get(device, "1"), "current": "mA", "mv_heat": "%"}
+    flags = ("moving", "homed", "running", "compressor")
+    readings = []
+    for name, value in values.items():
+        unit = "1" if name in flags else units.get(name, "degC")
+        channel = f"{device}.{name}"
+        broken = math.isnan(value)
+        readings.append(
+            bad_reading(channel, unit, time_ns, "sensor break") if broken else Reading(channel, value, unit, time_ns)
+        )
+    return Batch(device, time_ns, tuple(readings))
+
+
+def frame(time_ns, block_id, shape=(40, 60)):
+    image = np.random.default_rng(block_id).integers(0, 255, shape, np.uint8)
+    return Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0 + block_id, block_id, 1000 * block_id, 0, "capture-1")
+
+
+def one_second(time_ns, index):
+    """What a stand publishes in a second."""
+    yield batch("thermometers", time_ns, air=20 + index / 10, artifact=math.nan if index == 3 else 21.0)
+    yield batch("regulator", time_ns, pv=20.0, sp=25.0, mv_heat=12.5, running=1.0)
+    yield batch("linear", time_ns, position=100.0 + index, moving=0.0, homed=1.0)
+    yield batch("rotary", time_ns, position=30.0, moving=0.0, homed=1.0)
+    yield batch("flap", time_ns, position=1.0, current=35.0)
+    yield StepMark(time_ns, f"step-{index}", index, "Capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5})
+    yield frame(time_ns, index)
+    yield Event(time_ns, "info", "note", f"second {index}")
+
+
+async def record(directory, seconds=5, items=one_second, settings=SETTINGS, info=INFO, between=None):
+    """Publish `items(time_ns, index)` each virtual second; `between(index)` may do something to the disk. Returns all
+    events published, the recorder's own among them."""
+    clock, hub, events = VirtualClock(START_NS), Hub(), []
+    hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
+    recorder = Recorder(directory, info, ATTACHMENTS, DEVICES, hub, clock, settings)
+    recorder.start()
+    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
+    for index in range(seconds):
+        await clock.sleep_until(START_NS + index * NS_PER_S + NS_PER_S // 2)
+        if between is not None:
+            between(index)
+        for item in items(clock.now_ns(), index):
+            hub.publish(item)
+    await clock.sleep_until(START_NS + seconds * NS_PER_S + 1)
+    tasks[0].cancel()
+    with suppress(asyncio.CancelledError):
+        await tasks[0]
+    await recorder.finish()
+    tasks[1].cancel()
+    return events
+
+
+def contents(directory):
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def limit_files(size_bytes=None):
+    """The kernel refuses to let a file of this process grow beyond that (EFBIG), like a full disk; None lifts it."""
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard if size_bytes is None else size_bytes, hard))
+
+
+@pytest.fixture
+def files_limited():
+    """`files_limited(size_bytes, seconds)` gives a `between` for `record`: the limit holds in these seconds."""
+    yield lambda size_bytes, seconds: lambda index: limit_files(size_bytes if index in seconds else None)
+    limit_files()
+
+
+async def test_what_was_published_is_read_back(tmp_path):
+    await record(tmp_path / "s")
+    session = Session.open(tmp_path / "s")
+    times_ns, air_degC = session.readings("thermometers.air")
+    np.testing.assert_array_equal(times_ns, [START_NS + k * NS_PER_S + NS_PER_S // 2 for k in range(5)])
+    np.testing.assert_allclose(air_degC, [20.0, 20.1, 20.2, 20.3, 20.4], rtol=0, atol=1e-12)
+    assert np.isnan(session.readings("thermometers.artifact")[1]).tolist() == [False, False, False, True, False]
+    assert session.readings("linear.position")[1].tolist() == [100.0, 101.0, 102.0, 103.0, 104.0]
+    assert session.steps()[2] == StepMark(
+        int(times_ns[2]), "step-2", 2, "Capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5}
+    )
+    assert [event.text for event in session.events()] == [f"second {k}" for k in range(5)]
+    assert session.frame_count == 5
+    for index, got in enumerate(session.frames()):
+        sent = frame(int(times_ns[index]), index)
+        np.testing.assert_array_equal(got.image, sent.image)
+        for name in (
+            "channel",
+            "time_ns",
+            "exposure_s",
+            "gain_dB",
+            "camera_degC",
+            "block_id",
+            "camera_ticks",
+            "step_id",
+        ):
+            assert getattr(got, name) == getattr(sent, name)
+
+
+async def test_the_same_items_are_the_same_bytes_on_any_host(tmp_path):
+    await record(tmp_path / "a", 4, info=replace(INFO, host="laboratory"))
+    await record(tmp_path / "b", 4, info=replace(INFO, host="laptop"))
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    assert sorted(contents(tmp_path / "a")) == ["frames/0000.mcap", "telemetry/0000.mcap"]
+    await record(tmp_path / "c", 4, info=replace(INFO, clock_source="wall", host="laboratory"))
+    assert contents(tmp_path / "c") != contents(tmp_path / "a")
+
+
+async def test_a_reader_no_one_here_wrote_decodes_every_message(tmp_path):
+    await record(tmp_path / "s")
+    seen = {}
+    for path in (tmp_path / "s").rglob("*.mcap"):
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+            assert reader.get_header().library.startswith("mcap-python/")
+            for schema, channel, message, _ in reader.iter_decoded_messages():
+                seen.setdefault((channel.topic, schema.name), []).append(message.log_time)
+    assert {name: len(times) for name, times in seen.items()} == {
+        ("/camera/image", "foxglove.CompressedImage"): 5,
+        ("/camera/meta", "thermostand.FrameMeta"): 5,
+        ("/sensors/temperature", "thermostand.Temperatures"): 5,
+        ("/chamber/state", "thermostand.ChamberState"): 5,
+        ("/table/state", "thermostand.TableState"): 10,
+        ("/table/pose", "foxglove.PoseInFrame"): 9,  # none before both axes have told where they are
+        ("/flap/state", "thermostand.FlapState"): 5,
+        ("/experiment/step", "thermostand.Step"): 5,
+        ("/experiment/event", "thermostand.Event"): 5,
+        ("/log", "foxglove.Log"): 5,
+    }
+
+
+@pytest.mark.parametrize("settings", [RecordingSettings(segment_bytes=2000), RecordingSettings(segment_s=1.0)])
+async def test_each_segment_stands_alone(tmp_path, settings):
+    await record(tmp_path / "s", settings=settings)
+    assert len(list((tmp_path / "s" / "frames").iterdir())) == 5
+    telemetry = sorted((tmp_path / "s" / "telemetry").iterdir())
+    assert len(telemetry) >= 4
+    for number, path in enumerate(telemetry):
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+            assert {record.name: record.data.decode() for record in reader.iter_attachments()} == ATTACHMENTS
+        assert metadata["session"] == INFO.metadata()
+        previous = f"{number - 1:04d}" if number else ""
+        assert metadata["segment"] == {"series": "telemetry", "number": f"{number:04d}", "previous": previous}
+    session = Session.open(tmp_path / "s")
+    assert session.frame_count == len(session.events()) == 5
+
+
+async def test_raw_frames_are_read_back(tmp_path):
+    await record(tmp_path / "s", 2, settings=RecordingSettings(frame_encoding="raw"))
+    images = [got.image for got in Session.open(tmp_path / "s").frames()]
+    np.testing.assert_array_equal(images[1], frame(0, 1).image)
+
+
+async def test_frames_beyond_the_queue_are_dropped_counted_and_told(tmp_path):
+    def burst(time_ns, index):
+        for block_id in range(30 if index == 0 else 0):
+            yield frame(time_ns + block_id, block_id)
+
+    await record(tmp_path / "s", 2, items=burst)
+    session = Session.open(tmp_path / "s")
+    assert session.frame_count == 20
+    (event,) = session.events()
+    assert (event.level, event.kind) == ("error", "frames_dropped")
+    assert event.text == "10 frames lost, blocks 20 to 29, 10 in all: the disk is too slow"
+
+
+def test_a_block_the_disk_refuses_is_cut_off_again(tmp_path, files_limited):
+    at = files_limited(1500, {1})
+    sink = CommitSink(tmp_path / "file")
+    sink.append(b"a" * 1000)
+    at(1)
+    with pytest.raises(OSError, match="too large"):
+        sink.append(b"b" * 1000)
+    at(2)
+    assert (tmp_path / "file").read_bytes() == b"a" * 1000
+    sink.append(b"c" * 10)
+    sink.close()
+    assert (tmp_path / "file").read_bytes() == b"a" * 1000 + b"c" * 10
+
+
+def committed_event_texts(directory):
+    """The events in all telemetry segments, finished or not, with a reader that needs no index."""
+    decoder = DecoderFactory()
+    for path in sorted((directory / "telemetry").iterdir()):
+        schemas, channels = {}, {}
+        with path.open("rb") as file, suppress(Exception):  # an unfinished file ends anywhere
+            for part in StreamReader(file, validate_crcs=True).records:
+                if isinstance(part, Message) and channels[part.channel_id].topic == "/experiment/event":
+                    schema = schemas[channels[part.channel_id].schema_id]
+                    yield decoder.decoder_for("protobuf", schema)(part.data).text
+                elif type(part).__name__ == "Schema":
+                    schemas[part.id] = part
+                elif type(part).__name__ == "Channel":
+                    channels[part.id] = part
+
+
+def notes(time_ns, index):
+    yield Event(time_ns, "info", "note", f"second {index} {random.Random(index).randbytes(100).hex()}")
+
+
+async def test_after_a_disk_error_the_next_segment_goes_on_and_nothing_is_missing(tmp_path, files_limited):
+    events = await record(tmp_path / "s", 32, items=notes, between=files_limited(9_000, range(1, 30)))
+    assert {event.kind for event in events} == {"note", "segment_given_up"}
+    session = Session.open(tmp_path / "s")
+    assert [path.name for path in session.incomplete] == ["0000.mcap.part"]
+    texts = list(committed_event_texts(tmp_path / "s"))
+    assert [text.split()[1] for text in texts if text.startswith("second")] == [str(k) for k in range(32)]
+
+
+async def test_telemetry_waits_in_memory_while_the_disk_takes_nothing(tmp_path, files_limited):
+    events = await record(tmp_path / "s", 10, items=notes, between=files_limited(100, range(2, 6)))
+    kinds = [event.kind for event in events if event.kind != "note"]
+    assert kinds.count("telemetry_not_saved") == kinds.count("telemetry_saved_again") == 1
+    texts = list(committed_event_texts(tmp_path / "s"))
+    assert sorted(int(text.split()[1]) for text in texts if text.startswith("second")) == list(range(10))
+    assert sorted(path.name for path in (tmp_path / "s" / "telemetry").iterdir()) == ["0000.mcap.part", "0001.mcap"]
+
+
+async def test_a_frame_the_disk_refuses_is_told_and_telemetry_goes_on(tmp_path, files_limited):
+    def items(time_ns, index):
+        yield frame(time_ns, index, (200, 200) if index == 1 else (8, 8))
+        yield from notes(time_ns, index)
+
+    events = await record(tmp_path / "s", 4, items=items, between=files_limited(30_000, range(4)))
+    (told,) = [event.text for event in events if event.kind == "frames_dropped"]
+    assert told.startswith("1 frames lost, blocks 1 to 1, 1 in all: [Errno 27]")
+    session = Session.open(tmp_path / "s")
+    assert len([event for event in session.events() if event.kind == "note"]) == 4
+    assert [got.block_id for got in session.frames()] == [2, 3]  # block 0 waits in the part that was given up
+    assert [path.name for path in session.incomplete] == ["0000.mcap.part"]
+
+
+async def test_a_second_run_continues_the_session(tmp_path):
+    await record(tmp_path / "s", 2)
+    await record(tmp_path / "s", 2)
+    assert sorted(contents(tmp_path / "s")) == [f"{s}/000{k}.mcap" for s in ("frames", "telemetry") for k in (0, 1)]
+    assert Session.open(tmp_path / "s").frame_count == 4
+
+
+def test_mistakes_in_the_wiring_are_value_errors(tmp_path):
+    hub, clock = Hub(), VirtualClock(START_NS)
+    with pytest.raises(ValueError, match="no device kind toaster"):
+        Recorder(tmp_path, INFO, {}, {"kitchen": "toaster"}, hub, clock)
+    Recorder(tmp_path / "s", INFO, {}, DEVICES, hub, clock).start()
+    with pytest.raises(ValueError, match="humidity is not among"):
+        hub.publish(Batch("humidity", START_NS, ()))
+
+
+def test_a_place_where_nothing_can_be_written_is_a_session_error(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(SessionError, match="no session can be recorded here"):
+        Recorder(tmp_path / "file", INFO, {}, DEVICES, Hub(), VirtualClock(START_NS)).start()
