@@ -226,8 +226,10 @@ class ModbusClient:
             raise WireFault(Fault.GARBLED, f"asked for {len(values)} at {address:#06x}, the reply confirms {reply}")
 
     def _echoed(self, request: ModbusPDU) -> None:
-        """Send a single write, whose reply repeats address and value."""
+        """Send a single write, whose reply repeats address and value, and so is as long as the request."""
         reply = self._exchange(request)
+        if len(self._heard) != len(self._sent):
+            raise WireFault(Fault.GARBLED, "more came back than a reply (local echo of the adapter?)")
         if (reply.address, list(reply.registers)) != (request.address, list(request.registers)):
             raise WireFault(Fault.GARBLED, f"sent {request}, the reply confirms {reply}")
 
