@@ -58,9 +58,12 @@ class Feature:
         return self.bits > 0
 
 
-def features(width: int, height: int, serial: str) -> tuple[Feature, ...]:
-    """The table of a camera with a sensor of width x height px; defaults are the user set after power-on."""
-    return (*_device(serial), *_image(width, height), *_acquisition(), *_transport(width, height))
+def features(width: int, height: int, serial: str, stream_port: int = 0) -> tuple[Feature, ...]:
+    """The table of a camera with a sensor of width x height px; defaults are the user set after power-on.
+
+    `stream_port` is the UDP port that its stream comes from.
+    """
+    return (*_device(serial), *_image(width, height), *_acquisition(), *_transport(width * height, stream_port))
 
 
 def _text(name: str, address: int, length: int, default: str, access: Literal["RO", "RW"] = "RO") -> Feature:
@@ -162,10 +165,10 @@ def _acquisition() -> tuple[Feature, ...]:
     )
 
 
-def _transport(width: int, height: int) -> tuple[Feature, ...]:
+def _transport(payload_bytes: int, stream_port: int) -> tuple[Feature, ...]:
     transport = "TransportLayerControl"
     return (
-        Feature("PayloadSize", "integer", 0x10300, transport, "RO", width * height, unit="B"),
+        Feature("PayloadSize", "integer", 0x10300, transport, "RO", payload_bytes, unit="B"),
         Feature("TLParamsLocked", "integer", 0x10304, transport, maximum=1),
         Feature("GevHeartbeatTimeout", "integer", 0x0938, transport, "RW", 3000, 500, 60_000, unit="ms"),
         Feature(
@@ -202,7 +205,7 @@ def _transport(width: int, height: int) -> tuple[Feature, ...]:
         Feature("GevSCPSFireTestPacket", "command", 0x0D04, transport, lsb=31, bits=1),
         Feature("GevSCPD", "integer", 0x0D08, transport, maximum=10_000_000, unit="ns"),
         Feature("GevSCDA", "integer", 0x0D18, transport),
-        Feature("GevSCSP", "integer", 0x0D1C, transport, "RO", maximum=0xFFFF),
+        Feature("GevSCSP", "integer", 0x0D1C, transport, "RO", stream_port, maximum=0xFFFF),
     )
 
 

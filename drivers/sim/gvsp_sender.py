@@ -71,12 +71,20 @@ class _Job:
 class _Queue:
     """What is left to do: the packets of the current block, and those asked for again, in order, each once."""
 
-    block: Iterator[_Job] | None = None
+    jobs: Iterator[_Job] | None = None
+    sent: threading.Event = field(default_factory=threading.Event)
     resends: dict[tuple[int, int], _Job] = field(default_factory=dict[tuple[int, int], _Job])
     refusals: deque[tuple[bytes, Destination]] = field(default_factory=deque[tuple[bytes, Destination]])
 
+    def end_block(self) -> None:
+        """The current block is over; who waited for it goes on."""
+        self.sent.set()
+        self.sent = threading.Event()
+        self.jobs = None
+
     def empty(self) -> bool:
-        return self.block is None and not self.resends and not self.refusals
+        """Nothing to send."""
+        return self.jobs is None and not self.resends and not self.refusals
 
     def take(self, budget_bytes: int) -> list[_Job]:
         """The next packets, repetitions first, about `budget_bytes` of them."""
@@ -92,12 +100,7 @@ class _Queue:
     def _next(self) -> _Job | None:
         if self.resends:
             return self.resends.pop(next(iter(self.resends)))
-        if self.block is None:
-            return None
-        job = next(self.block, None)
-        if job is None:
-            self.block = None
-        return job
+        return None if self.jobs is None else next(self.jobs, None)
 
 
 class StreamSender:
@@ -127,29 +130,28 @@ class StreamSender:
 
     def close(self) -> None:
         """Stop at once; the socket stays open."""
-        self._closed.set()
         with self._wake:
+            self._closed.set()
+            self.abandon()
             self._wake.notify_all()
         if self._thread.is_alive():
             self._thread.join()
 
-    def send(self, block: Block, destination: Destination, gap_s: float = 0.0) -> None:
-        """Send one block and return when its last packet has left (or it was abandoned).
+    def begin(self, block: Block, destination: Destination, gap_s: float = 0.0) -> threading.Event:
+        """Begin to send one block; the event is set when its last packet has left, or it was abandoned.
 
         `gap_s` is the pause that the client asked for between two packets (GevSCPD).
         """
-        faults = self._faults
-        skipped = {0} if faults.drop_leader else set[int]()
-        if faults.drop_trailer:
-            skipped.add(block.trailer_id)
         with self._wake:
+            self._queue.end_block()
+            if self._closed.is_set():
+                return self._closed
+            self._queue.jobs = self._jobs(block, destination)
             self._kept.append((block, destination))
             self._gap_s = gap_s
-            packet_ids = (packet_id for packet_id in range(block.trailer_id + 1) if packet_id not in skipped)
-            self._queue.block = (_Job(block, packet_id, destination) for packet_id in packet_ids)
             self.counts.blocks += 1
             self._wake.notify_all()
-            self._wake.wait_for(lambda: self._queue.block is None or self._closed.is_set())
+            return self._queue.sent
 
     def resend(self, resend: Resend) -> None:
         """Queue packets once more; a block that is gone is answered by one UNAVAILABLE packet."""
@@ -165,11 +167,18 @@ class StreamSender:
             self._wake.notify_all()
 
     def abandon(self) -> None:
-        """Forget what is under way and what was kept."""
+        """Forget what is under way and what was kept; the caller of `begin` goes on."""
         with self._wake:
+            self._queue.end_block()
             self._queue = _Queue()
             self._kept.clear()
-            self._wake.notify_all()
+
+    def _jobs(self, block: Block, destination: Destination) -> Iterator[_Job]:
+        skipped = {0} if self._faults.drop_leader else set[int]()
+        if self._faults.drop_trailer:
+            skipped.add(block.trailer_id)
+        packet_ids = (packet_id for packet_id in range(block.trailer_id + 1) if packet_id not in skipped)
+        return (_Job(block, packet_id, destination) for packet_id in packet_ids)
 
     def _repeat(self, block: Block, destination: Destination, resend: Resend) -> None:
         for packet_id in range(resend.first, min(resend.last, block.trailer_id) + 1):
@@ -195,6 +204,8 @@ class StreamSender:
                 refusals = list(self._queue.refusals)
                 self._queue.refusals.clear()
                 jobs = self._queue.take(_BURST_bytes)
+                if not jobs:
+                    self._queue.end_block()
             for header, destination in refusals:
                 self.counts.unavailable += 1
                 self._transmit([header], destination)
@@ -202,8 +213,6 @@ class StreamSender:
                 self.counts.resent += job.status == gvsp.RESENT
                 self._transmit(job.block.packet(job.packet_id, job.status), job.destination)
             self._pace(sum(job.block.packet_size for job in jobs), len(jobs))
-            with self._wake:
-                self._wake.notify_all()
 
     def _transmit(self, parts: list[bytes] | tuple[bytes, bytes | memoryview], destination: Destination) -> None:
         if self._faults.silent_gvsp:
@@ -211,7 +220,11 @@ class StreamSender:
         if self._lost():
             self.counts.lost += 1
             return
-        self._socket.sendmsg(parts, [], 0, destination)
+        try:
+            self._socket.sendmsg(parts, [], 0, destination)
+        except OSError:  # no way to the destination: the packet is lost, as on a real wire
+            self.counts.lost += 1
+            return
         self.counts.packets += 1
 
     def _lost(self) -> bool:
