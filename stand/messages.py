@@ -28,7 +28,6 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from drivers.clock import NS_PER_S
 from drivers.interface import Frame, Quality, Reading, SessionError
 from stand.hub import Batch, Event, StepMark, StepState
 
@@ -353,8 +352,9 @@ def encode_table_pose(time_ns: int, linear_mm: float, rotary_deg: float) -> byte
 
 def timestamp(time_ns: int) -> Timestamp:
     """An instant in Foxglove's messages."""
-    seconds, nanos = divmod(time_ns, NS_PER_S)
-    return Timestamp(seconds=seconds, nanos=nanos)
+    stamp = Timestamp()
+    stamp.FromNanoseconds(time_ns)
+    return stamp
 
 
 def _get(message: Message, field: str) -> Any:

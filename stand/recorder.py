@@ -180,7 +180,7 @@ class Recorder:
             self._info.metadata(),
             self._attachments,
             self._settings.segment_bytes,
-            self._settings.segment_s,
+            seconds_ns(self._settings.segment_s),
         )
         return Series(self.directory / name, form)
 
@@ -201,13 +201,13 @@ class Recorder:
         self._report()
         self._open = False
         failure = await self._save_telemetry()
-        await self._telemetry_lane.call(self._telemetry_series.finish)
+        is_complete = await self._telemetry_lane.call(self._telemetry_series.finish)
         self._frame_lane.close()
         self._telemetry_lane.close()
         if failure is not None:
             raise SessionError(f"{self.directory}: {len(self._backlog)} messages were not saved ({failure})")
-        if self._telemetry_series.troubles:
-            raise SessionError(f"{self.directory}: {self._telemetry_series.troubles.popleft()}")
+        if not is_complete:
+            raise SessionError(f"{self.directory}: {self._telemetry_series.troubles.pop()}")
 
     def _receive(self, item: Item) -> None:
         """The hub's subscriber: enqueue, or count what does not fit."""
@@ -302,6 +302,6 @@ class Losses:
             blocks.setdefault(reason, []).append(block_id)
             self._total += 1
         return [
-            f"{len(ids)} frames lost, blocks {ids[0]} to {ids[-1]}, {self._total} in all: {reason}"
+            f"frames lost: {len(ids)} (blocks {ids[0]} to {ids[-1]}), {self._total} in all; {reason}"
             for reason, ids in blocks.items()
         ]

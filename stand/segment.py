@@ -26,8 +26,6 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from drivers.clock import seconds_ns
-
 FRAMES = "frames"
 TELEMETRY = "telemetry"
 FINISHED = ".mcap"
@@ -67,7 +65,7 @@ class SeriesForm:
     session: Mapping[str, str]
     attachments: Mapping[str, str]
     segment_bytes: int
-    segment_s: float
+    segment_ns: int
 
 
 class CommitSink:
@@ -234,20 +232,21 @@ class Series:
     def _is_full(self, time_ns: int) -> bool:
         segment = self._segment
         return segment is not None and (
-            segment.committed_bytes >= self._form.segment_bytes
-            or time_ns - segment.begun_ns >= seconds_ns(self._form.segment_s)
+            segment.committed_bytes >= self._form.segment_bytes or time_ns - segment.begun_ns >= self._form.segment_ns
         )
 
-    def finish(self) -> None:
-        """Close the open segment, if any; one that cannot be finished stays `.part` and is a trouble."""
+    def finish(self) -> bool:
+        """Close the open segment, if any; False when it cannot be finished: it stays `.part`, and that is a trouble."""
         segment, self._segment = self._segment, None
         if segment is None:
-            return
+            return True
         try:
             segment.finish()
         except OSError as error:
             segment.abandon()
             self.troubles.append(f"a segment of {self._form.name} stays unfinished ({error})")
+            return False
+        return True
 
 
 def next_number(folder: Path) -> int:

@@ -200,7 +200,7 @@ async def test_frames_beyond_the_queue_are_dropped_counted_and_told(tmp_path):
     assert session.frame_count == 20
     (event,) = session.events()
     assert (event.level, event.kind) == ("error", "frames_dropped")
-    assert event.text == "10 frames lost, blocks 20 to 29, 10 in all: the disk is too slow"
+    assert event.text == "frames lost: 10 (blocks 20 to 29), 10 in all; the disk is too slow"
 
 
 def test_a_block_the_disk_refuses_is_cut_off_again(tmp_path, files_limited):
@@ -262,11 +262,18 @@ async def test_a_frame_the_disk_refuses_is_told_and_telemetry_goes_on(tmp_path, 
 
     events = await record(tmp_path / "s", 4, items=items, between=files_limited(30_000, range(4)))
     (told,) = [event.text for event in events if event.kind == "frames_dropped"]
-    assert told.startswith("1 frames lost, blocks 1 to 1, 1 in all: [Errno 27]")
+    assert told.startswith("frames lost: 1 (blocks 1 to 1), 1 in all; [Errno 27]")
     session = Session.open(tmp_path / "s")
     assert len([event for event in session.events() if event.kind == "note"]) == 4
     assert [got.block_id for got in session.frames()] == [2, 3]  # block 0 waits in the part that was given up
     assert [path.name for path in session.incomplete] == ["0000.mcap.part"]
+
+
+async def test_a_telemetry_segment_that_cannot_be_finished_is_not_passed_over(tmp_path, files_limited):
+    with pytest.raises(SessionError, match="telemetry stays unfinished"):
+        await record(tmp_path / "s", 4, items=notes, between=files_limited(9_000, range(4)))
+    texts = list(committed_event_texts(tmp_path / "s"))
+    assert [text.split()[1] for text in texts] == ["0", "1", "2", "3"]
 
 
 async def test_a_second_run_continues_the_session(tmp_path):

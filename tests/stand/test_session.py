@@ -24,7 +24,7 @@ TELEMETRY_TOPICS = (
 
 
 def form(name, topics, compression, metadata=METADATA):
-    return SeriesForm(name, topics, compression, metadata, ATTACHMENTS, 1_000_000_000, 600.0)
+    return SeriesForm(name, topics, compression, metadata, ATTACHMENTS, 1_000_000_000, 600 * NS_PER_S)
 
 
 def telemetry_of(second):
