@@ -1,0 +1,395 @@
+"""A fake Standa controller with its stage: XIMC commands in front, a stepper behind, no thread of its own.
+
+What changes by itself (motion, homing, the current in the windings) is worked out when a request arrives, for the
+simulated time of that request. HOME leaves the count as it is, as the vendor describes it: the residual of a home
+check can be read before ZERO makes the place zero.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
+
+from drivers.clock import FollowedClock, WallClock
+from drivers.sim import ximc_table as table
+from drivers.sim.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Run, Shift, Stepper
+from drivers.sim.ximc_settings import Settings
+from drivers.ximc import Damage, Frame, decode, encode
+
+if TYPE_CHECKING:
+    from drivers.sim.plant import Plant
+
+PARTIAL_FRAME_S = 0.4  # real seconds of silence inside a frame after which the controller forgets it
+MOTION = frozenset({"move", "movr", "left", "rigt", "home", "loft", "sstp"})
+SIDES = {"": 0, "left": LEFT, "right": RIGHT}
+
+
+class XimcEngine:
+    """One connection: bytes in, reply bytes out. `monotonic` gives real seconds, for the partial-frame time-out."""
+
+    def __init__(self, axis: FakeAxis, monotonic: Callable[[], float]) -> None:
+        self._axis = axis
+        self._monotonic = monotonic
+        self._partial = b""
+        self._heard_s = monotonic()
+
+    def feed(self, data: bytes) -> bytes:
+        """Execute the requests that are complete; zero bytes between frames come back one for one."""
+        heard_s = self._monotonic()
+        if heard_s - self._heard_s > PARTIAL_FRAME_S:
+            self._partial = b""
+        self._heard_s = heard_s
+        received, reply = self._partial + data, b""
+        while received:
+            frame_start = received.lstrip(b"\0")
+            reply += bytes(len(received) - len(frame_start))
+            frame, received = decode(frame_start, table.REQUEST_SIZES)
+            if frame is None:
+                break
+            reply += self._axis.handle(frame)
+        self._partial = received
+        return reply
+
+
+class FakeAxis:
+    """A controller and its stage. `plant.linear_mm_at` or `plant.rotary_deg_at` becomes its mechanical position,
+    which is 0 where homing ends; the stage begins `start_steps` to the right of that, count 0, not homed.
+
+    Faults: alarm, ctp_error, danger (any bits of GETS Flags), limit ("left" or "right": a switch that reads closed),
+    wrong_limit (a stop at a limit is taken for the other side's), stall_steps (the mechanics cannot pass this position
+    to the right), lost_steps (how far the mechanics has fallen back), endless (commands run until SSTP or STOP),
+    motor_off, and power_cycle().
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        clock: FollowedClock | WallClock,
+        profile: table.Profile,
+        serial_number: int,
+        attach: Literal["linear", "rotary"],
+        start_steps: float = 2_000.0,
+    ) -> None:
+        self._plant = plant
+        self._clock = clock
+        self._profile = profile
+        self._serial_number = serial_number
+        self._settings = Settings(profile)
+        self._stepper = Stepper(profile.switches, start_steps, clock.now_ns())
+        self._stepper.stops = self._settings.stops()
+        self._clear()
+        self.wrong_limit = False
+        self.endless = False
+        self._lost_steps = 0.0
+        if attach == "linear":
+            plant.linear_mm_at = self.position_at
+        else:
+            plant.rotary_deg_at = self.position_at
+
+    def engine(self, monotonic: Callable[[], float] = time.monotonic) -> XimcEngine:
+        """A new conversation with this controller."""
+        return XimcEngine(self, monotonic)
+
+    def position_at(self, time_ns: int) -> float:
+        """Mechanical position in mm or degrees. A motor without current falls into the nearest full step."""
+        steps = self._stepper.mechanical(time_ns)
+        if self._power(time_ns) == table.PWR_OFF:
+            steps = round(steps)
+        return steps * self._profile.unit_per_step
+
+    def handle(self, frame: Frame) -> bytes:
+        """The reply to one request, whose effect begins at the clock's present time."""
+        with self._plant.lock:
+            now_ns = self._clock.now_ns()
+            self._plant.advance(now_ns)
+            self._settle(now_ns)
+            if frame.damage is Damage.CRC:
+                return self._error("errd", table.FLAG_ERRD)
+            if frame.damage is Damage.LETTERS or frame.letters in table.SERVICE_SIZES:
+                return self._error("errc", table.FLAG_ERRC)
+            if frame.letters in table.QUERIES:
+                return encode(frame.letters, self._answer(frame.letters, now_ns))
+            if frame.letters in table.ACTIONS:
+                return self._act(frame, now_ns)
+            name = frame.letters[1:]
+            if frame.letters[0] == "g":
+                return encode(frame.letters, self._settings.payload(name))
+            stored = self._settings.store(name, frame.payload)
+            self._apply_stops(now_ns)
+            return encode(frame.letters) if stored else self._error("errv", table.FLAG_ERRV)
+
+    def power_cycle(self) -> None:
+        """Off and on again: settings from flash, count 0, not homed; the stage stays where it is."""
+        with self._plant.lock:
+            now_ns = self._clock.now_ns()
+            self._settings.restore()
+            self._stepper.release(now_ns)
+            self._stepper.recount(now_ns, 0.0)
+            self._apply_stops(now_ns)
+            self._clear()
+
+    @property
+    def danger(self) -> int:
+        """Danger bits of GETS Flags that stand; setting the ALARM bit stops the motor."""
+        return self._danger
+
+    @danger.setter
+    def danger(self, bits: int) -> None:
+        with self._plant.lock:
+            now_ns = self._clock.now_ns()
+            self._settle(now_ns)
+            self._danger = bits
+            if bits & table.FLAG_CTP_ERROR:
+                self._homed = False
+            if bits & table.FLAG_ALARM:
+                self._failed = self._failed or self._under_way
+                self._finish(now_ns)
+
+    @property
+    def alarm(self) -> bool:
+        """ALARM stands: motion commands are ignored until STOP."""
+        return bool(self._danger & table.FLAG_ALARM)
+
+    @alarm.setter
+    def alarm(self, on: bool) -> None:
+        self.danger = self._danger & ~table.FLAG_ALARM | (table.FLAG_ALARM if on else 0)
+
+    @property
+    def ctp_error(self) -> bool:
+        """CTP_ERROR stands: encoder and step count differ."""
+        return bool(self._danger & table.FLAG_CTP_ERROR)
+
+    @ctp_error.setter
+    def ctp_error(self, on: bool) -> None:
+        self.danger = self._danger & ~table.FLAG_CTP_ERROR | (table.FLAG_CTP_ERROR if on else 0)
+
+    @property
+    def limit(self) -> str:
+        """The limit switch that is stuck closed: "", "left" or "right"; any other side is a KeyError."""
+        return next(name for name, side in SIDES.items() if side == self._stepper.stuck_switch)
+
+    @limit.setter
+    def limit(self, side: str) -> None:
+        with self._plant.lock:
+            self._stepper.disturb(self._clock.now_ns())
+            self._stepper.stuck_switch = SIDES[side]
+
+    @property
+    def stall_steps(self) -> float | None:
+        """Mechanical position, steps, which the stage cannot pass to the right; None: nothing in the way."""
+        return self._stepper.stall_at
+
+    @stall_steps.setter
+    def stall_steps(self, mechanical: float | None) -> None:
+        with self._plant.lock:
+            self._stepper.disturb(self._clock.now_ns())
+            self._stepper.stall_at = mechanical
+
+    @property
+    def lost_steps(self) -> float:
+        """Steps the mechanics has fallen back by order; those lost at a stall are not in it."""
+        return self._lost_steps
+
+    @lost_steps.setter
+    def lost_steps(self, steps: float) -> None:
+        with self._plant.lock:
+            self._stepper.disturb(self._clock.now_ns(), steps - self._lost_steps)
+            self._lost_steps = steps
+
+    @property
+    def motor_off(self) -> bool:
+        """The windings carry no current; False has no effect, the next motion energises them."""
+        return self._power(self._clock.now_ns()) == table.PWR_OFF
+
+    @motor_off.setter
+    def motor_off(self, off: bool) -> None:
+        if off:
+            with self._plant.lock:
+                now_ns = self._clock.now_ns()
+                self._settle(now_ns)
+                self._failed = self._failed or self._under_way
+                self._finish(now_ns)
+                self._stepper.release(now_ns)
+
+    def _clear(self) -> None:
+        """The state after power-on."""
+        self._command = ""
+        self._under_way = False
+        self._failed = False
+        self._homed = False
+        self._errors = 0
+        self._danger = 0
+        self._target = 0.0
+        self._encoder = 0
+
+    def _settle(self, now_ns: int) -> None:
+        """Notice that the motion under way has ended."""
+        travel = self._stepper.travel(now_ns)
+        if not self._under_way or travel.leg is not None:
+            return
+        if travel.limit:
+            self._failed = True
+            if self.wrong_limit:
+                alarm = table.FLAG_ALARM if self._settings.alarm_at_wrong_limit() else 0
+                self._danger |= table.FLAG_BORDERS_SWAP_MISSET | alarm
+        elif self.endless and self._command != "sstp":
+            return
+        elif self._command == "home":
+            self._homed = True
+        self._finish(now_ns)
+
+    def _finish(self, now_ns: int) -> None:
+        self._stepper.halt(now_ns)
+        self._under_way = False
+        if self._failed or self._command not in ("move", "movr"):
+            self._target = self._stepper.count(now_ns)
+
+    def _apply_stops(self, now_ns: int) -> None:
+        self._stepper.disturb(now_ns)
+        self._stepper.stops = self._settings.stops()
+
+    def _error(self, letters: str, flag: int) -> bytes:
+        self._errors |= flag
+        return encode(letters)
+
+    def _act(self, frame: Frame, now_ns: int) -> bytes:
+        if frame.letters in MOTION:
+            return self._move(frame, now_ns)
+        match frame.letters:
+            case "stop":
+                self._stop(now_ns)
+            case "pwof" if not self._under_way:
+                self._stepper.release(now_ns)
+            case "zero":
+                self._recount(now_ns, 0.0)
+                self._encoder = 0
+            case "spos":
+                full, micro, encoder, leave = struct.unpack(table.ACTIONS["spos"], frame.payload)
+                if not leave & table.SPOS_LEAVE_POSITION:
+                    self._recount(now_ns, self._settings.steps(full, micro))
+                if not leave & table.SPOS_LEAVE_ENCODER:
+                    self._encoder = encoder
+            case "save":
+                self._settings.save()
+            case "read":
+                self._settings.restore()
+                self._apply_stops(now_ns)
+            case _:
+                pass  # the sync-in queue, measurements, robust settings and stage memory change nothing here
+        return encode(frame.letters)
+
+    def _move(self, frame: Frame, now_ns: int) -> bytes:
+        """Begin a motion; in ALARM the request is acknowledged and ignored."""
+        if self.alarm:
+            return encode(frame.letters)
+        corrected = False
+        if frame.letters in ("move", "movr"):
+            full, micro = struct.unpack(table.ACTIONS[frame.letters], frame.payload)
+            allowed = self._settings.allowed_micro(micro)
+            corrected = allowed != micro
+            self._target = self._settings.steps(full, allowed) + (self._target if frame.letters == "movr" else 0.0)
+        if frame.letters == "home":
+            self._homed = False
+        self._command, self._failed = frame.letters, False
+        if frame.letters != "sstp" or self._under_way:
+            self._under_way = True
+            self._stepper.go(now_ns, *self._legs(frame.letters))
+            self._settle(now_ns)
+        return self._error("errv", table.FLAG_ERRV) if corrected else encode(frame.letters)
+
+    def _legs(self, letters: str) -> tuple[Leg, ...]:
+        pace = self._settings.pace()
+        match letters:
+            case "move" | "movr":
+                return (GoTo(self._target, pace),)
+            case "left" | "rigt":
+                return (Run(LEFT if letters == "left" else RIGHT, pace),)
+            case "loft":
+                antiplay = self._settings.antiplay_steps()
+                return Shift(antiplay, pace), Shift(-antiplay, pace)
+            case "home":
+                return self._settings.homing()
+            case _:
+                return (Brake(pace.decel),)
+
+    def _stop(self, now_ns: int) -> None:
+        """Stand still, forget errors and dangers; a stop out of motion may skip steps, so the scale is lost."""
+        if self._stepper.speed(now_ns):
+            self._homed = False
+        self._command, self._failed = "stop", False
+        self._finish(now_ns)
+        self._errors = self._danger = 0
+
+    def _recount(self, now_ns: int, count: float) -> None:
+        moving_to_target = self._under_way and self._command in ("move", "movr")
+        self._target = self._target + count - self._stepper.count(now_ns) if moving_to_target else count
+        self._stepper.recount(now_ns, count)
+
+    def _answer(self, letters: str, now_ns: int) -> bytes:
+        if letters == "gets":
+            return self._status(now_ns)
+        values: dict[str, tuple[object, ...]] = {
+            "gpos": (*self._settings.full_and_micro(self._stepper.count(now_ns)), self._encoder),
+            "geti": (b"XIMC", b"SM", b"XISM-USB", 2, 3, 8),
+            "gser": (self._serial_number,),
+            "gfwv": (4, 7, 6),
+            "gblv": (4, 7, 6),
+            "guid": (self._serial_number, 0, 0, 0),
+        }
+        layout = struct.Struct(table.QUERIES[letters])
+        return layout.pack(*values[letters]) if letters in values else bytes(layout.size)
+
+    def _status(self, now_ns: int) -> bytes:
+        count = self._settings.full_and_micro(self._stepper.count(now_ns))
+        speed = self._settings.full_and_micro(self._stepper.speed(now_ns))
+        power = self._power(now_ns)
+        current_mA = self._settings.current_mA() if power == table.PWR_NORMAL else 0
+        command = table.COMMAND_CODES.get(self._command, 0)
+        command |= (table.MVCMD_ERROR if self._failed else 0) | (table.MVCMD_RUNNING if self._under_way else 0)
+        return struct.pack(
+            table.QUERIES["gets"],
+            self._move_state(now_ns),
+            command,
+            power,
+            0,  # no encoder
+            table.WINDINGS_OK,
+            *count,
+            self._encoder,
+            *speed,
+            current_mA,
+            table.SUPPLY_10mV,
+            table.USB_mA,
+            table.USB_10mV,
+            table.PROCESSOR_0_1degC,
+            self._flags(),
+            self._edges(now_ns),
+            table.COMMAND_QUEUE_FREE,
+        )
+
+    def _move_state(self, now_ns: int) -> int:
+        travel = self._stepper.travel(now_ns)
+        if travel.leg is None:
+            return table.MOVE_STATE_MOVING if self._under_way else 0
+        pace = None if isinstance(travel.leg, Brake) else travel.leg.pace
+        at_speed = pace is not None and abs(self._stepper.speed(now_ns)) == pace.speed
+        playing = table.MOVE_STATE_ANTIPLAY if self._command == "loft" else 0
+        return table.MOVE_STATE_MOVING | (table.MOVE_STATE_TARGET_SPEED if at_speed else 0) | playing
+
+    def _flags(self) -> int:
+        homed = table.FLAG_IS_HOMED if self._homed else 0
+        return table.FLAG_EEPROM_CONNECTED | self._errors | self._danger | homed
+
+    def _edges(self, now_ns: int) -> int:
+        side = self._stepper.closed_switch(now_ns) * (-1 if self.wrong_limit else 1)
+        return {LEFT: table.GPIO_LEFT_EDGE, RIGHT: table.GPIO_RIGHT_EDGE}.get(side, 0)
+
+    def _power(self, time_ns: int) -> int:
+        """PWRSts at that time."""
+        travel = self._stepper.travel(time_ns)
+        if not travel.energised:
+            return table.PWR_OFF
+        if travel.leg is not None:
+            return table.PWR_NORMAL
+        return self._settings.resting_power(time_ns - travel.rest_ns)
