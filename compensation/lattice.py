@@ -1,0 +1,105 @@
+"""A lattice grown through unordered points, with clutter and gaps among them.
+
+Breadth first from a seed; each step is predicted from the steps before, so that the lattice follows perspective and
+lens distortion.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+_STEP_TOLERANCE = 0.22
+"""A neighbour lies this close, in steps, to where the steps before predict it."""
+_CURVATURE = 0.8
+
+Float = NDArray[np.float64]
+Cell = tuple[int, int]
+
+
+def largest_lattice(points: Float, count: int) -> dict[Cell, int]:
+    """Cell -> candidate of the largest lattice; seeds nearest to the middle first, until one holds `count`."""
+    best: dict[Cell, int] = {}
+    tried: set[int] = set()
+    if len(points) < 4:
+        return best
+    for seed in np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=1)):
+        if int(seed) in tried:
+            continue
+        lattice = _grow(points, int(seed))
+        if len(lattice) > 3:
+            tried.update(lattice.values())
+        if len(lattice) > len(best):
+            best = lattice
+        if len(best) >= count:
+            break
+    return best
+
+
+def _grow(points: Float, seed: int) -> dict[Cell, int]:
+    """The lattice around a seed, empty when the seed has no two neighbours to begin with."""
+    base = _lattice_vectors(points, seed)
+    cells: dict[Cell, int] = {(0, 0): seed}
+    if base is None:
+        return {}
+    used = {seed}
+    came_by: dict[tuple[Cell, Cell], Float] = {}
+    queue = deque([(0, 0)])
+    while queue:
+        cell = queue.popleft()
+        for direction in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            beyond = (cell[0] + direction[0], cell[1] + direction[1])
+            if beyond in cells:
+                continue
+            step = _predicted_step(cell, direction, base, cells, came_by, points)
+            place = points[cells[cell]] + step
+            away = np.hypot(points[:, 0] - place[0], points[:, 1] - place[1])
+            nearest = int(np.argmin(away))
+            if nearest in used or away[nearest] > _STEP_TOLERANCE * np.hypot(step[0], step[1]):
+                continue
+            cells[beyond] = nearest
+            used.add(nearest)
+            came_by[beyond, direction] = points[nearest] - points[cells[cell]]
+            queue.append(beyond)
+    return cells
+
+
+def _lattice_vectors(points: Float, seed: int) -> tuple[Float, Float] | None:
+    """To the nearest neighbour, and to the nearest of the next 8 that is well off that line."""
+    offset = points - points[seed]
+    order = np.argsort(np.hypot(offset[:, 0], offset[:, 1]))[1:10]
+    first = offset[order[0]]
+    for other in offset[order[1:]]:
+        if abs(_cross(first, other)) > 0.6 * np.hypot(*first) * np.hypot(*other):
+            return first, other
+    return None
+
+
+def _predicted_step(
+    cell: Cell,
+    direction: Cell,
+    base: tuple[Float, Float],
+    cells: dict[Cell, int],
+    came_by: dict[tuple[Cell, Cell], Float],
+    points: Float,
+) -> Float:
+    """The step that led to `cell` plus 0.8 of its change; else a side neighbour's parallel step; else the seed's."""
+    i, j = cell
+    di, dj = direction
+    before, twice = (i - di, j - dj), (i - 2 * di, j - 2 * dj)
+    if before in cells:
+        step = points[cells[cell]] - points[cells[before]]
+        if twice in cells:
+            step = step + _CURVATURE * (step - (points[cells[before]] - points[cells[twice]]))
+        return step
+    for side in ((dj, di), (-dj, -di)):
+        here, there = (i + side[0], j + side[1]), (i + side[0] + di, j + side[1] + dj)
+        if here in cells and there in cells:
+            return points[cells[there]] - points[cells[here]]
+    return base[0] * di + base[1] * dj
+
+
+def _cross(a: Float, b: Float) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])

@@ -1,0 +1,175 @@
+"""A reference renderer for the tests: photographs of a marker grid with exact truth.
+
+Shares no code with the program: the projection, the coverage of a pixel by a disc and the centres are written out
+here again. Every disc is sampled on SUB x SUB cells per pixel; each cell's coverage is the exact area a straight line
+cuts from it; then Gaussian PSF, pixel box, noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+SUB = 4
+Float = NDArray[np.float64]
+
+
+def even_light(u: Float, v: Float) -> Float:
+    return np.ones(np.broadcast_shapes(u.shape, v.shape))
+
+
+def shaded_light(u: Float, v: Float) -> Float:
+    """Scene D of the 5 MP frame: +30 % along x, -20 % along y, 15 % vignetting."""
+    x, y = (u - 1223.5) / 1223.5, (v - 1023.5) / 1023.5
+    return (1 + 0.15 * x - 0.10 * y) * (1 - 0.075 * (x**2 + y**2))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is photographed. Angles in degrees; roll is counter-clockwise in the image; z is the distance in mm."""
+
+    columns: int = 9
+    rows: int = 6
+    pitch_mm: float = 30.0
+    diameters_mm: dict[int, float] = field(default_factory=dict[int, float])
+    diameter_mm: float = 8.0
+    size: tuple[int, int] = (2448, 2048)
+    f_px: float = 8772.0
+    distance_mm: float = 1000.0
+    roll_deg: float = 0.0
+    tilt_x_deg: float = 0.0
+    tilt_y_deg: float = 0.0
+    shift_mm: tuple[float, float] = (0.0, 0.0)
+    k1: float = 0.0
+    k2: float = 0.0
+    disc_DN: float = 30.0
+    ground_DN: float = 200.0
+    psf_px: float = 1.0
+    read_DN: float = 1.0
+    electrons_per_DN: float = 40.0
+    light: Callable[[Float, Float], Float] = even_light
+    missing: tuple[int, ...] = ()
+    clutter_mm: tuple[tuple[float, float, float], ...] = ()
+    """Further discs: x, y, diameter in the object frame."""
+
+    def discs_mm(self) -> Float:
+        """Centre x, y and diameter of each marker (N, 3); marker 1 at the origin, X right, Y up."""
+        return np.array(
+            [
+                (
+                    c * self.pitch_mm,
+                    r * self.pitch_mm,
+                    self.diameters_mm.get(r * self.columns + c + 1, self.diameter_mm),
+                )
+                for r in range(self.rows)
+                for c in range(self.columns)
+            ]
+        )
+
+    def pose(self) -> tuple[Float, Float]:
+        """Rotation and translation of the object frame (Z towards the camera) into the camera frame (y down)."""
+        a, b, c = np.radians([self.tilt_x_deg, self.tilt_y_deg, self.roll_deg])
+        rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+        ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+        rz = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+        rotation = np.diag([1.0, -1.0, -1.0]) @ rz @ ry @ rx
+        middle = np.array([(self.columns - 1) * self.pitch_mm / 2, (self.rows - 1) * self.pitch_mm / 2, 0])
+        towards = np.array([self.shift_mm[0], -self.shift_mm[1], self.distance_mm])
+        return rotation, towards - rotation @ middle
+
+
+def project(scene: Scene, plane_mm: Float) -> Float:
+    """Points (K, 2) of the target's plane -> pixels (K, 2)."""
+    rotation, translation = scene.pose()
+    camera = np.column_stack([plane_mm, np.zeros(len(plane_mm))]) @ rotation.T + translation
+    xy = camera[:, :2] / camera[:, 2:]
+    r2 = (xy**2).sum(axis=1, keepdims=True)
+    middle = (np.array(scene.size) - 1) / 2
+    return xy * (1 + scene.k1 * r2 + scene.k2 * r2**2) * scene.f_px + middle
+
+
+def back_project(scene: Scene, u: Float, v: Float) -> tuple[Float, Float]:
+    """Pixels -> the target's plane, mm; the distortion is undone by fixed-point rounds."""
+    middle = (np.array(scene.size) - 1) / 2
+    xd, yd = (u - middle[0]) / scene.f_px, (v - middle[1]) / scene.f_px
+    x, y = xd, yd
+    for _ in range(30 if scene.k1 or scene.k2 else 0):
+        r2 = x * x + y * y
+        bend = 1 + scene.k1 * r2 + scene.k2 * r2**2
+        x, y = xd / bend, yd / bend
+    rotation, translation = scene.pose()
+    to_plane = np.linalg.inv(np.column_stack([rotation[:, :2], translation]))
+    w = to_plane[2, 0] * x + to_plane[2, 1] * y + to_plane[2, 2]
+    return tuple((to_plane[i, 0] * x + to_plane[i, 1] * y + to_plane[i, 2]) / w for i in (0, 1))  # pyright: ignore[reportReturnType]
+
+
+def true_centres_px(scene: Scene) -> Float:
+    """Centroid of each marker's exact projected outline (N, 2)."""
+    angle = np.arange(720) * (2 * np.pi / 720)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.array([_centroid(project(scene, disc[:2] + disc[2] / 2 * circle)) for disc in scene.discs_mm()])
+
+
+def _centroid(polygon: Float) -> Float:
+    origin = polygon.mean(axis=0)
+    p, q = polygon - origin, np.roll(polygon, -1, axis=0) - origin
+    cross = p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]
+    return origin + ((p + q) * cross[:, None]).sum(axis=0) / (3 * cross.sum())
+
+
+def _coverage(level: Float) -> Float:
+    """Part of each cell where `level` < 0, the cell's boundary taken as a straight line (exact for one)."""
+    slope_y, slope_x = np.gradient(level)
+    wide, narrow = np.maximum(abs(slope_x), abs(slope_y)), np.minimum(abs(slope_x), abs(slope_y))
+    narrow = np.maximum(narrow, 1e-4 * wide)
+    long, short, t = (wide + narrow) / 2, (wide - narrow) / 2, -level
+    ramp = [np.maximum(t + offset, 0) ** 2 for offset in (long, short, -short, -long)]
+    return np.clip((ramp[0] - ramp[1] - ramp[2] + ramp[3]) / (2 * wide * narrow), 0, 1)
+
+
+def render(scene: Scene) -> Float:
+    """The noise-free image, DN, shape (height, width)."""
+    width, height = scene.size
+    image = scene.ground_DN * scene.light(np.arange(width)[None, :] * 1.0, np.arange(height)[:, None] * 1.0)
+    image = np.array(np.broadcast_to(image, (height, width)))
+    discs = [disc for number, disc in enumerate(scene.discs_mm(), 1) if number not in scene.missing]
+    for disc in [*discs, *np.array(scene.clutter_mm).reshape(-1, 3)]:
+        _draw(scene, image, disc)
+    return image
+
+
+def _draw(scene: Scene, image: Float, disc: Float) -> None:
+    """Replace the pixels round one disc."""
+    angle = np.arange(64) * (2 * np.pi / 64)
+    outline = project(scene, disc[:2] + disc[2] / 2 * np.column_stack([np.cos(angle), np.sin(angle)]))
+    margin = int(np.ceil(6 * scene.psf_px)) + 2
+    low = np.floor(outline.min(axis=0)).astype(int) - margin
+    high = np.ceil(outline.max(axis=0)).astype(int) + margin + 1
+    u, v = (low[i] - 0.5 + (np.arange((high[i] - low[i]) * SUB) + 0.5) / SUB for i in (0, 1))
+    u, v = u[None, :], v[:, None]
+    x, y = back_project(scene, u, v)
+    cover = _coverage(np.hypot(x - disc[0], y - disc[1]) - disc[2] / 2)
+    radiance = scene.light(u, v) * (scene.ground_DN + (scene.disc_DN - scene.ground_DN) * cover)
+    sigma = scene.psf_px * SUB
+    kernel = 2 * int(np.ceil(6 * sigma)) + 1
+    blurred = cv2.GaussianBlur(radiance, (kernel, kernel), sigma, borderType=cv2.BORDER_REPLICATE)
+    rows, columns = blurred.shape[0] // SUB, blurred.shape[1] // SUB
+    pixels = blurred.reshape(rows, SUB, columns, SUB).mean(axis=(1, 3))
+    top, left = max(low[1], 0), max(low[0], 0)
+    bottom, right = min(high[1], image.shape[0]), min(high[0], image.shape[1])
+    if top < bottom and left < right:
+        image[top:bottom, left:right] = pixels[top - low[1] : bottom - low[1], left - low[0] : right - low[0]]
+
+
+def photograph(
+    scene: Scene, clean: Float, seed: int, dtype: type[np.uint8] | type[np.uint16] = np.uint8
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """`clean` with read and shot noise, rounded and clipped."""
+    rng = np.random.default_rng(seed)
+    sigma = np.sqrt(scene.read_DN**2 + np.maximum(clean, 0) / scene.electrons_per_DN)
+    noisy = clean + sigma * rng.standard_normal(clean.shape)
+    return np.clip(np.round(noisy), 0, np.iinfo(dtype).max).astype(dtype)
