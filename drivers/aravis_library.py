@@ -110,15 +110,25 @@ class _GError(ctypes.Structure):
     _fields_ = (("domain", ctypes.c_uint32), ("code", ctypes.c_int32), ("message", ctypes.c_char_p))
 
 
+def load(sonames: tuple[str, ...], debian_package: str) -> ctypes.CDLL:
+    """The first of the libraries that is there; StandError names the package to install when none is."""
+    for soname in sonames:
+        try:
+            return ctypes.CDLL(soname)
+        except OSError:
+            continue
+    raise StandError(f"{sonames[0]} cannot be loaded; on Debian or Ubuntu: apt-get install {debian_package}")
+
+
 class Library:
     """The loaded functions; `call` raises what a function reported."""
 
     def __init__(self) -> None:
         self._functions: dict[str, Callable[..., Any]] = {}
         self._reporting: set[str] = set()
-        self._declare(_load(ARAVIS_SONAMES, "libaravis-0.8-0"), ARAVIS_FUNCTIONS)
-        self._declare(_load(("libgobject-2.0.so.0",), "libglib2.0-0"), GOBJECT_FUNCTIONS)
-        self._declare(_load(("libglib-2.0.so.0",), "libglib2.0-0"), GLIB_FUNCTIONS)
+        self._declare(load(ARAVIS_SONAMES, "libaravis-0.8-0"), ARAVIS_FUNCTIONS)
+        self._declare(load(("libgobject-2.0.so.0",), "libglib2.0-0"), GOBJECT_FUNCTIONS)
+        self._declare(load(("libglib-2.0.so.0",), "libglib2.0-0"), GLIB_FUNCTIONS)
 
     def _declare(self, library: ctypes.CDLL, signatures: dict[str, str]) -> None:
         for name, signature in signatures.items():
@@ -150,15 +160,6 @@ class Library:
         error = AravisError(domain.decode(), reported.contents.code, message.decode(errors="replace"))
         self.call("g_error_free", reported)
         return error
-
-
-def _load(sonames: tuple[str, ...], debian_package: str) -> ctypes.CDLL:
-    for soname in sonames:
-        try:
-            return ctypes.CDLL(soname)
-        except OSError:
-            continue
-    raise StandError(f"{sonames[0]} cannot be loaded; on Debian or Ubuntu: apt-get install {debian_package}")
 
 
 @functools.cache

@@ -126,7 +126,7 @@ class Camera:
     async def _grab_free_running(self, connection: Connection, exposure_s: float) -> Shot:
         """Sleep until the frame is due, then take it: virtual time moves only while nobody waits on a wire."""
         called_ns = self._clock.now_ns()
-        await self._call(connection.prepare_free_run, exposure_s)
+        await self._call(connection.prepare, exposure_s)
         for _ in range(ATTEMPTS):
             await self._clock.sleep_until(connection.next_frame_due_ns(max(called_ns, self._clock.now_ns())))
             shot = await self._call(connection.next_free, called_ns)

@@ -1,7 +1,7 @@
 """One opened camera and its stream, blocking; after any loss a new one is made.
 
-Acquisition recipe: UDP socket, receive buffer for one frame, lost packets asked for again until the frame is nearly a
-period old, buffers given back right after the copy. Lives in one thread (the camera's lane).
+Acquisition recipe: UDP socket with a receive buffer for a frame, lost packets asked for again until the frame is nearly
+a period old, buffers given back right after the copy. Lives in one thread (the camera's lane).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ INITIAL_PACKET_TIMEOUT_US = 1_000
 PACKET_TIMEOUT_US = 40_000
 PACKET_REQUEST_RATIO = 1.0
 FRAME_RETENTION_PERIODS = 0.9
-SOCKET_BUFFER_AUTO = 1
+SOCKET_BUFFER_FIXED = 0
 
 # Bootstrap registers (GigE Vision 1.2, section 28): tick frequency, timestamp control and latched value.
 TICK_FREQUENCY_HIGH, TICK_FREQUENCY_LOW = 0x093C, 0x0940
@@ -66,24 +66,24 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 class FrameCount:
-    """Turns the camera's frame ids (16 bits, from 1 at each start) into one count that only rises."""
+    """Turns the camera's frame ids (from 1 at each start, mostly 16 bits) into one count that only rises."""
 
     def __init__(self) -> None:
         self.total = 0
-        self._last_id: int | None = None
+        self._last_id = 0
 
     def restart(self) -> None:
         """Ids begin anew with the next frame."""
-        self._last_id = None
+        self._last_id = 0
 
     def advance(self, frame_id: int) -> int:
-        """Count a frame; returns how many are missing before it."""
-        step = 1 if self._last_id is None else frame_id - self._last_id
+        """Count up to this frame, those missing before it included; returns the total."""
+        step = frame_id - self._last_id
         if step <= 0:
             step += FRAME_ID_WRAP
         self._last_id = frame_id
         self.total += step
-        return step - 1
+        return self.total
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,14 +113,13 @@ class Connection:
         self._counts = counts
         self._stream: GigeStream | None = None
         self._stream_counts: dict[str, int] = {}
-        self._dropped = 0
-        self._unwatched = False
+        self._failed = 0  # attempts since the last good frame
         self._give_one_away = False
         self._free_run = settings.trigger == "free_run"
         self._timeout_s = max(TRANSFER_TIMEOUT_S, 2 * settings.period_s)
         self._offset_ns: int | None = None  # stand clock minus camera clock; None: no useful time stamps
         self._latched_at_ns = 0
-        self.phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
+        self._phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
         self._device = _open_controlled(name, settings)
         try:
             self._device.on_control_lost(self.control_lost.set)
@@ -131,6 +130,7 @@ class Connection:
                 )
             self._stop_quietly()  # a client that died may have left it running, with its settings locked
             self.effective = apply_settings(name, self._device, settings)
+            self._period_ns = seconds_ns(1 / self.effective.frame_rate_hz)
             self._exposure_asked_s = settings.exposure_s
             self._exposure_s = self.effective.exposure_s
             self._temperature, self._no_temperature = find_temperature(self._device, settings.temperature)
@@ -160,12 +160,13 @@ class Connection:
         except BaseException:
             stream.close()
             raise
-        self.phase_ns = self._clock.now_ns()
+        self._phase_ns = self._clock.now_ns()
         self._stream = stream
 
     def _configure(self, stream: GigeStream) -> None:
         retention_us = round(FRAME_RETENTION_PERIODS / self.effective.frame_rate_hz * 1e6)
-        stream.set_property("socket-buffer", SOCKET_BUFFER_AUTO, G_TYPE_INT)
+        stream.set_property("socket-buffer", SOCKET_BUFFER_FIXED, G_TYPE_INT)
+        stream.set_property("socket-buffer-size", self.effective.receive_buffer_bytes, G_TYPE_INT)
         stream.set_property("packet-resend", int(self._settings.resend), G_TYPE_INT)
         stream.set_property("packet-request-ratio", PACKET_REQUEST_RATIO, G_TYPE_DOUBLE)
         stream.set_property("initial-packet-timeout", INITIAL_PACKET_TIMEOUT_US, G_TYPE_UINT)
@@ -189,37 +190,33 @@ class Connection:
         except AravisError:
             self._counts["stop_errors"] += 1
 
+    def prepare(self, exposure_s: float) -> None:
+        """Set the exposure, throw away what came before, keep the camera's clock tied to ours."""
+        self._set_exposure(exposure_s)
+        self._discard()
+        self._give_one_away = self._free_run and self._offset_ns is None  # its exposure may have begun before the call
+        if self._clock.now_ns() - self._latched_at_ns > seconds_ns(LATCH_AGAIN_S):
+            self._latch()
+
     def trigger(self, exposure_s: float) -> Shot | None:
         """One software trigger and its frame, or None when it did not come complete."""
-        self._set_exposure(exposure_s)
-        self.discard()
+        self.prepare(exposure_s)
         trigger_ns = self._clock.now_ns()
         self._device.software_trigger()
         self._counts["triggers"] += 1
-        shot = self._take(trigger_ns, self._exposure_s + self._timeout_s)
-        if shot is None:
-            self._dropped += 1
-        return shot
-
-    def prepare_free_run(self, exposure_s: float) -> None:
-        """Set the exposure, throw away what came before, keep the camera's clock tied to ours."""
-        self._set_exposure(exposure_s)
-        self.discard()
-        self._give_one_away = self._offset_ns is None  # its exposure may have begun before the call
-        if self._clock.now_ns() - self._latched_at_ns > seconds_ns(LATCH_AGAIN_S):
-            self._latch()
+        return self._take(trigger_ns, self._exposure_s + self._timeout_s)
 
     def next_free(self, newer_than_ns: int) -> Shot | None:
         """The next complete frame whose exposure began at or after an instant, or None when none came in time."""
         shot = self._take(newer_than_ns, self._timeout_s)
         if shot is not None and self._offset_ns is not None:
-            self.phase_ns = shot.start_ns
+            self._phase_ns = shot.start_ns
         return shot
 
     def next_frame_due_ns(self, time_ns: int) -> int:
         """When the first free-run frame that begins at or after `time_ns` has been exposed."""
-        period_ns = seconds_ns(1 / self.effective.frame_rate_hz)
-        begin_ns = self.phase_ns + -(-(time_ns - self.phase_ns) // period_ns) * period_ns
+        periods = -((self._phase_ns - time_ns) // self._period_ns)  # rounded up
+        begin_ns = self._phase_ns + periods * self._period_ns
         return begin_ns + seconds_ns(self._exposure_s)
 
     def temperature(self) -> tuple[float, str]:
@@ -228,17 +225,13 @@ class Connection:
             return math.nan, self._no_temperature
         return read_temperature(self._device, self._temperature)
 
-    def discard(self) -> None:
+    def _discard(self) -> None:
         """Give back every finished frame unused."""
         stream = self._streaming()
-        discarded = 0
         while (buffer := stream.pop(0)) is not None:
-            discarded += 1
+            self._counts["stale"] += 1
             self._frames.advance(stream.info(buffer).frame_id)
             stream.push(buffer)
-        self._counts["stale"] += discarded
-        # The camera went on while all buffers were full: what it sent then is not lost, nobody wanted it.
-        self._unwatched = discarded >= self._settings.buffers - 1
 
     def _streaming(self) -> GigeStream:
         if self._stream is None:
@@ -258,36 +251,26 @@ class Connection:
             buffer = stream.pop(timeout_s)
             if buffer is None:
                 self._counts["missed"] += 1
-                return None
+                break
             try:
                 info = stream.info(buffer)
                 image = self._image(stream, buffer, info)
             finally:
                 stream.push(buffer)
-            self._count_lost(info, whole=image is not None)
+            self._frames.advance(info.frame_id)
             if image is None:
-                return None
-            start_ns = self._stand_ns(info.timestamp_ns)
-            if start_ns is not None and start_ns < newer_than_ns - STAMP_SLACK_NS:
+                break
+            stamped_ns = self._stand_ns(info.timestamp_ns)
+            if stamped_ns is not None and stamped_ns < newer_than_ns - STAMP_SLACK_NS:
                 self._counts["stale"] += 1
                 continue
-            if not self._free_run:
-                start_ns = newer_than_ns  # the trigger
-            elif start_ns is None:
-                if self._give_one_away:
-                    self._give_one_away = False
-                    self._counts["stale"] += 1
-                    return None
-                start_ns = self._clock.now_ns() - seconds_ns(self._exposure_s)
-            return self._shot(stream, image, start_ns, info.timestamp_ns)
+            if stamped_ns is None and self._give_one_away:
+                self._give_one_away = False
+                self._counts["stale"] += 1
+                return None
+            return self._shot(stream, image, info.timestamp_ns, newer_than_ns, stamped_ns)
+        self._failed += 1
         return None
-
-    def _count_lost(self, info: BufferInfo, *, whole: bool) -> None:
-        """Keep the frame count; in free run a hole in it or a frame with holes is a lost frame."""
-        missing = self._frames.advance(info.frame_id)
-        if self._free_run:
-            self._dropped += (0 if self._unwatched else missing) + (not whole)
-        self._unwatched = False
 
     def _image(self, stream: GigeStream, buffer: int, info: BufferInfo) -> Pixels | None:
         """The pixels in an array of their own, or None when the frame is not whole."""
@@ -304,12 +287,20 @@ class Connection:
         image.setflags(write=False)
         return image
 
-    def _shot(self, stream: GigeStream, image: Pixels, start_ns: int, ticks: int) -> Shot:
-        dropped, self._dropped = self._dropped, 0
+    def _shot(
+        self, stream: GigeStream, image: Pixels, camera_ticks: int, newer_than_ns: int, stamped_ns: int | None
+    ) -> Shot:
+        """The frame with its time, the losses before it, and the temperature right after it."""
+        start_ns, dropped = newer_than_ns, self._failed
+        if self._free_run:
+            start_ns = self._clock.now_ns() - seconds_ns(self._exposure_s) if stamped_ns is None else stamped_ns
+            if stamped_ns is not None:  # whole periods between the call and the frame were lost
+                dropped = max(0, (stamped_ns - newer_than_ns) // self._period_ns)
+        self._failed = 0
         self._counts["frames"] += 1
         self._count_stream(stream)
         temperature_degC, _ = self.temperature()
-        return Shot(image, start_ns, self._exposure_s, self._frames.total, ticks, dropped, temperature_degC)
+        return Shot(image, start_ns, self._exposure_s, self._frames.total, camera_ticks, dropped, temperature_degC)
 
     def _count_stream(self, stream: GigeStream) -> None:
         """Add what Aravis counted since the last time."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from drivers.aravis import GigeDevice
@@ -20,6 +21,9 @@ HEARTBEAT_TIMEOUT_MS = 0x0938
 EXPOSURE_TOLERANCE, EXPOSURE_TOLERANCE_S = 0.01, 50e-6
 GAIN_TOLERANCE_DB = 0.5
 FRAME_RATE_TOLERANCE = 0.02
+
+LEAST_RECEIVE_BUFFER_BYTES = 1 << 20
+RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
 # Codes of arv-device-error-quark.
 SILENT = {2, 4, 5, 6}  # not connected, transfer error, timeout, device not found
@@ -94,7 +98,10 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class EffectiveSettings:
-    """What the camera made of the settings; exposure and gain as it quantised them."""
+    """What the camera made of the settings; exposure and gain as it quantised them.
+
+    receive_buffer_bytes: of the host's socket; below payload_bytes a camera that sends in bursts loses packets.
+    """
 
     width_px: int
     height_px: int
@@ -106,6 +113,7 @@ class EffectiveSettings:
     packet_delay_ns: int
     heartbeat_s: float
     payload_bytes: int
+    receive_buffer_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +159,7 @@ def apply_settings(name: str, device: GigeDevice, settings: CameraSettings) -> E
     gain_dB = _set_gain(name, device, settings.gain_dB)
     frame_rate_hz = _set_trigger(name, device, settings)
     packet_size, packet_delay_ns = _set_packets(name, device, settings)
+    payload_bytes = device.payload_bytes()  # last: it follows from region, format and chunks
     return EffectiveSettings(
         width_px=width,
         height_px=height,
@@ -161,7 +170,8 @@ def apply_settings(name: str, device: GigeDevice, settings: CameraSettings) -> E
         packet_size=packet_size,
         packet_delay_ns=packet_delay_ns,
         heartbeat_s=heartbeat_s,
-        payload_bytes=device.payload_bytes(),  # last: it follows from region, format and chunks
+        payload_bytes=payload_bytes,
+        receive_buffer_bytes=_receive_buffer_bytes(payload_bytes),
     )
 
 
@@ -238,6 +248,19 @@ def _set_packets(name: str, device: GigeDevice, settings: CameraSettings) -> tup
     if settings.packet_delay_ns or device.packet_delay_ns():
         device.set_packet_delay(settings.packet_delay_ns)
     return device.packet_size(), device.packet_delay_ns()
+
+
+def _receive_buffer_bytes(payload_bytes: int) -> int:
+    """What to ask of the kernel, which grants no more than net.core.rmem_max (raise it with sysctl).
+
+    Twice a frame, because the kernel also counts what it adds to each packet (2.3 kB for 1.4 kB of image); Aravis' own
+    choice is one frame, and small images lose packets.
+    """
+    wanted_bytes = max(2 * payload_bytes, LEAST_RECEIVE_BUFFER_BYTES)
+    try:
+        return min(wanted_bytes, int(RECEIVE_BUFFER_LIMIT.read_text(encoding="ascii")))
+    except (OSError, ValueError):  # not Linux
+        return wanted_bytes
 
 
 def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> tuple[TemperatureFeature | None, str]:

@@ -1,0 +1,36 @@
+import os
+
+import pytest
+
+from drivers.aravis import GigeDevice
+from drivers.aravis_library import DEVICE_ERRORS, AravisError, Library, library, load
+from drivers.interface import StandError
+
+
+@pytest.fixture
+def aravis() -> Library:
+    try:
+        return library()
+    except StandError as error:
+        if os.environ.get("CI") == "true":
+            raise
+        pytest.skip(str(error))
+
+
+def test_a_missing_library_names_the_package_to_install():
+    with pytest.raises(StandError, match=r"^libnowhere\.so\.1 cannot be loaded.*apt-get install libnowhere1$"):
+        load(("libnowhere.so.1", "libnowhere.so.2"), "libnowhere1")
+
+
+def test_the_first_library_that_is_there_is_taken():
+    assert load(("libnowhere.so.1", "libc.so.6"), "libc6")
+
+
+def test_every_declared_function_exists(aravis: Library):
+    assert aravis.call("g_quark_to_string", 0) is None
+
+
+def test_what_aravis_reports_becomes_an_exception_with_domain_and_code(aravis: Library):
+    with pytest.raises(AravisError, match=r"'no such camera' not found") as caught:
+        GigeDevice("no such camera")
+    assert (caught.value.domain, caught.value.code) == (DEVICE_ERRORS, 6)
