@@ -223,15 +223,21 @@ class ModbusClient:
         """FC 16."""
         reply = self._exchange(WriteMultipleRegistersRequest(dev_id=unit, address=address, registers=values))
         if (reply.address, reply.count) != (address, len(values)):
-            raise WireFault(Fault.GARBLED, f"asked for {len(values)} at {address:#06x}, the reply confirms {reply}")
+            raise WireFault(
+                Fault.GARBLED,
+                f"wrote {len(values)} words at {address:#06x}, the reply has {reply.count} at {reply.address:#06x}",
+            )
 
     def _echoed(self, request: ModbusPDU) -> None:
         """Send a single write, whose reply repeats address and value, and so is as long as the request."""
         reply = self._exchange(request)
         if len(self._heard) != len(self._sent):
             raise WireFault(Fault.GARBLED, "more came back than a reply (local echo of the adapter?)")
-        if (reply.address, list(reply.registers)) != (request.address, list(request.registers)):
-            raise WireFault(Fault.GARBLED, f"sent {request}, the reply confirms {reply}")
+        sent, echoed = ((pdu.address, pdu.registers[0]) for pdu in (request, reply))
+        if sent != echoed:
+            raise WireFault(
+                Fault.GARBLED, "wrote {1:#06x} at {0:#06x}, the reply has {3:#06x} at {2:#06x}".format(*sent, *echoed)
+            )
 
     def _exchange(self, request: ModbusPDU) -> ModbusPDU:
         """Send `request`; its reply, of the same function and unit; raises WireFault."""

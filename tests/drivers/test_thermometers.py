@@ -1,0 +1,191 @@
+"""The thermometer driver against pymodbus servers with the words of an M-7015 and of an ADAM-4015."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+
+import pytest
+from pymodbus.constants import ExcCodes
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from drivers.bus import Bus, LineSettings
+from drivers.clock import WallClock
+from drivers.interface import ConfigError, DeviceFault, Quality, Reading, Unreachable
+from drivers.registers import load_register_map
+from drivers.thermometers import ThermometerChannel, Thermometers
+
+Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
+
+MAPS = Path(__file__).parents[2] / "configs" / "registers"
+M7015 = load_register_map(MAPS / "icpdas-m7015.yaml")
+ADAM4015 = load_register_map(MAPS / "adam-4015.yaml")
+UNIT = 3
+SENSORS = {
+    "granite_inside": ThermometerChannel(0),
+    "air": ThermometerChannel(3, offset_K=-0.05, polynomial=(0.01, 0.001), certificate="T-17"),
+    "laboratory": ThermometerChannel(5, plausible_degC=(5.0, 40.0)),
+}
+
+
+class Module:
+    """Six words, six fault bits, six type codes and the data format of an M-7015."""
+
+    def __init__(self) -> None:
+        self.words = [round(degC / 100 * 32767) for degC in (24.0, 0.0, 0.0, 25.0, 0.0, 21.5)]
+        self.faults = [False] * 6
+        self.types = [0x20] * 6
+        self.unreadable: set[int] = set()  # function codes that get an exception
+        self.unplugged = False
+        self.requests: list[int] = []
+
+    def device(self) -> SimDevice:
+        return SimDevice(
+            UNIT,
+            simdata=(
+                [SimData(0x100, values=[False] * 16, datatype=DataType.BITS)],
+                [SimData(0x80, values=[False] * 16, datatype=DataType.BITS)],
+                [SimData(0x100, count=6, datatype=DataType.REGISTERS)],
+                [SimData(0, count=6, datatype=DataType.REGISTERS)],
+            ),
+            action=self.act,
+        )
+
+    async def act(
+        self, function: int, start: int, address: int, count: int, registers: list[int], values: list[int] | None
+    ) -> ExcCodes | None:
+        self.requests.append(function)
+        if self.unplugged:
+            return ExcCodes.GATEWAY_NO_RESPONSE
+        if function in self.unreadable:
+            return ExcCodes.DEVICE_FAILURE
+        match function:
+            case 2:
+                registers[0] = sum(fault << channel for channel, fault in enumerate(self.faults))
+            case 3:
+                registers[:6] = self.types
+            case 4:
+                registers[:6] = [word & 0xFFFF for word in self.words]
+        return None
+
+
+@pytest.fixture
+def module() -> Module:
+    return Module()
+
+
+@pytest.fixture
+async def thermometers(serve_modbus: Serve, module: Module) -> AsyncIterator[Thermometers]:
+    """Not yet opened."""
+    bus = Bus("rs485", await serve_modbus([module.device()], []), WallClock(), LineSettings(), timeout_s=0.1, gap_s=0.0)
+    await bus.open()
+    yield Thermometers("thermometers", bus, M7015, SENSORS, WallClock())
+    await bus.close()
+
+
+async def readings(thermometers: Thermometers) -> dict[str, Reading]:
+    return {reading.channel.removeprefix("thermometers."): reading for reading in await thermometers.read()}
+
+
+async def test_temperatures_are_scaled_and_calibrated_and_the_raw_words_kept(
+    thermometers: Thermometers, module: Module
+) -> None:
+    await thermometers.open()
+    found = await readings(thermometers)
+    assert list(found) == ["granite_inside", "granite_inside_raw", "air", "air_raw", "laboratory", "laboratory_raw"]
+    assert found["granite_inside"].value == pytest.approx(24.0, abs=0.0016)  # half a count
+    assert found["air"].value == pytest.approx(25.0 - 0.05 + 0.01 + 0.001 * 25.0, abs=0.0016)
+    assert found["laboratory"].unit == "degC"
+    assert found["air_raw"].value == module.words[3]
+    assert {reading.quality for reading in found.values()} == {Quality.GOOD}
+
+
+async def test_below_zero_and_at_the_calibration_points(thermometers: Thermometers, module: Module) -> None:
+    await thermometers.open()
+    for degC in (-49.9, -10.0, 0.0, 52.0, 99.9):
+        module.words[0] = round(degC / 100 * 32767)
+        assert (await readings(thermometers))["granite_inside"].value == pytest.approx(degC, abs=0.0016)
+
+
+async def test_a_poll_is_one_read_of_words_and_one_of_bits(thermometers: Thermometers, module: Module) -> None:
+    await thermometers.open()
+    module.requests.clear()
+    await thermometers.read()
+    assert module.requests == [4, 2]
+
+
+@pytest.mark.parametrize(("word", "reason"), [(0x7FFF, "over range"), (-0x8000, "under range")])
+async def test_a_fault_word_spoils_its_own_sensor_only(
+    thermometers: Thermometers, module: Module, word: int, reason: str
+) -> None:
+    await thermometers.open()
+    module.words[3] = word
+    found = await readings(thermometers)
+    assert (found["air"].quality, found["air"].reason) == (Quality.BAD, reason)
+    assert found["granite_inside"].quality is found["laboratory"].quality is Quality.GOOD
+
+
+async def test_an_open_wire_bit_spoils_its_own_sensor_only(thermometers: Thermometers, module: Module) -> None:
+    await thermometers.open()
+    module.faults[5] = True
+    found = await readings(thermometers)
+    assert (found["laboratory"].quality, found["laboratory"].reason) == (Quality.BAD, "open_5")
+    assert found["granite_inside"].quality is found["air"].quality is Quality.GOOD
+
+
+async def test_an_implausible_temperature_is_bad(thermometers: Thermometers, module: Module) -> None:
+    await thermometers.open()
+    module.words[5] = round(0.5 * 32767)
+    assert "is outside 5..40 degC" in (await readings(thermometers))["laboratory"].reason
+
+
+async def test_values_are_stale_while_the_fault_bits_cannot_be_read(thermometers: Thermometers, module: Module) -> None:
+    await thermometers.open()
+    module.unreadable = {2}
+    found = await readings(thermometers)
+    assert found["air"].quality is Quality.STALE
+    assert found["air"].value == pytest.approx(24.985, abs=0.0016)
+    assert "fault bits unreadable" in found["air"].reason
+
+
+async def test_another_type_code_is_refused(thermometers: Thermometers, module: Module) -> None:
+    module.types[3] = 0x2E
+    with pytest.raises(DeviceFault, match="thermometers: type_code_3 is 46 where the register map expects 32"):
+        await thermometers.open()
+    with pytest.raises(DeviceFault, match="type_code_3"):
+        await thermometers.read()
+
+
+async def test_a_module_exchanged_while_unreachable_is_found_out(thermometers: Thermometers, module: Module) -> None:
+    await thermometers.open()
+    module.unplugged = True
+    with pytest.raises(Unreachable):
+        await thermometers.read()
+    module.unplugged = False
+    module.types = [0x2E] * 6
+    with pytest.raises(DeviceFault, match="type_code_0"):
+        await thermometers.read()
+
+
+async def test_an_adam_4015_is_driven_by_its_own_map(serve_modbus: Serve) -> None:
+    words = [26874, 0, 0, 0, 0, 0xFFFF]
+    registers = [
+        SimData(0, values=words, datatype=DataType.REGISTERS),
+        SimData(210, values=[0x40, 0x15], datatype=DataType.REGISTERS),
+    ]
+    address = await serve_modbus([SimDevice(UNIT, simdata=registers)], [])
+    bus = Bus("rs485", address, WallClock(), LineSettings(), timeout_s=0.1)
+    await bus.open()
+    sensors = {"granite_inside": ThermometerChannel(0), "air": ThermometerChannel(5)}
+    adam = Thermometers("thermometers", bus, ADAM4015, sensors, WallClock())
+    await adam.open()
+    found = await readings(adam)
+    assert found["granite_inside"].value == pytest.approx(32.0142, abs=1e-4)
+    assert found["air"].reason == "over range or open"
+    await bus.close()
+
+
+def test_a_sensor_on_a_channel_the_module_has_not_is_a_config_error() -> None:
+    bus = Bus("rs485", "tcp:localhost:502", WallClock(), LineSettings())
+    with pytest.raises(ConfigError, match=r"thermometers\.air: register map M-7015 has no value_6"):
+        Thermometers("thermometers", bus, M7015, {"air": ThermometerChannel(6)}, WallClock())
