@@ -126,6 +126,10 @@ class GigeDevice:
         """Write a String or Enumeration feature."""
         self._call("arv_camera_set_string", feature.encode(), value.encode())
 
+    def set_boolean(self, feature: str, value: bool) -> None:
+        """Write a Boolean feature."""
+        self._call("arv_camera_set_boolean", feature.encode(), value)
+
     def sensor_size(self) -> tuple[int, int]:
         """Width and height of the sensor, px."""
         width, height = ctypes.c_int(), ctypes.c_int()

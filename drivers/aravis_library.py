@@ -42,6 +42,7 @@ ARAVIS_FUNCTIONS = {
     "arv_camera_get_integer_bounds": "v PS**E",
     "arv_camera_get_string": "S PSE",
     "arv_camera_set_string": "v PSSE",
+    "arv_camera_set_boolean": "v PSbE",
     "arv_camera_is_feature_available": "b PSE",
     "arv_camera_gv_set_stream_options": "v Pi",
     "arv_camera_gv_set_packet_size_adjustment": "v Pi",

@@ -11,7 +11,14 @@ from collections.abc import Callable
 
 from drivers.aravis_library import AravisError
 from drivers.camera_connection import Connection, FrameCount, Shot
-from drivers.camera_settings import CameraSettings, EffectiveSettings, Identity, TemperatureFeature, device_error
+from drivers.camera_settings import (
+    CameraSettings,
+    EffectiveSettings,
+    Identity,
+    TemperatureFeature,
+    device_error,
+    lacks_control,
+)
 from drivers.clock import Clock, seconds_ns
 from drivers.interface import DeviceError, Frame, Reading, Unreachable, bad_reading
 from drivers.lane import Lane, Result
@@ -51,7 +58,7 @@ class Camera:
 
     def counters(self) -> dict[str, int]:
         """Counted since the camera was made: frames, triggers, missed, stale, incomplete_*, wrong_size, opened,
-        control_lost, and Aravis' own n_*; a counter that never moved may be absent."""
+        lost, and Aravis' own n_*; a counter that never moved may be absent."""
         return dict(self._counts)
 
     async def open(self) -> None:
@@ -142,6 +149,8 @@ class Camera:
         try:
             return await self._lane.call(function, *args)
         except AravisError as error:
+            if self._connection is not None and lacks_control(error):
+                raise self._lose(f"control lost: {error}") from error
             raise device_error(self._name, error) from error
 
     def _usable(self) -> Connection:
@@ -149,13 +158,13 @@ class Camera:
         if self._connection is None:
             raise Unreachable(self._name, "not open")
         if self._connection.control_lost.is_set() and not self._lost:
-            self._counts["control_lost"] += 1
             self._lose("control lost: the camera restarted, dropped us, or is silent")
         if self._lost:
             raise Unreachable(self._name, self._lost)
         return self._connection
 
     def _lose(self, reason: str) -> DeviceError:
+        self._counts["lost"] += 1
         self._lost = reason
         return Unreachable(self._name, reason)
 

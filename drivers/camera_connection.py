@@ -61,7 +61,6 @@ TRANSFER_TIMEOUT_S = 2.0  # real seconds beyond the exposure: read-out, 5 MB on 
 CONTROL_RETRY_S = 1.0
 FRAME_ID_WRAP = 65535  # 16-bit frame ids count 1..65535 and skip 0
 
-
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
@@ -124,10 +123,9 @@ class Connection:
         try:
             self._device.on_control_lost(self.control_lost.set)
             self.identity = read_identity(self._device)
-            if settings.serial_number is not None and settings.serial_number != self.identity.serial_number:
-                raise Refused(
-                    name, f"serial number {settings.serial_number} is expected, {self.identity.serial_number} answers"
-                )
+            serial_number = self.identity.serial_number
+            if settings.serial_number not in (None, serial_number):
+                raise Refused(name, f"serial number {settings.serial_number} is expected, {serial_number} answers")
             self._stop_quietly()  # a client that died may have left it running, with its settings locked
             self.effective = apply_settings(name, self._device, settings)
             self._period_ns = seconds_ns(1 / self.effective.frame_rate_hz)
@@ -194,9 +192,9 @@ class Connection:
         """Set the exposure, throw away what came before, keep the camera's clock tied to ours."""
         self._set_exposure(exposure_s)
         self._discard()
-        self._give_one_away = self._free_run and self._offset_ns is None  # its exposure may have begun before the call
-        if self._clock.now_ns() - self._latched_at_ns > seconds_ns(LATCH_AGAIN_S):
+        if self._offset_ns is None or self._clock.now_ns() - self._latched_at_ns > seconds_ns(LATCH_AGAIN_S):
             self._latch()
+        self._give_one_away = self._free_run and self._offset_ns is None  # its exposure may have begun before the call
 
     def trigger(self, exposure_s: float) -> Shot | None:
         """One software trigger and its frame, or None when it did not come complete."""

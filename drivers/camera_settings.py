@@ -17,6 +17,8 @@ BYTES_PER_PIXEL = {"Mono8": 1, "Mono10": 2, "Mono12": 2, "Mono16": 2}
 VENDOR, MODEL, VERSION, SERIAL = (0x0048, 32), (0x0068, 32), (0x0088, 32), (0x00D8, 16)
 HEARTBEAT_TIMEOUT_MS = 0x0938
 
+LEAST_HEARTBEAT_S = 1.5
+
 # Wider than any sensor's quantisation (line time, 0.1..0.36 dB steps), narrower than a clamped value.
 EXPOSURE_TOLERANCE, EXPOSURE_TOLERANCE_S = 0.01, 50e-6
 GAIN_TOLERANCE_DB = 0.5
@@ -87,8 +89,10 @@ class CameraSettings:
     def __post_init__(self) -> None:
         if self.pixel_format not in BYTES_PER_PIXEL:
             raise ValueError(f"pixel_format is one of {', '.join(BYTES_PER_PIXEL)}, not {self.pixel_format}")
-        if min(self.exposure_s, self.frame_rate_hz, self.heartbeat_s, self.buffers) <= 0:
-            raise ValueError("exposure_s, frame_rate_hz, heartbeat_s and buffers are positive")
+        if min(self.exposure_s, self.frame_rate_hz, self.buffers) <= 0:
+            raise ValueError("exposure_s, frame_rate_hz and buffers are positive")
+        if self.heartbeat_s < LEAST_HEARTBEAT_S:
+            raise ValueError(f"heartbeat_s is at least {LEAST_HEARTBEAT_S}: Aravis asks once a second")
 
     @property
     def period_s(self) -> float:
@@ -126,12 +130,17 @@ class Identity:
     version: str
 
 
+def lacks_control(error: AravisError) -> bool:
+    """Whether it failed because we do not, or no longer, control the camera."""
+    return error.domain == DEVICE_ERRORS and error.code in NO_CONTROL
+
+
 def device_error(name: str, error: AravisError) -> DeviceError:
     """The stand's error for what Aravis reported."""
     if error.domain == DEVICE_ERRORS:
         if error.code in SILENT:
             return Unreachable(name, str(error))
-        if error.code in NO_CONTROL:
+        if lacks_control(error):
             return Refused(name, f"{error} ({NO_CONTROL_HINT})")
         return Refused(name, f"{error} (Aravis device error {error.code})")
     if error.domain == GENICAM_ERRORS:
@@ -229,6 +238,8 @@ def _set_trigger(name: str, device: GigeDevice, settings: CameraSettings) -> flo
             raise Refused(name, f"a software trigger was asked for, the camera has mode {state[0]}, source {state[1]}")
         return settings.frame_rate_hz
     device.clear_triggers()
+    if device.available("AcquisitionFrameRateEnable"):  # without it the rate is only a number
+        device.set_boolean("AcquisitionFrameRateEnable", True)
     device.set_frame_rate(settings.frame_rate_hz)
     rate_hz = device.frame_rate_hz()
     if not math.isclose(rate_hz, settings.frame_rate_hz, rel_tol=FRAME_RATE_TOLERANCE):

@@ -124,7 +124,7 @@ def test_the_frame_count_rises_over_the_wrap_of_16_bit_ids_and_over_a_restart():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"pixel_format": "BayerRG8"}, {"exposure_s": 0.0}, {"frame_rate_hz": 0.0}, {"buffers": 0}],
+    [{"pixel_format": "BayerRG8"}, {"exposure_s": 0.0}, {"frame_rate_hz": 0.0}, {"buffers": 0}, {"heartbeat_s": 1.0}],
 )
 def test_settings_no_camera_could_take_are_refused_at_once(changes: dict[str, object]):
     with pytest.raises(ValueError, match=next(iter(changes))):
