@@ -22,12 +22,16 @@ NS_PER_S = 1_000_000_000
 QUIET_TURNS = 6
 
 
-class Clock(Protocol):
-    """Time as the stand sees it."""
+class Now(Protocol):
+    """The part of a clock that a fake device needs."""
 
     def now_ns(self) -> int:
         """ns since the epoch; never goes back."""
         ...
+
+
+class Clock(Now, Protocol):
+    """Time as the stand sees it."""
 
     async def sleep_until(self, time_ns: int) -> None:
         """Return at or after `time_ns`; at once when it has passed."""

@@ -6,6 +6,7 @@ end upwards, so that the spindle's play lies on the same side at every capture (
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from dataclasses import dataclass
 from typing import Literal
@@ -121,12 +122,18 @@ class Axis:
         """Whether the position scale is calibrated."""
         return bool((await self._lane.call(self._status)).flags & _HOMED)
 
-    async def home(self) -> None:
-        """Run the controller's homing procedure; DeviceFault when it does not end homed."""
+    async def home(self) -> float:
+        """Run the controller's homing procedure and make its end the zero of the scale.
+
+        Returns the residual: where the scale had this point before, mm or deg (after a power cycle without meaning).
+        DeviceFault when the procedure does not end homed.
+        """
         await self._lane.call(self._start, "home", b"")
         status = await self._wait(_HOME_LIMIT_S)
         if not status.flags & _HOMED:
             raise DeviceFault(self.name, "the homing procedure ended without a home position")
+        await self._lane.call(self._zero)
+        return status.steps * self._profile.unit_per_step
 
     async def move_to(self, position: float) -> None:
         """Move to `position` (mm or deg) from below. Refused outside the limits or when not homed; DeviceFault when
@@ -204,6 +211,13 @@ class Axis:
             self._checked = False  # whoever answers next must prove to be the same controller
             raise
         return _Status(command=values[1], steps=values[5] + values[6] / _MICROSTEPS, flags=values[15], gpio=values[16])
+
+    def _zero(self) -> None:
+        """HOME leaves the step counter alone (libximc, command_homezero): zero it, and look whether that came through."""
+        with contextlib.suppress(Unreachable, GarbledReply):
+            self._client.command("zero")
+        if (steps := self._status().steps) != 0:
+            raise DeviceFault(self.name, f"the step counter could not be set to zero, it is {steps:.2f}")
 
     def _start(self, letters: str, payload: bytes) -> None:
         """Send a command once; when its acknowledgement is lost, the controller's state tells whether it came."""

@@ -89,7 +89,7 @@ Step = StartChamber | SetTemperature | StopChamber | Soak | OpenFlap | CloseFlap
 # What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves, camera boot.
 _FLAP_S = 3.0
 _MOVE_S = 15.0
-_CAMERA_BOOT_S = 5.0
+_CAMERA_BOOT_S = 8.0
 
 
 def estimate_s(step: Step) -> float:

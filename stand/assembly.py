@@ -14,7 +14,7 @@ from drivers.camera import Camera, CameraSettings, TemperatureFeature
 from drivers.clock import Clock
 from drivers.flap import Flap, FlapSettings
 from drivers.interface import ConfigError, Sensor
-from drivers.registers import load_register_map
+from drivers.registers import RegisterMap, load_register_map
 from drivers.regulator import Regulator
 from drivers.relays import Relays
 from drivers.stage import Axis, AxisSettings
@@ -77,17 +77,14 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         regulator=Regulator(
             "regulator",
             bus,
-            load_register_map(packaged("registers", config.regulator.registers)),
+            _register_map(config.regulator.registers, config.regulator.unit),
             clock,
-            unit=config.regulator.unit,
         ),
         relays=Relays(
             "relays",
             bus,
-            load_register_map(packaged("registers", config.relays.registers)),
+            _register_map(config.relays.registers, config.relays.unit),
             {str(name): number for name, number in config.relays.channels.items()},
-            clock,
-            unit=config.relays.unit,
         ),
         thermometers=_thermometers(config, bus, clock),
         axes={
@@ -98,7 +95,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         camera=Camera("camera", _camera_settings(config), clock),
     )
     compressor = CompressorLimits(**config.compressor.model_dump())
-    limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, compressor)
+    limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor)
     return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock))
 
 
@@ -109,8 +106,12 @@ def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers:
         )
         for name, entry in config.thermometers.channels.items()
     }
-    register_map = load_register_map(packaged("registers", config.thermometers.registers))
-    return Thermometers("thermometers", bus, register_map, channels, clock, unit=config.thermometers.unit)
+    register_map = _register_map(config.thermometers.registers, config.thermometers.unit)
+    return Thermometers("thermometers", bus, register_map, channels, clock)
+
+
+def _register_map(name: str, unit: int) -> RegisterMap:
+    return load_register_map(packaged("registers", name)).at_unit(unit)
 
 
 class _BackendModule(Protocol):

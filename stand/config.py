@@ -76,11 +76,12 @@ class RelaysConfig(Document):
 
 
 class ThermometerConfig(Document):
-    """One Pt100: the module's channel and the sensor's calibration, degC = polynomial(raw degC) + offset."""
+    """One Pt100: the module's channel and the sensor's calibration, degC = t + offset_K + sum polynomial[k] * t**k,
+    where t is what the module indicates."""
 
     channel: int = Field(ge=0, le=15)
     offset_K: float = 0.0
-    polynomial: tuple[float, ...] = (0.0, 1.0)
+    polynomial: tuple[float, ...] = ()
     certificate: str = ""
     plausible_degC: tuple[float, float] = (-40.0, 100.0)
 
@@ -159,7 +160,7 @@ class CameraTemperatureConfig(Document):
 
 
 class CameraConfig(Document):
-    """The GigE Vision camera, by IP address."""
+    """The GigE Vision camera, by IP address. boot_s: from its supply being switched on until it answers."""
 
     address: IpAddress
     serial_number: str | None = None
@@ -173,6 +174,7 @@ class CameraConfig(Document):
     packet_size: int | None = Field(default=None, ge=220, le=16112)
     heartbeat_s: float = Field(default=3.0, ge=0.5)
     temperature: CameraTemperatureConfig | None = None
+    boot_s: float = Field(default=8.0, ge=0)
     poll_s: PollPeriod_s = 1.0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
+import platform
 import signal
 from collections.abc import Callable, Coroutine
 from contextlib import AsyncExitStack
@@ -13,7 +14,6 @@ from pathlib import Path
 
 from drivers.clock import NS_PER_S, Clock, VirtualClock, WallClock
 from drivers.interface import ConfigError, StandError, StandTripped
-from experiments.steps import PlannedStep
 from stand.assembly import Assembly, assemble
 from stand.config import StandConfig
 from stand.hub import Event, Hub
@@ -53,7 +53,7 @@ async def run_virtual(order: Order, out: Path, seed: int | None, watch: Callable
     try:
         await control.open()
         clock = VirtualClock(round(simulation.start.timestamp()) * NS_PER_S, control.advance)
-        return await _run(order, out, clock, clock.run(), watch)
+        return await _run(order, out, clock, clock.run, watch)
     finally:
         await control.close()
         await asyncio.to_thread(simulator.stop)
@@ -68,7 +68,7 @@ async def _run(
     order: Order,
     out: Path,
     clock: Clock,
-    time: Coroutine[None, None, None] | None,
+    time: Callable[[], Coroutine[None, None, None]] | None,
     watch: Callable[[Hub], None],
 ) -> Path:
     hub = Hub()
@@ -79,7 +79,7 @@ async def _run(
         background: list[asyncio.Task[None]] = []
         stack.push_async_callback(_cancel, background)
         if time is not None:
-            background.append(asyncio.create_task(time))
+            background.append(asyncio.create_task(time()))
         stack.push_async_callback(_close, assembly)
         await _watched(_open(assembly), background)
         recorder = Recorder(
@@ -91,7 +91,7 @@ async def _run(
             clock,
             RecordingSettings(order.config.recording.frame_encoding, order.config.recording.telemetry_commit_s),
         )
-        await recorder.start()
+        recorder.start()
         stack.push_async_callback(recorder.finish)
         background.append(asyncio.create_task(recorder.run()))
         await _perform(assembly, order.recipe, background)
@@ -131,7 +131,8 @@ async def _perform(assembly: Assembly, recipe: Recipe, background: list[asyncio.
         hub.publish(Event(clock.now_ns(), "info", "run.end", "complete"))
     finally:
         plan.cancel()
-        await stand.make_safe()
+        if not stopping:  # else that was the first thing done
+            await stand.make_safe()
         # One more look at every device, so that the recording ends with the safe state as the wire tells it.
         for poller in pollers:
             await poller.poll()
@@ -224,10 +225,10 @@ def _session_info(order: Order, directory: Path, clock: Clock, assembly: Assembl
         session_id=directory.name,
         recipe=order.recipe.name,
         operator=order.config.operator,
-        stand=order.config.name,
         camera_serial=assembly.devices.camera.identity.serial_number,
         software_version=importlib.metadata.version("thermostand"),
         clock_source="virtual" if isinstance(clock, VirtualClock) else "wall",
+        host=platform.node(),
     )
 
 
@@ -235,8 +236,3 @@ def _kinds(config: StandConfig) -> dict[str, str]:
     """Device name -> what kind of device it is, for the recorder's topics."""
     kinds = {name: name for name in ("regulator", "relays", "thermometers", "camera", "flap")}
     return {**kinds, **{str(name): "axis" for name in config.axes}}
-
-
-def plan_of(order: Order) -> tuple[PlannedStep, ...]:
-    """The order's steps; ConfigError when one goes outside what this stand allows."""
-    return tuple(order.recipe.plan())

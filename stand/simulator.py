@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -54,6 +55,7 @@ class Simulator:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # more threads render no faster and starve the daemon
             start_new_session=True,  # Ctrl-C reaches the daemon first, which makes the stand safe and then ends this
         )
         if self._process.stdin is None or self._process.stdout is None or self._process.stderr is None:

@@ -38,10 +38,11 @@ class Devices:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What no step may exceed, and how the permissions to heat and cool are kept alive."""
+    """What no step may exceed, how long a permission to heat or cool lives, how long the camera takes to boot."""
 
     chamber_degC: tuple[float, float]
     hold_s: float
+    camera_boot_s: float
     compressor: CompressorLimits
 
 
@@ -150,6 +151,7 @@ class Stand:
             await self.devices.relays.switch("camera_power", on=False)
             return
         await self.devices.relays.switch("camera_power", on=True)
+        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.camera_boot_s))
         await self._open_camera()
 
     async def make_safe(self) -> None:

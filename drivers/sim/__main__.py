@@ -1,34 +1,46 @@
 """`python -m drivers.sim`: one process is one simulated laboratory. Its description comes as JSON on standard input.
 
-Prints `ready` when every fake answers; ends on SIGTERM or SIGINT; exits with 2 and one line when it cannot start.
+Prints `ready` when every fake answers; ends on SIGTERM, SIGINT or the control socket's `quit`; exits with 2 and one
+line when it cannot start. When whoever started it dies, it lives on for a minute, as a real laboratory would: long enough
+to see the heater's dead-man drop.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
+from types import FrameType
 
 from drivers.documents import parse_document
 from drivers.interface import ConfigError
 from drivers.sim.control import serve_control
 from drivers.sim.laboratory import Laboratory, LaboratorySpec
 
+_ORPHAN_LIMIT_S = 60
+
 
 def main() -> int:
     """Build the laboratory, serve it, take it down."""
     stop = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, end)
     try:
         spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
         laboratory = Laboratory(spec)
     except (ConfigError, OSError) as error:
         print(f"{error}", file=sys.stderr)  # noqa: T201 - the process' answer to who started it
         return 2
-    control = serve_control(laboratory)
+    control = serve_control(laboratory, stop.set)
     print("ready", flush=True)  # noqa: T201 - the process' answer to who started it
-    stop.wait()
+    parent, orphaned_s = os.getppid(), 0
+    while not stop.wait(1.0) and orphaned_s < _ORPHAN_LIMIT_S:
+        orphaned_s += os.getppid() != parent
     control.close()
     laboratory.close()
     return 0

@@ -1,9 +1,10 @@
 """The simulator's control socket: time, truth and faults. One JSON object a line in, one out.
 
     {"do": "advance", "now_ns": N}              -> {"now_ns": N}       virtual time moves to N
-    {"do": "state"}                             -> {"air_degC": ...}   the plant's true state
+    {"do": "state"}                             -> {"now_ns": N, "air_degC": ...}   the plant's true state
     {"do": "optics"}                            -> {"centres_px": [[x, y], ...]}   noise-free marker centres
     {"do": "fault", "name": S, "value": V}      -> {"name": S}         one of drivers.sim.laboratory.FAULTS
+    {"do": "quit"}                              -> {}                  the laboratory ends
 
 Anything wrong is answered with {"error": sentence}.
 """
@@ -11,6 +12,7 @@ Anything wrong is answered with {"error": sentence}.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 
 from drivers.sim.faults import LinkFaults
 from drivers.sim.laboratory import FAULTS, Laboratory
@@ -20,8 +22,9 @@ from drivers.sim.wire import TcpWire
 class ControlEngine:
     """One control conversation."""
 
-    def __init__(self, laboratory: Laboratory) -> None:
+    def __init__(self, laboratory: Laboratory, quit_: Callable[[], None]) -> None:
         self._laboratory = laboratory
+        self._quit = quit_
         self._pending = b""
 
     def feed(self, data: bytes) -> bytes:
@@ -45,6 +48,9 @@ class ControlEngine:
                 return {"now_ns": now_ns}
             case {"do": "state"}:
                 return dict(self._laboratory.state())
+            case {"do": "quit"}:
+                self._quit()
+                return {}
             case {"do": "optics"}:
                 return {"centres_px": self._laboratory.true_centres_px()}
             case {"do": "fault", "name": str(name), "value": value}:
@@ -56,7 +62,7 @@ class ControlEngine:
                 raise ValueError(f"cannot understand {request}")
 
 
-def serve_control(laboratory: Laboratory) -> TcpWire:
-    """Listen on the laboratory's control address."""
+def serve_control(laboratory: Laboratory, quit_: Callable[[], None]) -> TcpWire:
+    """Listen on the laboratory's control address; `quit_` is called for a `quit` request."""
     host, port = laboratory.spec.control.removeprefix("tcp:").rsplit(":", 1)
-    return TcpWire(host, int(port), lambda: ControlEngine(laboratory), LinkFaults())
+    return TcpWire(host, int(port), lambda: ControlEngine(laboratory, quit_), LinkFaults())

@@ -26,14 +26,19 @@ from drivers.sim.thermometers import FakeThermometers
 from drivers.sim.usb import UsbServer
 from drivers.sim.wire import Engine, PtyWire, TcpWire
 from drivers.sim.ximc import FakeAxis
-from drivers.sim.ximc_table import PROFILES
+from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+
+PROFILES = {"8MT160-300": LINEAR_8MT160_300, "8MR151": ROTARY_8MR151}
+
+# How fast frames leave: as a camera's readout in real time; in virtual time nothing else moves meanwhile.
+_PACE_MBps = {False: 40.0, True: 120.0}
 
 
 class AxisSpec(Document):
     """A stage: where its controller answers and which profile it was delivered with."""
 
     address: str
-    profile: str
+    profile: Literal["8MT160-300", "8MR151"]
     serial_number: int
 
 
@@ -81,7 +86,7 @@ class Laboratory:
             self.close()
             raise ConfigError(
                 f"an address of the simulated laboratory cannot be used; is one running already? ({error})"
-            )
+            ) from error
         except BaseException:
             self.close()
             raise
@@ -96,10 +101,11 @@ class Laboratory:
         self.camera.advance(now_ns)
 
     def state(self) -> dict[str, float]:
-        """The plant's true state now."""
+        """The plant's true state now; `now_ns` is the laboratory's time."""
         with self.plant.lock:
-            self.plant.advance(self._clock.now_ns())
-            return self.plant.state()
+            now_ns = self._clock.now_ns()
+            self.plant.advance(now_ns)
+            return {"now_ns": now_ns, **self.plant.state()}
 
     def true_centres_px(self) -> list[list[float]]:
         """Noise-free marker centres (x, y), marker 1 first."""
@@ -128,11 +134,9 @@ class Laboratory:
         units = (self.regulator, self.relays, self.thermometers)
         framing = RtuEngine if spec.bus.startswith("serial:") else TcpEngine
         self.bus_faults = self._listen(spec.bus, lambda: framing(units))
-        self.axes = {name: FakeAxis(plant, clock, PROFILES[axis.profile], axis.serial_number, name)
-                     for name, axis in spec.axes.items()}  # fmt: skip
-        self.axis_faults = {
-            name: self._listen(spec.axes[name].address, axis.engine) for name, axis in self.axes.items()
-        }
+        for name, settings in spec.axes.items():
+            axis = FakeAxis(plant, clock, PROFILES[settings.profile], settings.serial_number, name)
+            self._listen(settings.address, axis.engine)
         self.flap = FakeFlap(plant, clock, spec.flap.serial_number or "")
         host, port = _host_and_port(spec.flap.address or "")
         self._closers.append(UsbServer(host, port, [self.flap]).close)
@@ -143,6 +147,7 @@ class Laboratory:
             spec.camera.address or "",
             spec.camera.serial_number or "",
             real_time=not spec.virtual,
+            pace_MBps=_PACE_MBps[spec.virtual],
         )
         self._closers.append(self.camera.close)
         self.camera.start()

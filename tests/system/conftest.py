@@ -1,0 +1,92 @@
+"""A simulated laboratory of its own for each test: free ports, a folder for the pseudo-terminals, a camera address."""
+
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drivers.aravis_library import library
+from drivers.interface import StandError
+from stand.config import StandConfig, load_config, packaged
+from stand.recipe import load_recipe
+from stand.run import Order
+from stand.simulator import Simulator, laboratory_of
+
+SHORT_RECIPE = """
+name: short
+experiments:
+  - thermal_cycle:
+      table_position: {linear: 2, rotary: 1}
+      equilibrium_s: 600
+      set_points_degC: [30, 20, 24]
+      held_out_degC: [20]
+      dwell_s: 600
+      reference_frames: 2
+      frames_per_point: 1
+"""
+
+
+def require_aravis() -> None:
+    """Skip where libaravis is missing, but fail in CI."""
+    try:
+        library()
+    except StandError as error:
+        if os.environ.get("CI") == "true":
+            pytest.fail(f"CI must have libaravis: {error}")
+        pytest.skip(str(error))
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@pytest.fixture
+def config_text(tmp_path: Path) -> Callable[..., str]:
+    """The installed simulated configuration at free addresses; keyword arguments replace whole sections' entries."""
+
+    def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
+        data = yaml.safe_load(packaged("", "simulated").read_text())
+        data["bus"]["address"] = f"tcp:127.0.0.1:{free_port()}" if wire == "tcp" else f"serial:{tmp_path / 'bus'}"
+        for name, axis in data["axes"].items():
+            axis["address"] = f"serial:{tmp_path / name}"
+        data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
+        data["camera"]["address"] = "127.0.0.41"
+        data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
+        for section, entries in sections.items():
+            data[section].update(entries)
+        return yaml.safe_dump(data)
+
+    return build
+
+
+@pytest.fixture
+def order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Order]:
+    """An order for a recipe text against a simulated laboratory of its own."""
+
+    def build(recipe: str = SHORT_RECIPE, **options: object) -> Order:
+        text = config_text(**options)
+        config_file, recipe_file = tmp_path / "config.yaml", tmp_path / "recipe.yaml"
+        config_file.write_text(text)
+        recipe_file.write_text(recipe)
+        target = packaged("targets", "paper-9x6").read_text()
+        return Order(load_config(config_file), load_recipe(recipe_file), text, recipe, target)
+
+    return build
+
+
+@pytest.fixture
+def simulator() -> Iterator[Callable[[StandConfig, bool], Simulator]]:
+    """Start simulator processes that end with the test."""
+    started: list[Simulator] = []
+
+    def start(config: StandConfig, virtual: bool) -> Simulator:
+        started.append(Simulator(laboratory_of(config, virtual=virtual, seed=None)))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.stop()

@@ -1,0 +1,74 @@
+"""The same daemon in real time over serial wires: Modbus RTU and XIMC on pseudo-terminals, USB, GigE."""
+
+import asyncio
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stand.hub import Hub, Item, StepMark
+from stand.run import Interrupted, Order, run_real
+from stand.session import Session
+from tests.system.conftest import require_aravis
+
+BRIEF = """
+name: brief
+experiments:
+  - thermal_cycle:
+      equilibrium_s: 0.5
+      set_points_degC: [26]
+      dwell_s: 1.0
+      reference_frames: 3
+      interval_s: 0.5
+"""
+FAST = {"poll_s": 0.5}
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+def ignore(hub: Hub) -> None:
+    pass
+
+
+@pytest.mark.parametrize("trigger", ["software", "free_run"])
+async def test_a_brief_run_in_real_time_over_serial_wires(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object], trigger: str
+):
+    ordered = order(BRIEF, wire="serial", camera={"trigger": trigger, "poll_s": 0.5}, regulator=FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    session = Session.open(await run_real(ordered, tmp_path / "out", ignore))
+    assert session.metadata["clock_source"] == "wall"
+    frames = list(session.frames())
+    assert len(frames) == 4
+    times_s = np.diff([frame.time_ns for frame in frames[:3]]) / 1e9
+    assert np.all(times_s > 0.3)
+    assert all(frame.image.max() > 150 for frame in frames)
+    assert session.readings("regulator.pv")[1].size >= 4
+
+
+async def test_an_interrupt_leaves_the_stand_safe_and_the_session_readable(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    ordered = order(BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600"), regulator=FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+
+    def watch(hub: Hub) -> None:
+        def interrupt(item: Item) -> None:
+            if isinstance(item, StepMark) and item.kind == "Soak":
+                os.kill(os.getpid(), signal.SIGINT)
+
+        hub.subscribe(interrupt)
+
+    with pytest.raises(Interrupted, match="stopped by the operator"):
+        await run_real(ordered, tmp_path / "out", watch)
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    assert session.incomplete == ()
+    assert session.readings("regulator.running")[1][-1] == 0
+    assert session.readings("relays.heater_enable")[1][-1] == 0
+    assert "stopped by the operator" in session.events()[-1].text

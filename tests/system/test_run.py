@@ -1,0 +1,204 @@
+"""A whole run over every wire, in virtual time, against the simulator in its own process."""
+
+import asyncio
+import contextlib
+import hashlib
+import pickle
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.clock import seconds_ns
+from drivers.interface import ConfigError, StandTripped, Unreachable
+from stand.hub import Event, Hub, Item, StepMark, StepState
+from stand.run import Order, run_virtual
+from stand.session import Session
+from stand.simulator import ControlSocket
+from tests.system.conftest import require_aravis
+
+pytestmark = pytest.mark.usefixtures("_aravis")
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+def digests(session: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(session)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(session.rglob("*"))
+        if path.is_file()
+    }
+
+
+def ignore(hub: Hub) -> None:
+    pass
+
+
+async def fault(order: Order, name: str, value: object) -> None:
+    simulation = order.config.simulation
+    assert simulation is not None
+    control = ControlSocket(simulation.control)
+    await control.open()
+    await control.request({"do": "fault", "name": name, "value": value})
+    await control.close()
+
+
+def at_step(kind: str, action: Callable[[], object]) -> Callable[[Hub], None]:
+    """Do `action` when the first step of this kind begins."""
+    done: list[object] = []
+
+    def follow(item: Item) -> None:
+        if isinstance(item, StepMark) and item.kind == kind and item.state is StepState.STARTED and not done:
+            done.append(action())
+
+    return lambda hub: hub.subscribe(follow)
+
+
+async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order()
+    first = await run_virtual(ordered, tmp_path / "first", 7, ignore)
+    second = await run_virtual(ordered, tmp_path / "second", 7, ignore)
+    assert digests(first) == digests(second)
+    assert len(digests(first)) >= 2
+
+    session = Session.open(first)
+    assert session.frame_count == 5
+    captures = {step.step_id: step for step in session.steps() if step.kind == "Capture"}
+    frames = list(session.frames())
+    assert all(frame.step_id in captures for frame in frames)
+    assert frames[0].image.shape == (2048, 2448)
+    assert frames[0].image.max() > 150  # the flap was open
+    assert [event.kind for event in session.events() if event.kind.startswith("run.")] == ["run.start", "run.end"]
+    check_temperatures(session)
+
+    third = await run_virtual(ordered, tmp_path / "third", 8, ignore)
+    assert digests(third) != digests(first)
+
+
+def check_temperatures(session: Session) -> None:
+    """The chamber follows its set-points, the camera heats itself, and the last word is a stand at rest."""
+    times_ns, pv_degC = session.readings("regulator.pv")
+    marks = [step for step in session.steps() if step.kind == "SetTemperature" and step.state is StepState.DONE]
+    for mark, end in zip(marks, [*marks[1:], session.steps()[-1]], strict=True):
+        before_end = pv_degC[(times_ns > mark.time_ns) & (times_ns < end.time_ns)][-5:]
+        wanted = float(str(mark.parameters["chamber_degC"]))
+        assert abs(before_end.mean() - wanted) < 2.0  # ten minutes only
+    assert session.readings("camera.temperature")[1].max() > 35
+    for relay in ("relays.heater_enable", "relays.compressor"):
+        assert session.readings(relay)[1][-1] == 0
+    assert session.readings("flap.position")[1][-1] == pytest.approx(0, abs=0.02)
+    assert session.readings("linear.position")[1][-1] == pytest.approx(2.0, abs=1e-6)
+    assert session.readings("rotary.position")[1][-1] == pytest.approx(1.0, abs=1e-6)
+    air = session.readings("thermometers.air")[1]
+    assert np.isfinite(air).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("thermometer.open", "air", "thermometers.air is BAD"),
+        ("regulator.sensor_break", True, "regulator.pv is BAD"),
+        ("bus.silent", True, "BAD|last read"),
+    ],
+)
+async def test_a_lost_safety_sensor_makes_the_stand_safe_and_ends_the_run(
+    tmp_path: Path, order: Callable[..., Order], name: str, value: object, reason: str
+):
+    ordered = order(bus={"timeout_s": 0.1})
+    tasks: list[asyncio.Task[None]] = []
+    events: list[Event] = []
+
+    def watch(hub: Hub) -> None:
+        at_step("Soak", lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))(hub)
+        hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
+
+    with pytest.raises(StandTripped, match=reason):
+        await run_virtual(ordered, tmp_path / "out", None, watch)
+    await asyncio.gather(*tasks)
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    assert any(event.kind.startswith("guard.") for event in session.events())
+    assert [event.text[:8] for event in session.events() if event.kind == "run.end"] == ["aborted:"]
+    if name != "bus.silent":
+        assert session.readings("relays.heater_enable")[1][-1] == 0
+        assert session.readings("regulator.running")[1][-1] == 0
+    failed = [step for step in session.steps() if step.state is StepState.FAILED]
+    assert [step.kind for step in failed] == ["Soak"]
+
+
+DAEMON = """
+import asyncio, pickle, sys
+from pathlib import Path
+from stand.hub import Batch
+from stand.run import run_virtual
+
+order, out = pickle.loads(sys.stdin.buffer.read())
+
+def watch(hub):
+    def follow(item):
+        if isinstance(item, Batch) and item.device == "regulator" and hub.latest("regulator.mv_heat").value > 50:
+            print("heating", flush=True)
+    hub.subscribe(follow)
+
+asyncio.run(run_virtual(order, out, None, watch))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+async def test_a_dead_daemon_does_not_heat(tmp_path: Path, order: Callable[..., Order], number: signal.Signals):
+    ordered = order()
+    daemon = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", DAEMON, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+    )
+    assert daemon.stdin is not None
+    assert daemon.stdout is not None
+    daemon.stdin.write(pickle.dumps((ordered, tmp_path / "out")))
+    daemon.stdin.close()
+    assert (await daemon.stdout.readline()).strip() == b"heating"
+    daemon.send_signal(number)
+    if number is signal.SIGKILL:
+        await daemon.wait()
+
+    simulation = ordered.config.simulation
+    assert simulation is not None
+    control = ControlSocket(simulation.control)
+    await control.open()
+    before = await control.request({"do": "state"})
+    assert before["heater_enabled"] == 1
+    assert isinstance(before["now_ns"], int)
+    await control.advance(before["now_ns"] + seconds_ns(ordered.config.guard.heater_hold_s))
+    after = await control.request({"do": "state"})
+    assert after["heater_enabled"] == 0
+    assert after["compressor_on"] == 0
+    await control.advance(before["now_ns"] + seconds_ns(ordered.config.guard.heater_hold_s + 1))
+    assert (await control.request({"do": "state"}))["heater_W"] == 0
+    with contextlib.suppress(Unreachable):  # it may be gone before it has answered
+        await control.request({"do": "quit"})
+    await control.close()
+    if number is signal.SIGSTOP:
+        daemon.kill()
+        await daemon.wait()
+
+
+async def test_a_second_laboratory_at_the_same_addresses_is_refused_with_a_reason(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    ordered = order()
+    await asyncio.to_thread(simulator, ordered.config, False)
+    with pytest.raises(ConfigError, match="is one running already"):
+        await run_virtual(ordered, tmp_path / "out", None, ignore)
+    assert not (tmp_path / "out").exists()
+
+
+async def test_an_existing_session_is_never_overwritten(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order()
+    taken = tmp_path / "out" / "20260101T180000Z-short"
+    taken.mkdir(parents=True)
+    with pytest.raises(ConfigError, match="exists already"):
+        await run_virtual(ordered, tmp_path / "out", None, ignore)
+    assert not list(taken.iterdir())
