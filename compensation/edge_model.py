@@ -126,7 +126,9 @@ def normal_equations(
     root_weight = np.sqrt(band.used / noise.variance_DN2(model))
     residual = (band.value - model) * root_weight
     slope = contrast * density * (root_weight / sigma)
-    jacobian = _jacobian(place, scale, t, slope, step * root_weight, root_weight) * free[:, :, None]
+    jacobian = _jacobian(place, scale, t, slope, step * root_weight, root_weight)
+    if not free.all():
+        jacobian *= free[:, :, None]
     normal = jacobian @ jacobian.transpose(0, 2, 1)
     index = np.arange(p.shape[1])
     normal[:, index, index] += ~free

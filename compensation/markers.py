@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.bootstrap import Candidates, disc_sizes_px, find_candidates
-from compensation.edge_fit import NO_CENTRE, EdgeFit, Flag, fit_edges
+from compensation.edge_fit import EdgeFit, Flag, fit_edges
 from compensation.edge_model import B0, CX, CY, F0, M11, M12, M22, SIGMA, EdgeState
 from compensation.grid import DetectionError, Identified, fit_homography, identify, pitch_px
 from compensation.noise import Image, Noise
@@ -35,7 +35,8 @@ _SIZE_TOLERANCE = 1.35
 _PLACE_TOLERANCE_PITCH = 0.2
 _TRACKED_PART = 0.9
 _TRACKED_STEP_PX = 5.0
-_TRACKED_GROWTH = 0.02
+_GLANCE_BLURS = 3.0
+_GLANCE_CONTRAST = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,9 +75,12 @@ def detect(
     """
     grey = grey_image(image)
     if previous is not None:
-        tracked = _fit(grey, target, previous.homography, previous.state, noise)
-        if tracked is not None and _has_followed(tracked, previous):
-            return tracked
+        if len(previous.flags) != target.count:
+            raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
+        if _still_there(grey, previous):
+            tracked = _fit(grey, target, previous.state, noise)
+            if tracked is not None and _has_followed(tracked, previous):
+                return tracked
     return _search(grey, target, None if previous is None else previous.homography, noise)
 
 
@@ -138,7 +142,7 @@ def _first_fit(
     scale = float(np.median(np.sqrt(areas / np.pi) / start.radii_px()[seen]))
     start.parameters[seen, :2] = candidates.centres_px[identified.candidate[seen]]
     start = EdgeState(start.parameters, start.scale_px * scale)
-    detection = _fit(grey, target, identified.homography, start, noise)
+    detection = _fit(grey, target, start, noise)
     if detection is None:
         raise DetectionError(
             f"found {seen.sum()} of {target.count} markers of {target.name}, but too few have a clean edge",
@@ -147,11 +151,11 @@ def _first_fit(
     return detection
 
 
-def _fit(grey: Image, target: Target, homography: Float, start: EdgeState, noise: Noise | None) -> Detection | None:
+def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> Detection | None:
     """The fit from `start`, judged; None when fewer markers than the target demands have a credible centre."""
     model = noise or Noise()
     fit = fit_edges(grey, start, model, _reach(target))
-    good = ((fit.flags & NO_CENTRE) == 0) & _has_contrast(fit.state, target, model)
+    good = np.isfinite(fit.chi) & _has_contrast(fit.state, target, model)
     if good.sum() < target.least_markers:
         return None
     homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
@@ -240,12 +244,28 @@ def _within_image(state: EdgeState, grey: Image) -> NDArray[np.bool_]:
     return np.all((centres - margin >= -0.5) & (centres + margin <= [width - 0.5, height - 0.5]), axis=1)
 
 
+def _still_there(grey: Image, before: Detection) -> bool:
+    """Whether the markers still look as they did: a glance at 16 pixels on either side of each outline. Much cheaper
+    than a fit that ends nowhere because the target has moved.
+    """
+    state, p = before.state, before.state.parameters
+    angle = np.arange(16) * (2 * np.pi / 16)
+    towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    bend = p[:, M11, None] * towards[:, 0] ** 2 + p[:, M22, None] * towards[:, 1] ** 2
+    radius = state.scale_px[:, None] / np.sqrt(bend + 2 * p[:, M12, None] * towards[:, 0] * towards[:, 1])
+    margin = np.minimum(_GLANCE_BLURS * p[:, SIGMA, None], 0.6 * radius)
+    limits = np.array(grey.shape[::-1]) - 1
+    levels: list[Float] = []
+    for along in (radius + margin, radius - margin):
+        place = np.rint(p[:, None, :2] + along[:, :, None] * towards).astype(int)
+        column, row = np.moveaxis(np.clip(place, 0, limits), 2, 0)
+        levels.append(grey[row, column].mean(axis=1))
+    unchanged = (levels[0] - levels[1]) / state.contrast_DN() > _GLANCE_CONTRAST
+    seen = np.isfinite(before.chi)
+    return bool(unchanged[seen].mean() >= _TRACKED_PART)
+
+
 def _has_followed(now: Detection, before: Detection) -> bool:
-    """Whether tracking stayed on the same markers: about as many, none far from where it was, of the same size."""
+    """Whether tracking stayed on the same markers: about as many, and none far from where it was."""
     moved = np.linalg.norm(now.centres_px - before.centres_px, axis=1)
-    grown = np.abs(np.log(now.state.radii_px() / before.state.radii_px()))
-    return bool(
-        now.found >= _TRACKED_PART * before.found
-        and np.nanmax(moved) < _TRACKED_STEP_PX
-        and np.median(grown) < _TRACKED_GROWTH
-    )
+    return bool(now.found >= _TRACKED_PART * before.found and np.nanmax(moved) < _TRACKED_STEP_PX)

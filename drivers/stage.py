@@ -213,7 +213,7 @@ class Axis:
         return _Status(command=values[1], steps=values[5] + values[6] / _MICROSTEPS, flags=values[15], gpio=values[16])
 
     def _zero(self) -> None:
-        """HOME leaves the step counter alone (libximc, command_homezero): zero it, and look whether that came through."""
+        """HOME leaves the step counter alone (libximc, command_homezero): zero it, and see that it is."""
         with contextlib.suppress(Unreachable, GarbledReply):
             self._client.command("zero")
         if (steps := self._status().steps) != 0:

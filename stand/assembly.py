@@ -72,7 +72,7 @@ class Assembly:
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     """Make every device the configuration names; nothing is opened. ConfigError when a named file is missing."""
     line = LineSettings(config.bus.baud, config.bus.parity, config.bus.stopbits)
-    bus = Bus("bus", config.bus.address, clock, line, config.bus.timeout_s)
+    bus = Bus("bus", config.bus.address, clock, line, config.bus.timeout_s, config.bus.gap_s)
     devices = Devices(
         regulator=Regulator(
             "regulator",

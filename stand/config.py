@@ -40,13 +40,15 @@ RelayName = Literal["heater_enable", "compressor", "camera_power"]
 
 
 class BusConfig(Document):
-    """The RS-485 bus, by a serial adapter or behind a Modbus TCP gateway."""
+    """The RS-485 bus, by a serial adapter or behind a Modbus TCP gateway. timeout_s, gap_s (silence between a reply and
+    the next request on a serial line) are real seconds."""
 
     address: ByteAddress
     baud: int = Field(default=9600, ge=1200, le=921600)
-    parity: Literal["N", "E", "O"] = "E"
+    parity: Literal["N", "E", "O"] = "N"
     stopbits: Literal[1, 2] = 1
     timeout_s: Seconds = 0.3
+    gap_s: float = Field(default=0.005, ge=0)
 
 
 class RegulatorConfig(Document):
@@ -172,7 +174,7 @@ class CameraConfig(Document):
     trigger: Literal["software", "free_run"] = "software"
     frame_rate_hz: float = Field(default=2.0, gt=0)
     packet_size: int | None = Field(default=None, ge=220, le=16112)
-    heartbeat_s: float = Field(default=3.0, ge=0.5)
+    heartbeat_s: float = Field(default=3.0, ge=1.5)  # Aravis asks once a second
     temperature: CameraTemperatureConfig | None = None
     boot_s: float = Field(default=8.0, ge=0)
     poll_s: PollPeriod_s = 1.0

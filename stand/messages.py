@@ -70,13 +70,14 @@ class Kind:
     quantities: tuple[Quantity, ...]
 
 
+THERMOMETERS = ("granite_inside", "granite_outside", "artifact", "air", "laboratory")
 KINDS: Mapping[str, Kind] = {
     "thermometers": Kind(
         "/sensors/temperature",
         "Temperatures",
-        tuple(
-            Quantity(place, "degC", f"{place}_degC")
-            for place in ("granite_inside", "granite_outside", "artifact", "air", "laboratory")
+        (
+            *(Quantity(place, "degC", f"{place}_degC") for place in THERMOMETERS),
+            *(Quantity(f"{place}_raw", "1", f"{place}_raw") for place in THERMOMETERS),
         ),
     ),
     "regulator": Kind(

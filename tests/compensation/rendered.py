@@ -143,7 +143,7 @@ def render(scene: Scene) -> Float:
 
 
 def _draw(scene: Scene, image: Float, disc: Float) -> None:
-    """Replace the pixels round one disc."""
+    """Add what one disc takes from, or gives to, the blurred ground."""
     angle = np.arange(64) * (2 * np.pi / 64)
     outline = project(scene, disc[:2] + disc[2] / 2 * np.column_stack([np.cos(angle), np.sin(angle)]))
     margin = int(np.ceil(6 * scene.psf_px)) + 2
@@ -153,16 +153,16 @@ def _draw(scene: Scene, image: Float, disc: Float) -> None:
     u, v = u[None, :], v[:, None]
     x, y = back_project(scene, u, v)
     cover = _coverage(np.hypot(x - disc[0], y - disc[1]) - disc[2] / 2)
-    radiance = scene.light(u, v) * (scene.ground_DN + (scene.disc_DN - scene.ground_DN) * cover)
+    radiance = scene.light(u, v) * (scene.disc_DN - scene.ground_DN) * cover
     sigma = scene.psf_px * SUB
     kernel = 2 * int(np.ceil(6 * sigma)) + 1
-    blurred = cv2.GaussianBlur(radiance, (kernel, kernel), sigma, borderType=cv2.BORDER_REPLICATE)
+    blurred = cv2.GaussianBlur(radiance, (kernel, kernel), sigma, borderType=cv2.BORDER_CONSTANT)
     rows, columns = blurred.shape[0] // SUB, blurred.shape[1] // SUB
     pixels = blurred.reshape(rows, SUB, columns, SUB).mean(axis=(1, 3))
     top, left = max(low[1], 0), max(low[0], 0)
     bottom, right = min(high[1], image.shape[0]), min(high[0], image.shape[1])
     if top < bottom and left < right:
-        image[top:bottom, left:right] = pixels[top - low[1] : bottom - low[1], left - low[0] : right - low[0]]
+        image[top:bottom, left:right] += pixels[top - low[1] : bottom - low[1], left - low[0] : right - low[0]]
 
 
 def photograph(
