@@ -149,7 +149,7 @@ def _judged(solution: _Solution, start: EdgeState) -> EdgeFit:
 
 
 def _solved(band: Band, state: EdgeState, noise: Noise, failed: NDArray[np.int64]) -> _Solution:
-    """Gauss-Newton on one gathering of pixels, until every centre rests."""
+    """Gauss-Newton on one gathering of pixels, until every marker rests."""
     p, scale = state.parameters.copy(), state.scale_px
     free = _free(state)
     if np.isnan(p[:, B0:]).any():
@@ -160,7 +160,9 @@ def _solved(band: Band, state: EdgeState, noise: Noise, failed: NDArray[np.int64
         step = _limited(_newton_step(normal, right), p, scale)
         failed = failed | np.where((failed == 0) & ~_possible(p + step, noise), Flag.DIVERGED, 0)
         p = np.where(failed[:, None] != 0, p, p + step)
-        if np.all((failed != 0) | (np.hypot(step[:, CX], step[:, CY]) < _CONVERGED_PX)):
+        # g'd is how much of the sum of squares the step gains: less than a pixel's share once all twelve have settled.
+        resting = (np.hypot(step[:, CX], step[:, CY]) < _CONVERGED_PX) & (np.sum(right * step, axis=1) < chi**2)
+        if np.all((failed != 0) | resting):
             break
         normal, right, chi = normal_equations(p, scale, band, noise, free)
     failed = failed | np.where((failed == 0) & _strayed(state, EdgeState(p, scale)), Flag.DIVERGED, 0)

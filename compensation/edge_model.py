@@ -99,13 +99,14 @@ def geometry(p: Float, scale: Float, column: Float, row: Float) -> Geometry:
 
 
 def set_start_levels(p: Float, scale: Float, band: Band) -> None:
-    """Set the levels of ground and disc in `p` to the band's means on either side of the outline."""
+    """Where the levels in `p` are unknown (NaN), set them to the band's means on either side of the outline."""
     place = geometry(p[:, :, None], scale[:, None], band.column, band.row)
     outside = (place.distance_px > 0) * band.used
-    within = band.used - outside
-    for level, part in ((B0, outside), (F0, within)):
-        p[:, level] = (band.value * part).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
-    p[:, [BX, BY, FX, FY]] = 0
+    unknown = np.isnan(p[:, B0])
+    for level, part in ((B0, outside), (F0, band.used - outside)):
+        mean = (band.value * part).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
+        p[unknown, level] = mean[unknown]
+        p[unknown, level + 1 : level + 3] = 0
 
 
 def normal_equations(

@@ -1,0 +1,197 @@
+"""The edge fit against rendered truth: bias, scatter against the Cramer-Rao limit, honesty of the covariance."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from compensation.edge_fit import EdgeFit, Flag, fit_edges
+from compensation.edge_model import (
+    B0,
+    BX,
+    BY,
+    CX,
+    CY,
+    F0,
+    FX,
+    FY,
+    M11,
+    M12,
+    M22,
+    SIGMA,
+    Band,
+    EdgeState,
+    Float,
+    normal_cdf,
+    normal_equations,
+)
+from compensation.noise import Noise
+
+from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
+
+SCENES = {
+    "A even light": (Scene(), 2.21),
+    "B sharp": (Scene(psf_px=0.8), 1.97),
+    "D shaded": (Scene(light=shaded_light), 2.21),
+    "E tilt 30": (Scene(tilt_y_deg=30, tilt_x_deg=5, roll_deg=20, distance_mm=1040), 2.47),
+    "F tilt 45": (Scene(tilt_y_deg=45, distance_mm=1040), 2.76),
+}
+"""Scene and Cramer-Rao limit in mpx with two planes (12 parameters), of the same geometry."""
+FREE = np.ones((1, 12), dtype=bool)
+
+
+@cache
+def clean(name: str) -> Float:
+    return render(SCENES[name][0])
+
+
+def start_from(scene: Scene, offset_px: float) -> EdgeState:
+    """Rough ellipses: centres off by `offset_px`, blur 1.2, levels unknown."""
+    centres = true_centres_px(scene)
+    angle = np.arange(64) * (2 * np.pi / 64)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    parameters, scale = np.full((len(centres), 12), np.nan), np.empty(len(centres))
+    for n, disc in enumerate(scene.discs_mm()):
+        outline = project(scene, disc[:2] + disc[2] / 2 * circle) - centres[n]
+        shape = np.linalg.inv(outline.T @ outline / 32)
+        scale[n] = np.linalg.det(shape) ** -0.25
+        shape *= scale[n] ** 2
+        parameters[n, [M11, M12, M22]] = shape[0, 0], shape[0, 1], shape[1, 1]
+    parameters[:, [CX, CY]] = centres + offset_px
+    parameters[:, SIGMA] = 1.2
+    return EdgeState(parameters, scale)
+
+
+def fit(scene: Scene, image: np.ndarray, start: EdgeState, noise: Noise | None = None) -> EdgeFit:
+    camera = Noise(scene.read_DN**2 + 1 / 12, 1 / scene.electrons_per_DN)
+    return fit_edges(image, start, noise or camera, np.full(len(start.scale_px), np.inf))
+
+
+def rms_mpx(errors_px: Float) -> float:
+    return 1e3 * float(np.sqrt(np.mean(np.square(errors_px))))
+
+
+def test_the_normal_distribution_function_is_right_to_2e_7():
+    t = np.linspace(-7, 7, 20001)
+    exact = np.array([0.5 * math.erfc(-value / math.sqrt(2)) for value in t])
+    np.testing.assert_allclose(normal_cdf(t), exact, atol=2e-7)
+
+
+def test_the_reference_renderer_puts_the_centroid_where_the_truth_says():
+    scene = Scene(columns=3, rows=3, size=(900, 900), tilt_y_deg=30, roll_deg=10)
+    light = scene.ground_DN - render(scene)
+    for x, y in true_centres_px(scene):
+        rows, columns = np.mgrid[round(y) - 60 : round(y) + 61, round(x) - 60 : round(x) + 61]
+        weight = light[rows, columns]
+        found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+        np.testing.assert_allclose(found, [x, y], atol=1e-4)
+
+
+def test_the_gradient_of_the_sum_of_squares_is_that_of_the_model():
+    """J'We against the numerical derivative of the sum; the terms left out are below 2 % of each parameter's scale."""
+    rows, columns = np.mgrid[-20.0:21, -20.0:21]
+    pixels = [grid.reshape(1, -1) for grid in (columns, rows)]
+    none = np.zeros(1, dtype=bool)
+    truth = np.array([[0.3, -0.2, 1.1, 0.08, 0.9, 1.1, 200, 3, -2, 30, 1, 1]], dtype=np.float64)
+    scale, flat = np.array([12.0]), Noise(1.0, 0.0)
+    blank = Band(*pixels, np.zeros((1, 1681)), np.ones((1, 1681)), np.array([99.0]), none, none)
+    away = truth + np.array([[0.02, -0.03, 0.002, 0.001, -0.002, 0.02, 0.5, 0.1, 0.1, -0.3, 0.1, -0.1]])
+
+    def model(p: Float) -> Float:
+        # With all values 0 and unit weights the sum of squares of (value - model) isolates the model.
+        x, y = (pixels[0] - p[0, CX]) / 12, (pixels[1] - p[0, CY]) / 12
+        gx, gy = p[0, M11] * x + p[0, M12] * y, p[0, M12] * x + p[0, M22] * y
+        F, length = np.sqrt(gx * x + gy * y), np.hypot(gx, gy)
+        t = (F - 1) * F / length * 12 / p[0, SIGMA]
+        b, f = (p[0, i] + p[0, i + 1] * x + p[0, i + 2] * y for i in (B0, F0))
+        lean = ((p[0, BX] - p[0, FX]) * gx + (p[0, BY] - p[0, FY]) * gy) / length * p[0, SIGMA] / 12
+        return f + (b - f) * normal_cdf(t) + lean * np.exp(-t * t / 2) / math.sqrt(2 * math.pi)
+
+    band = Band(*pixels, model(truth), blank.used, blank.width_px, none, none)
+    normal, right, _ = normal_equations(away, scale, band, flat, FREE)
+    step = 1e-4 * np.sqrt(np.diag(normal[0])) ** -1
+    for index in range(12):
+        shift = np.zeros((1, 12))
+        shift[0, index] = step[index]
+        sums = [np.sum((band.value - model(away + sign * shift)) ** 2) for sign in (1, -1)]
+        slope = -(sums[0] - sums[1]) / (4 * step[index])
+        reference = math.sqrt(normal[0, index, index] * np.sum((band.value - model(away)) ** 2))
+        assert abs(right[0, index] - slope) < 0.02 * reference
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_noise_free_image_gives_the_true_centre_within_a_tenth_of_a_mpx(name: str):
+    scene = SCENES[name][0]
+    fine = np.round(clean(name) * 200).astype(np.uint16)
+    result = fit(scene, fine, start_from(scene, 1.0), Noise(1.0, 1 / 40))
+    assert not result.flags.any()
+    assert rms_mpx(result.state.centres_px() - true_centres_px(scene)) < 0.1
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_noisy_frames_scatter_at_the_physical_limit_and_the_covariance_says_so(name: str):
+    scene, limit_mpx = SCENES[name]
+    truth, state = true_centres_px(scene), start_from(scene, 1.0)
+    errors: list[Float] = []
+    variances: list[Float] = []
+    for seed in range(4):
+        result = fit(scene, photograph(scene, clean(name), seed), state)
+        assert not result.flags.any()
+        assert np.all(np.abs(result.chi - 1) < 0.1)
+        state = result.state
+        errors.append(result.state.centres_px() - truth)
+        variances.append(np.einsum("nii->ni", result.covariance_px2))
+    actual, predicted = rms_mpx(np.array(errors)), 1e3 * float(np.sqrt(np.mean(variances)))
+    assert actual < 1.25 * limit_mpx
+    assert 0.85 < predicted / actual < 1.15
+
+
+def test_dots_of_seven_to_ten_pixels_keep_their_centre_and_an_honest_covariance():
+    scene = Scene(size=(640, 480), f_px=1000, roll_deg=7, tilt_y_deg=20, psf_px=0.7)
+    truth, image = true_centres_px(scene), render(scene)
+    start = start_from(scene, 0.3)
+    assert 3.3 < start.radii_px().min() < start.radii_px().max() < 5
+    fine = fit(scene, np.round(image * 200).astype(np.uint16), start, Noise(1.0, 1 / 40))
+    assert rms_mpx(fine.state.centres_px() - truth) < 0.5
+    results = [fit(scene, photograph(scene, image, seed), start) for seed in range(6)]
+    actual = rms_mpx(np.array([result.state.centres_px() - truth for result in results]))
+    predicted = 1e3 * np.sqrt(np.mean([np.einsum("nii->ni", result.covariance_px2) for result in results]))
+    assert actual < 8
+    assert 0.85 < predicted / actual < 1.15
+
+
+def test_a_defocused_image_is_gathered_again_in_a_wider_band():
+    scene = Scene(columns=3, rows=3, size=(800, 800), psf_px=3.0)
+    truth = true_centres_px(scene)
+    result = fit(scene, photograph(scene, render(scene), 1), start_from(scene, 1.0))
+    assert not result.flags.any()
+    np.testing.assert_allclose(result.state.parameters[:, SIGMA], math.hypot(3, 1 / math.sqrt(12)), rtol=0.02)
+    assert rms_mpx(result.state.centres_px() - truth) < 1.25 * 4.38
+
+
+def test_plain_ground_diverges_and_says_so_while_the_others_are_measured():
+    scene = Scene(columns=3, rows=3, size=(800, 800), missing=(5,))
+    result = fit(scene, photograph(scene, render(scene), 3), start_from(scene, 0.5))
+    assert result.flags[4] == Flag.DIVERGED
+    assert np.isnan(result.chi[4])
+    assert not np.delete(result.flags, 4).any()
+
+
+def test_an_overexposed_ground_is_flagged_and_does_not_shift_the_centres():
+    scene = Scene(columns=3, rows=3, size=(800, 800), ground_DN=300)
+    result = fit(scene, photograph(scene, render(scene), 3), start_from(scene, 0.5))
+    assert np.all(result.flags == Flag.SATURATED)
+    assert rms_mpx(result.state.centres_px() - true_centres_px(scene)) < 5
+
+
+def test_the_fit_reads_its_inputs_only():
+    scene = Scene(columns=3, rows=3, size=(800, 800))
+    image, start = photograph(scene, render(scene), 3), start_from(scene, 0.5)
+    before, parameters = image.copy(), start.parameters.copy()
+    image.setflags(write=False)
+    fit(scene, image, start)
+    np.testing.assert_array_equal(image, before)
+    np.testing.assert_array_equal(start.parameters, parameters)

@@ -1,0 +1,232 @@
+"""Image to identified centres: first frames, tracking, flags, and the CSV table."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from compensation.detections import COLUMNS, DetectedImage, flags_text, write_detections
+from compensation.markers import Detection, DetectionError, Flag, Noise, detect, grey_image, read_image
+from compensation.target import OddMarker, Target, load_target
+
+from .rendered import Float, Scene, photograph, render, true_centres_px
+
+PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
+HALF = Scene(size=(1224, 1024), f_px=4386)
+CAMERA = Noise(1 + 1 / 12, 1 / 40)
+
+
+@cache
+def half_frame() -> Float:
+    return render(HALF)
+
+
+def rms_mpx(detection: Detection, scene: Scene) -> float:
+    return 1e3 * float(np.sqrt(np.nanmean((detection.centres_px - true_centres_px(scene)) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("scene", "limit_mpx"),
+    [
+        (Scene(), 3.0),
+        (dataclasses.replace(HALF, roll_deg=20, distance_mm=1100), 5),
+        (dataclasses.replace(HALF, roll_deg=45, distance_mm=1300), 5),
+        (dataclasses.replace(HALF, tilt_y_deg=30, roll_deg=-10), 5),
+        (dataclasses.replace(HALF, tilt_x_deg=45, distance_mm=1100), 6),
+        (dataclasses.replace(HALF, f_px=1300, distance_mm=320, k1=-0.25), 6),
+        (Scene(size=(640, 480), f_px=1000), 8),
+    ],
+    ids=["5 MP", "roll 20", "roll 45", "tilt 30", "tilt 45", "wide field, distortion", "8 px dots"],
+)
+def test_a_first_frame_is_searched_identified_and_measured(scene: Scene, limit_mpx: float):
+    found = detect(photograph(scene, render(scene), 1), PAPER, noise=CAMERA)
+    assert found.found == 54
+    assert not found.flags.any()
+    assert rms_mpx(found, scene) < limit_mpx
+    assert np.all(np.linalg.eigvalsh(found.covariance_px2) > 0)
+
+
+@pytest.mark.parametrize("shift_mm", [(0.02, -0.01), (0.5, 0.3), (6.0, 0.0), (30.0, 0.0)])
+def test_the_next_frame_follows_the_target_however_far_it_moved(shift_mm: tuple[float, float]):
+    moved = dataclasses.replace(HALF, shift_mm=shift_mm, distance_mm=1150)
+    first = detect(photograph(HALF, render(dataclasses.replace(HALF, distance_mm=1150)), 1), PAPER, noise=CAMERA)
+    found = detect(photograph(moved, render(moved), 2), PAPER, previous=first, noise=CAMERA)
+    assert found.found == 54
+    assert rms_mpx(found, moved) < 5
+
+
+def test_tracking_agrees_with_a_fresh_search_far_below_the_noise():
+    """Within 0.5 mpx; the noise scatters these centres by 3.4 mpx."""
+    image = photograph(HALF, half_frame(), 5)
+    fresh = detect(image, PAPER, noise=CAMERA)
+    tracked = detect(image, PAPER, previous=detect(photograph(HALF, half_frame(), 6), PAPER), noise=CAMERA)
+    np.testing.assert_allclose(tracked.centres_px, fresh.centres_px, atol=5e-4)
+
+
+def test_a_turned_target_keeps_its_numbers_when_tracked_past_a_quarter_turn():
+    previous: Detection | None = None
+    for roll in (60, 85, 110):
+        scene = dataclasses.replace(HALF, roll_deg=roll, distance_mm=1400)
+        previous = detect(photograph(scene, render(scene), roll), PAPER, previous=previous)
+        assert rms_mpx(previous, scene) < 10
+
+
+def test_a_missing_marker_is_nan_flagged_and_looked_for_again():
+    gap = dataclasses.replace(HALF, missing=(20,))
+    first = detect(photograph(gap, render(gap), 1), PAPER, noise=CAMERA)
+    assert first.found == 53
+    assert Flag(int(first.flags[19])) & Flag.MISSING
+    assert np.isnan(first.centres_px[19]).all()
+    assert np.isnan(first.covariance_px2[19]).all()
+    assert not np.delete(first.flags, 19).any()
+    again = detect(photograph(HALF, half_frame(), 2), PAPER, previous=first, noise=CAMERA)
+    assert again.found == 54
+    assert not again.flags.any()
+
+
+def test_a_disc_cut_by_the_border_is_missing_and_one_near_it_is_flagged():
+    scene = dataclasses.replace(HALF, roll_deg=6)
+    beyond_px = true_centres_px(scene)[45, 0] - 5
+    scene = dataclasses.replace(scene, shift_mm=(-beyond_px * scene.distance_mm / scene.f_px, 0))
+    assert true_centres_px(scene)[[45, 36], 0] == pytest.approx([5, 19], abs=1)  # the discs are 17.5 px in radius
+    found = detect(photograph(scene, render(scene), 1), PAPER, noise=CAMERA)
+    assert np.flatnonzero(found.flags).tolist() == [36, 45]
+    assert found.flags[36] == Flag.BORDER
+    assert Flag(int(found.flags[45])) & (Flag.BORDER | Flag.MISSING) == Flag.BORDER | Flag.MISSING
+    assert np.flatnonzero(np.isnan(found.centres_px[:, 0])).tolist() == [45]
+    assert rms_mpx(found, scene) < 5
+
+
+def test_glare_on_an_outline_flags_that_marker_and_no_other():
+    image = half_frame().copy()
+    x, y = true_centres_px(HALF)[30]
+    v, u = np.indices(image.shape)
+    image += 400 * np.exp(-((u - x - 17) ** 2 + (v - y) ** 2) / (2 * 7.0**2))
+    found = detect(photograph(HALF, image, 1), PAPER, noise=CAMERA)
+    assert Flag(int(found.flags[30])) & (Flag.POOR_FIT | Flag.MISSING)
+    assert not np.delete(found.flags, 30).any()
+
+
+def test_without_a_noise_model_the_covariance_comes_from_the_residuals():
+    image = photograph(HALF, half_frame(), 3)
+    told, untold = detect(image, PAPER, noise=CAMERA), detect(image, PAPER, noise=Noise(4 * (1 + 1 / 12), 4 / 40))
+    np.testing.assert_allclose(untold.chi, told.chi / 2, rtol=1e-3)
+    np.testing.assert_allclose(untold.covariance_px2, told.covariance_px2, rtol=1e-2)
+    assert np.median(detect(image, PAPER).chi) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("light", [False, True])
+def test_light_discs_16_bits_and_colour_are_measured_too(light: bool):
+    scene = dataclasses.replace(HALF, disc_DN=200.0, ground_DN=30.0) if light else HALF
+    target = PAPER.model_copy(update={"polarity": "light" if light else "dark"})
+    image = photograph(scene, render(scene), 4)
+    deep = image.astype(np.uint16) * 16
+    colour = np.repeat(image[:, :, None], 3, axis=2)
+    results = [detect(picture, target) for picture in (image, deep, colour)]
+    for result in results:
+        assert result.found == 54
+        assert rms_mpx(result, scene) < 5
+    np.testing.assert_array_equal(results[0].centres_px, results[2].centres_px)
+    with pytest.raises(DetectionError, match="found 0 of 54 markers"):
+        detect(image, PAPER.model_copy(update={"polarity": "dark" if light else "light"}))
+
+
+def test_the_double_size_corner_dot_fixes_the_orientation():
+    scene = Scene(columns=10, rows=10, pitch_mm=25.4, diameter_mm=12.7, diameters_mm={1: 25.4}, size=(640, 480),
+                  f_px=700, distance_mm=900, roll_deg=150, tilt_x_deg=25)  # fmt: skip
+    target = Target(
+        name="t", columns=10, rows=10, pitch_mm=25.4, diameter_mm=12.7, odd_marker=OddMarker(number=1, diameter_mm=25.4)
+    )
+    found = detect(photograph(scene, render(scene), 1), target)
+    assert found.found == 100
+    assert rms_mpx(found, scene) < 20
+
+
+def test_images_without_the_target_are_refused_with_a_sentence():
+    rng = np.random.default_rng(1)
+    for image in (np.zeros((1024, 1224), np.uint8), rng.integers(0, 255, (1024, 1224)).astype(np.uint8)):
+        with pytest.raises(DetectionError, match=r"found \d+ of 54 markers of paper-9x6: 41 are needed"):
+            detect(image, PAPER)
+    with pytest.raises(DetectionError, match="an image of 30 x 20 pixels is too small"):
+        detect(np.zeros((20, 30), np.uint8), PAPER)
+
+
+def test_a_dark_frame_after_a_good_one_is_refused():
+    first = detect(photograph(HALF, half_frame(), 1), PAPER)
+    with pytest.raises(DetectionError, match="found 0 of 54"):
+        detect(np.full((1024, 1224), 3, np.uint8), PAPER, previous=first)
+
+
+def test_the_image_is_only_read():
+    image = photograph(HALF, half_frame(), 1)
+    before = image.copy()
+    image.setflags(write=False)
+    detect(image, PAPER, previous=detect(image, PAPER))
+    np.testing.assert_array_equal(image, before)
+
+
+def test_what_is_no_image_is_a_programming_mistake():
+    for wrong in (np.zeros((4, 4), np.float64), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4), np.uint8)):
+        with pytest.raises(ValueError, match="an image"):
+            grey_image(wrong)  # pyright: ignore[reportArgumentType] - wrong on purpose
+
+
+def test_image_files_are_read_as_grey_and_bad_ones_get_a_sentence(tmp_path: Path):
+    deep = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
+    cv2.imwrite(str(tmp_path / "deep.png"), deep)
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), deep)
+    cv2.imwrite(str(tmp_path / "colour.png"), np.full((3, 4, 3), 90, np.uint8))
+    assert read_image(tmp_path / "colour.png").shape == (3, 4)
+    (tmp_path / "bad.png").write_bytes(b"\x89PNG nonsense")
+    (tmp_path / "empty.png").touch()
+    for name in ("bad.png", "empty.png"):
+        with pytest.raises(DetectionError, match=rf"{name}: not an image, or damaged"):
+            read_image(tmp_path / name)
+    with pytest.raises(DetectionError, match=r"none\.png: cannot be read \(No such file"):
+        read_image(tmp_path / "none.png")
+
+
+def test_the_table_has_a_row_per_marker_with_the_agreed_columns(tmp_path: Path):
+    gap = dataclasses.replace(HALF, missing=(54,))
+    found = detect(photograph(gap, render(gap), 1), PAPER)
+    write_detections(tmp_path / "out.csv", PAPER, [DetectedImage("a.png", None, found), DetectedImage("7", 123, found)])
+    rows = list(csv.DictReader((tmp_path / "out.csv").read_text(encoding="utf-8").splitlines()))
+    assert tuple(rows[0]) == COLUMNS
+    assert ",".join(COLUMNS) == "image,time_ns,marker,row,column,x_px,y_px,var_x_px2,cov_xy_px2,var_y_px2,flags"
+    assert len(rows) == 108
+    assert [rows[9][key] for key in ("image", "time_ns", "marker", "row", "column", "flags")] == [
+        "a.png", "", "10", "1", "0", "OK",
+    ]  # fmt: skip
+    assert rows[54]["time_ns"] == "123"
+    assert [float(rows[9]["x_px"]), float(rows[9]["y_px"])] == pytest.approx(found.centres_px[9], abs=1e-6)
+    assert float(rows[9]["cov_xy_px2"]) == pytest.approx(found.covariance_px2[9, 0, 1], rel=1e-6)
+    assert rows[53]["x_px"] == "nan"
+    assert "MISSING" in rows[53]["flags"].split("|")
+
+
+def test_flags_are_written_as_names():
+    assert flags_text(0) == "OK"
+    assert flags_text(Flag.POOR_FIT | Flag.BORDER) == "POOR_FIT|BORDER"
+
+
+def test_nothing_half_written_is_left_when_an_image_fails(tmp_path: Path):
+    found = detect(photograph(HALF, half_frame(), 1), PAPER)
+
+    def images() -> Iterator[DetectedImage]:
+        yield DetectedImage("a.png", None, found)
+        raise DetectionError("b.png: not an image, or damaged")
+
+    (tmp_path / "out.csv").write_text("older")
+    with pytest.raises(DetectionError, match=r"b\.png"):
+        write_detections(tmp_path / "out.csv", PAPER, images())
+    assert [path.name for path in tmp_path.iterdir()] == ["out.csv"]
+    assert (tmp_path / "out.csv").read_text() == "older"
+    with pytest.raises(DetectionError, match="cannot be written"):
+        write_detections(tmp_path / "nowhere" / "out.csv", PAPER, [])

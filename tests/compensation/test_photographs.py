@@ -1,0 +1,64 @@
+"""Fifteen webcam pictures of a 10 x 10 target (robot_cal_tools, Apache-2.0): real noise, glare, textured ground."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from compensation.grid import project
+from compensation.markers import Detection, detect, read_image
+from compensation.target import load_target
+
+ROOT = Path(__file__).parents[2]
+TARGET = load_target(ROOT / "configs" / "targets" / "robot-cal-tools-10x10.yaml")
+IMAGES = ROOT.parent / "shared" / "data" / "robot_cal_tools_10x10" / "images"
+
+
+@pytest.fixture(scope="module", params=range(15), ids="{}.png".format)
+def photograph(request: pytest.FixtureRequest) -> tuple[np.ndarray, Detection]:
+    path = IMAGES / f"{request.param}.png"
+    if not path.exists():
+        if os.environ.get("CI") == "true":
+            pytest.fail(f"{path} is missing")
+        pytest.skip(f"{path} is missing")
+    image = read_image(path)
+    return image, detect(image, TARGET)
+
+
+def test_all_hundred_dots_are_found_where_opencv_finds_them(photograph: tuple[np.ndarray, Detection]):
+    image, detection = photograph
+    assert detection.found == 100
+    success, grid = cv2.findCirclesGrid(image, (10, 10))
+    assert success
+    away = np.linalg.norm(grid.reshape(-1, 1, 2) - detection.centres_px[None], axis=2)
+    assert sorted(away.argmin(axis=1)) == list(range(100))
+    assert away.min(axis=1).max() < 0.5
+
+
+def test_the_dots_lie_on_one_plane_in_their_order(photograph: tuple[np.ndarray, Detection]):
+    """A mix-up costs at least a pitch, 13 px; the lens distorts by up to 3 px at the picture's edge."""
+    _, detection = photograph
+    off = np.linalg.norm(project(detection.homography, TARGET.coordinates_mm()) - detection.centres_px, axis=1)
+    assert np.sqrt(np.mean(off**2)) < 0.7
+    assert off.max() < 3
+    rows, columns = (
+        detection.centres_px[10] - detection.centres_px[0],
+        detection.centres_px[1] - detection.centres_px[0],
+    )
+    assert columns[0] * rows[1] - columns[1] * rows[0] < 0
+
+
+def test_the_big_dot_is_marker_one_in_its_corner(photograph: tuple[np.ndarray, Detection]):
+    image, detection = photograph
+    radii = detection.state.radii_px()
+    assert radii.argmax() == 0
+    assert radii[0] > 1.5 * np.max(radii[1:])
+    dark = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)[1]
+    x, y = np.rint(detection.centres_px[0]).astype(int)
+    # A square as large as half the big dot, larger than any small one, is dark to its corners.
+    half = int(0.6 * radii[0])
+    assert dark[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1].all()
