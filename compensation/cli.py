@@ -1,0 +1,217 @@
+"""The `compensate` command: offline, from recorded sessions and photographs."""
+
+from __future__ import annotations
+
+import importlib.resources
+import sys
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from compensation.detections import DetectedImage, write_detections
+from compensation.drift import MAX_DEGREE, CompensationModel
+from compensation.edge_fit import EdgeState
+from compensation.files import check_writable
+from compensation.fitting import fit as fit_model
+from compensation.markers import Detection, DetectionError, Flag, Image, detect, read_image
+from compensation.observations import observe_sessions, session_target
+from compensation.report import write_report
+from compensation.target import Target, load_target
+from compensation.validation import evaluate, table
+from drivers.interface import ConfigError, StandError
+from stand.progress import progress
+from stand.session import Session
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="Find markers, fit the thermal drift of a camera, report what compensation gains.\n\n"
+    "Example: compensate report sessions/20260101T180000Z-thermal-cycle -o report.html",
+)
+
+Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of recorded sessions.")]
+TargetOption = Annotated[
+    str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
+]
+DegreeOption = Annotated[
+    int | None, typer.Option(min=1, max=MAX_DEGREE, help="Degree of the polynomial; else chosen by cross-validation.")
+]
+
+_DEFAULT_TARGET = "paper-9x6"
+
+
+@app.command("detect")
+def detect_images(
+    sources: Annotated[list[Path], typer.Argument(metavar="SESSION|IMAGE...", help="Sessions and image files.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")],
+    target: TargetOption = None,
+) -> None:
+    """Find the target's markers: a CSV row per marker and image, with covariance and flags.
+
+    Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
+    """
+    with _one_line_errors():
+        check_writable(out)
+        opened = [_open(path) for path in sources]
+        chosen = _detection_target(opened, target)
+        failures: list[str] = []
+        with progress("find markers", sum(_count(source) for source in opened)) as report:
+
+            def counted() -> Iterator[DetectedImage]:
+                for done, image in enumerate(_detections(opened, chosen, failures), 1):
+                    report(done, image.image)
+                    yield image
+
+            write_detections(out, chosen, counted())
+        for failure in failures:
+            typer.echo(f"not found in {failure}", err=True)
+
+
+@app.command()
+def fit(
+    sessions: Sessions,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
+    degree: DegreeOption = None,
+    target: TargetOption = None,
+) -> None:
+    """Fit the drift model to the reference and fit frames of sessions of one camera.
+
+    Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
+    """
+    with _one_line_errors():
+        check_writable(out)
+        observations = observe_sessions(sessions, progress, _named_target(target))
+        model = fit_model(observations, degree)
+        evaluation = evaluate(model, observations)
+        model.save(out)
+        typer.echo(f"degree {model.degree}, {model.score.terms} terms, condition {model.score.condition:.0f}")
+        typer.echo(table(evaluation))
+
+
+@app.command()
+def report(
+    sessions: Sessions,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write.")],
+    model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
+    target: TargetOption = None,
+) -> None:
+    """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
+
+    Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
+    """
+    with _one_line_errors():
+        check_writable(out)
+        given = None if model is None else CompensationModel.load(model)
+        observations = observe_sessions(sessions, progress, _named_target(target))
+        used = given or fit_model(observations)
+        evaluation = evaluate(used, observations)
+        write_report(out, observations, used, evaluation)
+        typer.echo(table(evaluation))
+
+
+def installed_target(name: str) -> Target:
+    """The target of a file, or of an installed name; ConfigError that lists what there is."""
+    if Path(name).is_file():
+        return load_target(Path(name))
+    folder = Path(str(importlib.resources.files("configs"))) / "targets"
+    known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    if name.removesuffix(".yaml") not in known:
+        raise ConfigError(f"{name}: no such file, and not one of the installed targets: {', '.join(known)}")
+    return load_target(known[name.removesuffix(".yaml")])
+
+
+def _named_target(name: str | None) -> Target | None:
+    return None if name is None else installed_target(name)
+
+
+def _open(path: Path) -> Session | Path:
+    """A folder is a session, a file is an image."""
+    if path.is_dir():
+        return Session.open(path)
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file or folder")
+    return path
+
+
+def _detection_target(sources: Sequence[Session | Path], name: str | None) -> Target:
+    """The named target, else the one attached to all the sessions, else the paper's; one table has one target."""
+    if name is not None:
+        return installed_target(name)
+    attached = [session_target(source) for source in sources if isinstance(source, Session)]
+    if any(target != attached[0] for target in attached):
+        raise ConfigError("the sessions have different targets; write a table for each")
+    return attached[0] if attached else installed_target(_DEFAULT_TARGET)
+
+
+def _count(source: Session | Path) -> int:
+    return source.frame_count if isinstance(source, Session) else 1
+
+
+def _detections(sources: Sequence[Session | Path], target: Target, failures: list[str]) -> Iterator[DetectedImage]:
+    """Every image in turn; where the target is not found all its markers are missing, and `failures` grows by a line.
+
+    DetectionError when it is found nowhere.
+    """
+    several = len(sources) > 1
+    images = 0
+    for source in sources:
+        previous: Detection | None = None
+        for name, time_ns, image in _images(source, several):
+            images += 1
+            try:
+                # Photographs need not be of one pose: only frames of a session are tracked.
+                found = detect(image, target, previous)
+                previous = found if isinstance(source, Session) else None
+            except DetectionError as error:
+                failures.append(f"{name}: {error}")
+                found = _nothing(target)
+            yield DetectedImage(name, time_ns, found)
+    if len(failures) == images:
+        raise DetectionError(f"{failures[0] if failures else 'there are no images'}")
+
+
+def _images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | None, Image]]:
+    """Name, time and pixels of each image of a source."""
+    if not isinstance(source, Session):
+        yield source.name, None, read_image(source)
+        return
+    prefix = f"{source.path.name}/" if several else ""
+    for index, frame in enumerate(source.frames()):
+        yield f"{prefix}{index}", frame.time_ns, frame.image
+
+
+def _nothing(target: Target) -> Detection:
+    """All markers missing."""
+    count = target.count
+    return Detection(
+        centres_px=np.full((count, 2), np.nan),
+        covariance_px2=np.full((count, 2, 2), np.nan),
+        flags=np.full(count, Flag.MISSING, np.uint8),
+        chi=np.full(count, np.nan),
+        homography=np.full((3, 3), np.nan),
+        state=EdgeState(np.full((count, 12), np.nan), np.full(count, np.nan)),
+    )
+
+
+@contextmanager
+def _one_line_errors() -> Generator[None]:
+    """Bad input ends with status 2, a machine that fails with 1, an interrupted run with 130; each with a sentence."""
+    try:
+        yield
+    except StandError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+    except OSError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(1) from error
+    except KeyboardInterrupt as error:
+        typer.echo("interrupted; nothing was written", err=True)
+        raise typer.Exit(130) from error
+
+
+if __name__ == "__main__":
+    sys.exit(app())

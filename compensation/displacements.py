@@ -1,0 +1,89 @@
+"""How far each measured centre is from where it was at the reference temperature.
+
+Displacement always means reference position minus measured position: what must be added to a measured centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.observations import Float, Mask, Observations, Role
+from drivers.interface import SessionError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Displacements:
+    """M single centres against their references, row by row.
+
+    measured_px (M, 2), displacement_px (M, 2): reference minus measured. variance_px2 (M, 2): of the measured centre
+    and of its reference. camera_degC, chamber_degC (M,). frame (M,): row of the observations. marker (M,): from 0.
+    """
+
+    measured_px: Float
+    displacement_px: Float
+    variance_px2: Float
+    camera_degC: Float
+    chamber_degC: Float
+    frame: NDArray[np.int64]
+    marker: NDArray[np.int64]
+
+    def where(self, mask: Mask) -> Displacements:
+        """The rows of a mask (M,)."""
+        return Displacements(
+            self.measured_px[mask],
+            self.displacement_px[mask],
+            self.variance_px2[mask],
+            self.camera_degC[mask],
+            self.chamber_degC[mask],
+            self.frame[mask],
+            self.marker[mask],
+        )
+
+
+def reference_centres(observations: Observations) -> tuple[Float, Float]:
+    """Mean centres (S, N, 2) and their variance (S, N, 2) over each session's own REFERENCE frames; NaN without any.
+
+    Each session has a reference of its own: between sessions somebody may have moved the target.
+    """
+    shape = (len(observations.sessions), observations.target.count, 2)
+    centres, variance = np.full(shape, np.nan), np.full(shape, np.nan)
+    frames = observations.of(Role.REFERENCE)
+    for index in range(len(observations.sessions)):
+        own = frames & (observations.session == index)
+        measured = observations.centres_px[own]
+        count = np.isfinite(measured).sum(axis=0)
+        seen = count > 0
+        centres[index][seen] = np.nansum(measured, axis=0)[seen] / count[seen]
+        variance[index][seen] = np.nansum(_variance_px2(observations)[own], axis=0)[seen] / count[seen] ** 2
+    return centres, variance
+
+
+def displacements(observations: Observations, frames: Mask) -> Displacements:
+    """The measured centres of `frames` (F,) against the references of their sessions; markers without either are
+    left out. SessionError when a session of these frames has no reference frames."""
+    centres, variance = reference_centres(observations)
+    for index in np.unique(observations.session[frames]):
+        if not np.isfinite(centres[index]).any():
+            name = observations.sessions[index].session_id
+            raise SessionError(f"session {name} has no usable reference frames to measure the drift against")
+    reference = centres[observations.session]
+    displacement = reference - observations.centres_px
+    frame, marker = np.nonzero(frames[:, None] & np.isfinite(displacement).all(axis=2))
+    total = _variance_px2(observations) + variance[observations.session]
+    return Displacements(
+        measured_px=observations.centres_px[frame, marker],
+        displacement_px=displacement[frame, marker],
+        variance_px2=total[frame, marker],
+        camera_degC=observations.camera_degC[frame],
+        chamber_degC=observations.chamber_degC[frame],
+        frame=frame,
+        marker=marker,
+    )
+
+
+def _variance_px2(observations: Observations) -> Float:
+    """(F, N, 2): the diagonals of the covariances."""
+    return np.diagonal(observations.covariance_px2, axis1=2, axis2=3)

@@ -1,0 +1,177 @@
+"""Observations -> drift model: choose the degree by temperatures left out, fit, and say how far it can be trusted."""
+
+from __future__ import annotations
+
+import importlib.metadata
+
+import numpy as np
+
+from compensation.displacements import Displacements, displacements, reference_centres
+from compensation.drift import MAX_DEGREE, CompensationModel, DegreeScore
+from compensation.observations import Observations, Role
+from compensation.polynomial import Float, Scaling, design, exponents, solve
+from drivers.interface import SessionError
+
+_LEAST_TEMPERATURES = 3
+_LEAST_RANGE_K = 1.0
+
+
+def fit(observations: Observations, degree: int | None = None) -> CompensationModel:
+    """The model of the REFERENCE and FIT frames; nothing else is looked at.
+
+    degree: 1..5; None takes the simplest within one standard error of the best (cross-validation, see `choose`).
+    SessionError when the sessions cannot support it.
+    """
+    frames = observations.of(Role.REFERENCE, Role.FIT)
+    rows = displacements(observations, frames)
+    scaling = _scaling(observations, rows)
+    scores = cross_validate(rows, scaling, _degrees(rows, degree))
+    chosen = choose(scores) if degree is None else _given(scores, degree)
+    terms = design(rows.measured_px, rows.camera_degC, chosen, scaling)
+    solutions = [solve(terms, rows.displacement_px[:, axis], rows.variance_px2[:, axis]) for axis in (0, 1)]
+    held_out = left_out(rows, chosen, scaling)
+    reference = observations.of(Role.REFERENCE)
+    centres, _ = reference_centres(observations)
+    return CompensationModel(
+        degree=chosen,
+        scaling=scaling,
+        coefficients=np.array([solution.coefficients for solution in solutions]),
+        coefficient_covariance=np.array([solution.covariance for solution in solutions]),
+        discrepancy_px=_discrepancy_px(rows, held_out),
+        hull_px=convex_hull(rows.measured_px),
+        reference_degC=float(observations.camera_degC[reference].mean()),
+        reference_chamber_degC=_reference_chamber_degC(observations),
+        reference_centres_px=centres[0],
+        scores=scores,
+        target_name=observations.target.name,
+        camera_serial=observations.sessions[0].camera_serial,
+        session_ids=tuple(facts.session_id for facts in observations.sessions),
+        software_version=importlib.metadata.version("thermostand"),
+    )
+
+
+def _reference_chamber_degC(observations: Observations) -> float:
+    """The set-point of the reference frames; displacements from two different ones cannot be mixed."""
+    set_points = np.unique(observations.chamber_degC[observations.of(Role.REFERENCE)])
+    if len(set_points) != 1:
+        raise SessionError(f"the sessions have different reference temperatures: {_listed(set_points)} degC")
+    return float(set_points[0])
+
+
+def _degrees(rows: Displacements, degree: int | None) -> range:
+    """The degrees that the temperatures can decide on: T^n needs n + 1 of them, and one more to be left out."""
+    set_points = np.unique(rows.chamber_degC)
+    if degree is not None and not 1 <= degree <= MAX_DEGREE:
+        raise SessionError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
+    least = _LEAST_TEMPERATURES if degree is None else degree + 2
+    if len(set_points) < least:
+        of_degree = "" if degree is None else f" of degree {degree}"
+        raise SessionError(
+            f"a fit{of_degree} needs frames at {least} chamber temperatures or more, "
+            f"found {len(set_points)} ({_listed(set_points)} degC)"
+        )
+    return range(1, min(MAX_DEGREE, len(set_points) - 2) + 1)
+
+
+def _scaling(observations: Observations, rows: Displacements) -> Scaling:
+    if len(rows.frame) == 0:
+        raise SessionError("the sessions have no usable frames for a fit")
+    low, high = float(rows.camera_degC.min()), float(rows.camera_degC.max())
+    if high - low < _LEAST_RANGE_K:
+        raise SessionError(f"the camera's temperature hardly changes ({low:.2f} to {high:.2f} degC); nothing to fit")
+    return Scaling(observations.image_size, (low, high))
+
+
+def cross_validate(rows: Displacements, scaling: Scaling, degrees: range) -> tuple[DegreeScore, ...]:
+    """The score of each degree, up to the first that the markers cannot determine."""
+    scores: list[DegreeScore] = []
+    for degree in degrees:
+        try:
+            scores.append(_score(rows, degree, scaling))
+        except np.linalg.LinAlgError:
+            break
+    if not scores:
+        raise SessionError("the markers do not determine even a polynomial of degree 1: too few, or all in one line")
+    return tuple(scores)
+
+
+def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
+    squares = _by_fold(rows, left_out(rows, degree, scaling) ** 2)
+    terms = design(rows.measured_px, rows.camera_degC, degree, scaling)
+    conditions = [solve(terms, rows.displacement_px[:, axis], rows.variance_px2[:, axis]).condition for axis in (0, 1)]
+    rms = np.sqrt(squares.mean(axis=0))
+    return DegreeScore(
+        degree=degree,
+        terms=len(exponents(degree)),
+        condition=max(conditions),
+        rms_px=(float(rms[0]), float(rms[1])),
+        fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
+        fold_rms_px=tuple((float(i), float(j)) for i, j in np.sqrt(squares)),
+    )
+
+
+def left_out(rows: Displacements, degree: int, scaling: Scaling) -> Float:
+    """Residual displacement (M, 2) of each row, from a fit that has not seen its chamber set-point."""
+    terms = design(rows.measured_px, rows.camera_degC, degree, scaling)
+    residual = np.empty_like(rows.displacement_px)
+    for chamber_degC in np.unique(rows.chamber_degC):
+        held = rows.chamber_degC == chamber_degC
+        for axis in (0, 1):
+            known = solve(terms[~held], rows.displacement_px[~held, axis], rows.variance_px2[~held, axis])
+            residual[held, axis] = rows.displacement_px[held, axis] - terms[held] @ known.coefficients
+    return residual
+
+
+def choose(scores: tuple[DegreeScore, ...]) -> int:
+    """The simplest degree whose held-out mean square is within one standard error of the best.
+
+    The standard error is that of the difference, fold by fold: what is common to both (a set-point that is hard for
+    every degree) does not count.
+    """
+    squares = np.array([[i**2 + j**2 for i, j in score.fold_rms_px] for score in scores])
+    best = int(np.argmin(squares.mean(axis=1)))
+    for index in range(best):
+        worse = squares[index] - squares[best]
+        if worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)):
+            return scores[index].degree
+    return scores[best].degree
+
+
+def _given(scores: tuple[DegreeScore, ...], degree: int) -> int:
+    if degree not in {score.degree for score in scores}:
+        raise SessionError(f"the markers do not determine a polynomial of degree {degree}; at most {len(scores)}")
+    return degree
+
+
+def _discrepancy_px(rows: Displacements, held_out: Float) -> Float:
+    """(2,): RMS of the held-out residuals, all folds counting the same, after the noise of the markers is taken off;
+    0 when noise explains all."""
+    return np.sqrt(np.maximum(_by_fold(rows, held_out**2 - rows.variance_px2).mean(axis=0), 0))
+
+
+def _by_fold(rows: Displacements, values: Float) -> Float:
+    """Means (folds, 2) of values (M, 2) over each chamber set-point."""
+    return np.array([values[rows.chamber_degC == fold].mean(axis=0) for fold in np.unique(rows.chamber_degC)])
+
+
+def convex_hull(points: Float) -> Float:
+    """The corners (H, 2) of points (M, 2), in the sense that turns x towards y (Andrew's monotone chain)."""
+    ordered = np.unique(points, axis=0).tolist()
+    halves = [_half_hull(ordered), _half_hull(ordered[::-1])]
+    return np.array(halves[0][:-1] + halves[1][:-1])
+
+
+def _half_hull(ordered: list[list[float]]) -> list[list[float]]:
+    chain: list[list[float]] = []
+    for x, y in ordered:
+        while len(chain) > 1:
+            (x0, y0), (x1, y1) = chain[-2:]
+            if (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > 0:
+                break
+            chain.pop()
+        chain.append([x, y])
+    return chain
+
+
+def _listed(values: Float) -> str:
+    return ", ".join(f"{value:g}" for value in values)

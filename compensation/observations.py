@@ -1,0 +1,300 @@
+"""Recorded session -> arrays over frames: marker centres, temperatures, what each frame was taken for.
+
+Pixels as in compensation/markers.py: x = column = I to the right, y = row = J down, integers are pixel centres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.markers import Detection, DetectionError, detect
+from compensation.target import Target
+from drivers.documents import parse_document
+from drivers.interface import Frame, SessionError
+from stand.progress import Report
+from stand.session import Session
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+Progress = Callable[[str, float], AbstractContextManager[Report]]
+"""stand.progress.progress, or anything like it: (title, total) -> a context that yields report(done, text)."""
+
+_AIR_CHANNEL = "thermometers.air"
+_AIR_GAP_NS = 120_000_000_000
+"""The air temperature is interpolated between readings this close together, and unknown elsewhere."""
+_PREVIEW_WIDTH_PX = 816
+
+
+class Role(StrEnum):
+    """What a frame was taken for, as its capture step says. OTHER: no such step, or one without a set-point."""
+
+    REFERENCE = "reference"
+    FIT = "fit"
+    VALIDATION = "validation"
+    WARM_UP = "warm_up"
+    OTHER = "other"
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFacts:
+    """Where frames come from. incomplete: segments that a killed recorder left behind and nobody has read."""
+
+    session_id: str
+    recipe: str
+    camera_serial: str
+    operator: str
+    software_version: str
+    clock_source: str
+    incomplete: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """F frames of a target with N markers, in order of time within each of the sessions.
+
+    session (F,): index into `sessions`. frame (F,): number within its session, from 0. time_ns (F,) int64. role (F,):
+    values of Role. chamber_degC (F,): set-point. camera_degC (F,): the camera's own temperature. air_degC (F,): near
+    the camera. Temperatures are NaN when unknown. centres_px (F, N, 2), covariance_px2 (F, N, 2, 2): NaN when the
+    marker is missing or flagged. flags (F, N): of markers.Flag. reasons (F): why the frame cannot be used, "" when it
+    can. preview: the first usable frame, reduced, grey. image_size: (width, height) of the frames, px.
+    """
+
+    target: Target
+    sessions: tuple[SessionFacts, ...]
+    image_size: tuple[int, int]
+    preview: NDArray[np.uint8]
+    session: NDArray[np.int64]
+    frame: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    role: NDArray[np.str_]
+    step_id: tuple[str, ...]
+    chamber_degC: Float
+    camera_degC: Float
+    air_degC: Float
+    centres_px: Float
+    covariance_px2: Float
+    flags: NDArray[np.uint8]
+    reasons: tuple[str, ...]
+
+    @property
+    def usable(self) -> Mask:
+        """(F,): frames with markers and a camera temperature."""
+        return np.array([not reason for reason in self.reasons], bool)
+
+    def of(self, *roles: Role) -> Mask:
+        """(F,): usable frames taken for one of these purposes."""
+        return self.usable & np.isin(self.role, [str(role) for role in roles])
+
+
+def session_target(session: Session) -> Target:
+    """The target attached to the session; SessionError when none is, ConfigError when it is wrong."""
+    text = session.attachment("target.yaml")
+    if text is None:
+        raise SessionError(f"{session.path}: no target.yaml is attached; name the target with --target")
+    return parse_document(text, Target, f"{session.path}: target.yaml")
+
+
+def observe(session: Session, target: Target, report: Report | None = None) -> Observations:
+    """Find the target in every frame; `report` counts frames.
+
+    A frame without the target, of another size or without a camera temperature stays, with its reason. SessionError
+    when no frame can be used at all.
+    """
+    captures = {mark.step_id: mark.parameters for mark in session.steps() if mark.kind == "Capture"}
+    found: list[_Seen] = []
+    previous: Detection | None = None
+    first: Frame | None = None
+    for frame in session.frames():
+        seen = _see(frame, target, previous, None if first is None else first.image.shape)
+        if seen.detection is not None:
+            previous, first = seen.detection, first or frame
+        found.append(seen)
+        if report is not None:
+            report(len(found), f"frame {len(found)} of {session.frame_count}")
+    if first is None:
+        why = found[0].reason if found else "it has no frames"
+        raise SessionError(f"{session.path}: no frame can be used; {why}")
+    return _arrays(session, target, found, captures, first)
+
+
+def observe_sessions(paths: Sequence[Path], progress: Progress, target: Target | None = None) -> Observations:
+    """All frames of all sessions, found once, with progress. target: instead of the ones attached to the sessions."""
+    sessions = [Session.open(path) for path in paths]
+    targets = [target or session_target(session) for session in sessions]
+    parts: list[Observations] = []
+    done = 0
+    with progress("find markers", sum(session.frame_count for session in sessions)) as report:
+        for session, its_target in zip(sessions, targets, strict=True):
+            parts.append(observe(session, its_target, _continued(report, done)))
+            done += session.frame_count
+    return concatenate(parts)
+
+
+def _continued(report: Report, done_before: float) -> Report:
+    def continued(done: float, text: str) -> None:
+        report(done_before + done, text)
+
+    return continued
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A frame without its image. `detection` is None, with a reason, when the target was not found."""
+
+    time_ns: int
+    step_id: str
+    camera_degC: float
+    detection: Detection | None
+    reason: str
+
+
+def _see(frame: Frame, target: Target, previous: Detection | None, shape: tuple[int, ...] | None) -> _Seen:
+    detection, reason = None, ""
+    if shape is not None and frame.image.shape != shape:
+        reason = f"the image has the shape {frame.image.shape}, the session's {shape}"
+    else:
+        try:
+            detection = detect(frame.image, target, previous)
+        except DetectionError as error:
+            reason = str(error)
+    if not reason and math.isnan(frame.camera_degC):
+        reason = "the camera's temperature is unknown"
+    return _Seen(frame.time_ns, frame.step_id, frame.camera_degC, detection, reason)
+
+
+def _arrays(
+    session: Session, target: Target, found: list[_Seen], captures: dict[str, dict[str, object]], first: Frame
+) -> Observations:
+    purposes = [_purpose(captures.get(seen.step_id, {})) for seen in found]
+    time_ns = np.array([seen.time_ns for seen in found], np.int64)
+    flags = np.array([_flags(seen.detection, target.count) for seen in found], np.uint8)
+    centres = np.array([_centres(seen.detection, target.count) for seen in found])
+    covariance = np.array([_covariance(seen.detection, target.count) for seen in found])
+    centres[flags != 0] = np.nan
+    covariance[flags != 0] = np.nan
+    return Observations(
+        target=target,
+        sessions=(_facts(session),),
+        image_size=(first.image.shape[1], first.image.shape[0]),
+        preview=_preview(first.image),
+        session=np.zeros(len(found), np.int64),
+        frame=np.arange(len(found)),
+        time_ns=time_ns,
+        role=np.array([str(role) for role, _ in purposes]),
+        step_id=tuple(seen.step_id for seen in found),
+        chamber_degC=np.array([chamber_degC for _, chamber_degC in purposes]),
+        camera_degC=np.array([seen.camera_degC for seen in found]),
+        air_degC=_air_degC(session, time_ns),
+        centres_px=centres,
+        covariance_px2=covariance,
+        flags=flags,
+        reasons=tuple(seen.reason for seen in found),
+    )
+
+
+def _flags(detection: Detection | None, count: int) -> NDArray[np.uint8]:
+    return np.zeros(count, np.uint8) if detection is None else detection.flags
+
+
+def _centres(detection: Detection | None, count: int) -> Float:
+    return np.full((count, 2), np.nan) if detection is None else detection.centres_px
+
+
+def _covariance(detection: Detection | None, count: int) -> Float:
+    return np.full((count, 2, 2), np.nan) if detection is None else detection.covariance_px2
+
+
+def _purpose(parameters: dict[str, object]) -> tuple[Role, float]:
+    """Role and set-point of a capture step's parameters."""
+    role, chamber_degC = parameters.get("role"), parameters.get("chamber_degC")
+    if not isinstance(chamber_degC, int | float) or not isinstance(role, str) or role not in set(Role):
+        return Role.OTHER, math.nan
+    return Role(role), float(chamber_degC)
+
+
+def _facts(session: Session) -> SessionFacts:
+    fields = ("session_id", "recipe", "camera_serial", "operator", "software_version", "clock_source")
+    texts = {name: session.metadata.get(name, "") for name in fields}
+    return SessionFacts(**texts, incomplete=len(session.incomplete))
+
+
+def _air_degC(session: Session, time_ns: NDArray[np.int64]) -> Float:
+    """Linear between the readings before and after; NaN beyond them and across gaps."""
+    try:
+        times_ns, values = session.readings(_AIR_CHANNEL)
+    except SessionError:
+        return np.full(len(time_ns), np.nan)
+    good = np.isfinite(values)
+    times_ns, values = times_ns[good], values[good]
+    if len(times_ns) == 0:
+        return np.full(len(time_ns), np.nan)
+    after = np.clip(np.searchsorted(times_ns, time_ns), 1, max(len(times_ns) - 1, 1))
+    near = (times_ns[np.minimum(after, len(times_ns) - 1)] - times_ns[after - 1]) <= _AIR_GAP_NS
+    origin = int(times_ns[0])
+    air = np.interp(time_ns - origin, times_ns - origin, values, left=np.nan, right=np.nan)
+    return np.where(near, air, np.nan)
+
+
+def _preview(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """The image at a width for the report; averaging before rounding takes most of the noise away."""
+    height, width = image.shape
+    factor = max(1, math.ceil(width / _PREVIEW_WIDTH_PX))
+    reduced = cv2.resize(image, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    brightest = max(int(reduced.max()), 1)
+    return np.round(reduced * (255 / brightest)).astype(np.uint8)
+
+
+def concatenate(parts: Sequence[Observations]) -> Observations:
+    """The frames of several sessions, one after the other.
+
+    SessionError when camera, target or image size differ: one model is of one camera.
+    """
+    first = parts[0]
+    for index, part in enumerate(parts[1:], 1):
+        _check_same(first, part)
+        if part.sessions[0] in [known.sessions[0] for known in parts[:index]]:
+            raise SessionError(f"session {part.sessions[0].session_id} is given twice")
+    lengths = np.cumsum([0] + [len(part.sessions) for part in parts])
+    return Observations(
+        target=first.target,
+        sessions=tuple(facts for part in parts for facts in part.sessions),
+        image_size=first.image_size,
+        preview=first.preview,
+        session=np.concatenate([part.session + shift for part, shift in zip(parts, lengths, strict=False)]),
+        frame=np.concatenate([part.frame for part in parts]),
+        time_ns=np.concatenate([part.time_ns for part in parts]),
+        role=np.concatenate([part.role for part in parts]),
+        step_id=tuple(step_id for part in parts for step_id in part.step_id),
+        chamber_degC=np.concatenate([part.chamber_degC for part in parts]),
+        camera_degC=np.concatenate([part.camera_degC for part in parts]),
+        air_degC=np.concatenate([part.air_degC for part in parts]),
+        centres_px=np.concatenate([part.centres_px for part in parts]),
+        covariance_px2=np.concatenate([part.covariance_px2 for part in parts]),
+        flags=np.concatenate([part.flags for part in parts]),
+        reasons=tuple(reason for part in parts for reason in part.reasons),
+    )
+
+
+def _check_same(first: Observations, other: Observations) -> None:
+    here, there = first.sessions[0], other.sessions[0]
+    pairs = {
+        "camera": (here.camera_serial, there.camera_serial),
+        "target": (first.target.name, other.target.name),
+        "number of markers": (first.target.count, other.target.count),
+        "image size": (first.image_size, other.image_size),
+    }
+    for name, (one, two) in pairs.items():
+        if one != two:
+            raise SessionError(
+                f"sessions {here.session_id} and {there.session_id} cannot be combined: {name} {one} and {two}"
+            )

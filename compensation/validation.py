@@ -1,0 +1,158 @@
+"""How much the compensation gains, on frames at temperatures the fit has never seen (the paper's section 6.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.displacements import Displacements, displacements
+from compensation.drift import CompensationModel
+from compensation.fitting import left_out
+from compensation.observations import Float, Observations, Role
+from drivers.interface import SessionError
+
+PAPER_BEFORE_PX = (0.191, 0.576)
+PAPER_AFTER_PX = (0.100, 0.090)
+"""RMS along I and J of the paper's camera, fourth degree (section 6.2)."""
+
+_SIGMA_95 = 1.959964
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureRms:
+    """RMS deviations (I, J), px, of the held-out frames at one chamber set-point; camera_degC is their mean."""
+
+    chamber_degC: float
+    camera_degC: float
+    frames: int
+    before_px: tuple[float, float]
+    after_px: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """Deviations of held-out centres from their reference positions, before and after compensation.
+
+    method: what was held out, in words. frames: how many. before_px, after_px (M, 2): reference minus measured, and
+    reference minus corrected. outside (M,): beyond the model's valid range. coverage_95 (I, J): part of the deviations
+    after that lie in the 95 % interval the model and the markers claim; 0.95 is right. temperatures: one per set-point.
+    """
+
+    method: str
+    held_out: bool
+    frames: int
+    before_px: Float
+    after_px: Float
+    outside: NDArray[np.bool_]
+    coverage_95: tuple[float, float]
+    temperatures: tuple[TemperatureRms, ...]
+
+    @property
+    def rms_before_px(self) -> tuple[float, float]:
+        """RMS along I and J before compensation, px."""
+        return rms_px(self.before_px)
+
+    @property
+    def rms_after_px(self) -> tuple[float, float]:
+        """RMS along I and J after compensation, px."""
+        return rms_px(self.after_px)
+
+
+def evaluate(model: CompensationModel, observations: Observations) -> Evaluation:
+    """Score the model on the VALIDATION frames; a session without any is scored by leaving out one temperature at a
+    time, each time with a new fit of the same degree. SessionError when the frames are of another camera or target."""
+    _check_same(model, observations)
+    frames = observations.of(Role.VALIDATION)
+    if frames.any():
+        rows = displacements(observations, frames)
+        after = rows.displacement_px - model.shift(rows.measured_px, rows.camera_degC)
+        method = "held-out temperatures"
+    else:
+        rows = displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
+        after = _left_out(model, rows)
+        method = "no held-out frames: one temperature left out at a time"
+    if len(rows.frame) == 0:
+        raise SessionError("no markers are left to score the model with")
+    return Evaluation(
+        method=method,
+        held_out=bool(frames.any()),
+        frames=len(np.unique(rows.frame)),
+        before_px=rows.displacement_px,
+        after_px=after,
+        outside=~model.inside(rows.measured_px, rows.camera_degC),
+        coverage_95=_coverage(model, rows, after),
+        temperatures=_by_temperature(rows, after),
+    )
+
+
+def _check_same(model: CompensationModel, observations: Observations) -> None:
+    serial = observations.sessions[0].camera_serial
+    if serial != model.camera_serial:
+        raise SessionError(f"the model is of camera {model.camera_serial}, the session of camera {serial}")
+    if observations.image_size != model.scaling.image_size:
+        raise SessionError(
+            f"the model is of images of {model.scaling.image_size} px, the session of {observations.image_size}"
+        )
+
+
+def _left_out(model: CompensationModel, rows: Displacements) -> Float:
+    low, high = float(rows.camera_degC.min()), float(rows.camera_degC.max())
+    try:
+        return left_out(rows, model.degree, replace(model.scaling, camera_degC=(low, high)))
+    except (np.linalg.LinAlgError, ZeroDivisionError) as error:
+        raise SessionError(f"too few temperatures to leave one out of a fit of degree {model.degree}") from error
+
+
+def _coverage(model: CompensationModel, rows: Displacements, after: Float) -> tuple[float, float]:
+    claimed = np.diagonal(model.covariance(rows.measured_px, rows.camera_degC), axis1=1, axis2=2) + rows.variance_px2
+    inside = (np.abs(after) <= _SIGMA_95 * np.sqrt(claimed)).mean(axis=0)
+    return float(inside[0]), float(inside[1])
+
+
+def _by_temperature(rows: Displacements, after: Float) -> tuple[TemperatureRms, ...]:
+    found: list[TemperatureRms] = []
+    for chamber_degC in np.unique(rows.chamber_degC):
+        here = rows.chamber_degC == chamber_degC
+        frames, first = np.unique(rows.frame[here], return_index=True)
+        found.append(
+            TemperatureRms(
+                chamber_degC=float(chamber_degC),
+                camera_degC=float(rows.camera_degC[here][first].mean()),
+                frames=len(frames),
+                before_px=rms_px(rows.displacement_px[here]),
+                after_px=rms_px(after[here]),
+            )
+        )
+    return tuple(found)
+
+
+def rms_px(deviations: Float) -> tuple[float, float]:
+    """RMS of deviations (M, 2) along I and J."""
+    i, j = np.sqrt((deviations**2).mean(axis=0))
+    return float(i), float(j)
+
+
+def improvement_percent(before_px: float, after_px: float) -> float:
+    """By how much the RMS has shrunk; negative when it has grown, NaN when there was nothing to shrink."""
+    return 100 * (1 - after_px / before_px) if before_px > 0 else float("nan")
+
+
+def table(evaluation: Evaluation) -> str:
+    """The paper's result and ours side by side, as text."""
+    before, after = evaluation.rms_before_px, evaluation.rms_after_px
+    lines = [
+        "RMS deviation from the reference position, px",
+        f"{'':<14}{'along I':>26}{'along J':>30}",
+        f"{'':<14}" + 2 * f"{'before':>10}{'after':>10}{'gain':>8}  ",
+        _line("paper", PAPER_BEFORE_PX, PAPER_AFTER_PX),
+        _line("this session", before, after),
+        f"{evaluation.frames} frames; {evaluation.method}",
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _line(name: str, before: tuple[float, float], after: tuple[float, float]) -> str:
+    cells = (f"{b:10.3f}{a:10.3f}{improvement_percent(b, a):6.0f} %  " for b, a in zip(before, after, strict=True))
+    return f"{name:<14}" + "".join(cells)
