@@ -113,11 +113,14 @@ class Camera:
         )
 
     async def read(self) -> tuple[Reading, ...]:
-        """(Reading("camera.temperature", 41.5, "degC", ...),), BAD with the reason when the camera has none or it
-        cannot be read; Unreachable when the camera is not open or lost."""
+        """(Reading("camera.temperature", 41.5, "degC", ...),), BAD with the reason when the camera has none, it cannot
+        be read, or the camera is closed (it is switched off before a warm-up); Unreachable when it was lost."""
+        channel = f"{self._name}.temperature"
+        if self._lane is None:
+            return (bad_reading(channel, "degC", self._clock.now_ns(), "the camera is closed"),)
         value_degC, reason = await self._call(self._usable().temperature)
         self._usable()
-        channel, time_ns = f"{self._name}.temperature", self._clock.now_ns()
+        time_ns = self._clock.now_ns()
         if reason:
             return (bad_reading(channel, "degC", time_ns, reason),)
         return (Reading(channel, value_degC, "degC", time_ns),)

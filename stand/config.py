@@ -216,7 +216,7 @@ class CompressorConfig(Document):
     min_off_s: float = Field(default=300.0, ge=0)
     min_on_s: float = Field(default=180.0, ge=0)
     max_starts_per_h: int = Field(default=6, ge=1)
-    start_above_cool_percent: float = Field(default=20.0, gt=0, le=100)
+    start_above_cool_percent: float = Field(default=10.0, gt=0, le=100)
     stop_above_heat_percent: float = Field(default=60.0, gt=0, le=100)
 
 

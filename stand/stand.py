@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from drivers.camera import Camera
 from drivers.clock import Clock, seconds_ns
 from drivers.flap import Flap
-from drivers.interface import ConfigError, StandError, StandTripped, Unreachable
+from drivers.interface import ConfigError, Frame, StandError, StandTripped, Unreachable
 from drivers.regulator import Regulator
 from drivers.relays import Relays
 from drivers.stage import Axis
@@ -128,8 +128,17 @@ class Stand:
         for number in range(frames):
             self._check()
             await self._clock.sleep_until(start_ns + number * seconds_ns(interval_s))
-            frame = await self.devices.camera.grab(exposure_s)
+            frame = await self._grab(exposure_s)
             self._hub.publish(replace(frame, step_id=step_id))
+
+    async def _grab(self, exposure_s: float) -> Frame:
+        """One frame; a camera lost meanwhile is opened anew and asked once more, and the event says so."""
+        try:
+            return await self.devices.camera.grab(exposure_s)
+        except Unreachable as error:
+            self._hub.publish(Event(self._clock.now_ns(), "warning", "camera_lost", str(error)))
+        await self._open_camera()
+        return await self.devices.camera.grab(exposure_s)
 
     async def move_to(self, axis: str, position: float) -> None:
         """Move a stage (mm or deg), homing it first when it lost its scale."""

@@ -1,8 +1,8 @@
 """`python -m drivers.sim`: one process is one simulated laboratory. Its description comes as JSON on standard input.
 
 Prints `ready` when every fake answers; ends on SIGTERM, SIGINT or the control socket's `quit`; exits with 2 and one
-line when it cannot start. When whoever started it dies, it lives on for a minute, as a real laboratory would: long enough
-to see the heater's dead-man drop.
+line when it cannot start. When whoever started it dies, it lives on for a minute, as a real laboratory would: long
+enough to see the heater's dead-man drop.
 """
 
 from __future__ import annotations

@@ -267,7 +267,9 @@ async def test_a_closed_camera_is_unreachable_until_it_is_opened_again():
     await camera.close()
     await camera.close()
     with pytest.raises(Unreachable, match="not open"):
-        await camera.read()
+        await camera.grab()
+    (reading,) = await camera.read()
+    assert (reading.quality, reading.reason) == (Quality.BAD, "the camera is closed")
     assert camera.counters()["opened"] == 2
 
 
