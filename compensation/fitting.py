@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib.metadata
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from compensation.displacements import Displacements, displacements, reference_centres
 from compensation.drift import MAX_DEGREE, CompensationModel, DegreeScore
-from compensation.observations import Observations, Role
-from compensation.polynomial import Float, Scaling, design, exponents, solve
+from compensation.observations import Mask, Observations, Role
+from compensation.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from drivers.interface import SessionError
 
 _LEAST_TEMPERATURES = 3
@@ -24,11 +26,10 @@ def fit(observations: Observations, degree: int | None = None) -> CompensationMo
     """
     frames = observations.of(Role.REFERENCE, Role.FIT)
     rows = displacements(observations, frames)
-    scaling = _scaling(observations, rows)
-    scores = cross_validate(rows, scaling, _degrees(rows, degree))
+    scaling = scaling_of(observations, rows)
+    scores = cross_validate(rows, scaling, degrees_for(rows, degree))
     chosen = choose(scores) if degree is None else _given(scores, degree)
-    terms = design(rows.measured_px, rows.camera_degC, chosen, scaling)
-    solutions = [solve(terms, rows.displacement_px[:, axis], rows.variance_px2[:, axis]) for axis in (0, 1)]
+    solutions = _solutions(_condensed(rows, chosen, scaling))
     held_out = left_out(rows, chosen, scaling)
     reference = observations.of(Role.REFERENCE)
     centres, _ = reference_centres(observations)
@@ -41,7 +42,7 @@ def fit(observations: Observations, degree: int | None = None) -> CompensationMo
         hull_px=convex_hull(rows.measured_px),
         reference_degC=float(observations.camera_degC[reference].mean()),
         reference_chamber_degC=_reference_chamber_degC(observations),
-        reference_centres_px=centres[0],
+        reference_centres_px=centres[observations.session[reference][0]],
         scores=scores,
         target_name=observations.target.name,
         camera_serial=observations.sessions[0].camera_serial,
@@ -58,8 +59,11 @@ def _reference_chamber_degC(observations: Observations) -> float:
     return float(set_points[0])
 
 
-def _degrees(rows: Displacements, degree: int | None) -> range:
-    """The degrees that the temperatures can decide on: T^n needs n + 1 of them, and one more to be left out."""
+def degrees_for(rows: Displacements, degree: int | None) -> range:
+    """The degrees that the temperatures can decide on: T^n needs n + 1 of them, and one more to be left out.
+
+    SessionError when `degree` (None: any at all) is not among them.
+    """
     set_points = np.unique(rows.chamber_degC)
     if degree is not None and not 1 <= degree <= MAX_DEGREE:
         raise SessionError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
@@ -73,7 +77,8 @@ def _degrees(rows: Displacements, degree: int | None) -> range:
     return range(1, min(MAX_DEGREE, len(set_points) - 2) + 1)
 
 
-def _scaling(observations: Observations, rows: Displacements) -> Scaling:
+def scaling_of(observations: Observations, rows: Displacements) -> Scaling:
+    """The image and the range of the camera's temperature in these rows; SessionError when that hardly changes."""
     if len(rows.frame) == 0:
         raise SessionError("the sessions have no usable frames for a fit")
     low, high = float(rows.camera_degC.min()), float(rows.camera_degC.max())
@@ -97,13 +102,11 @@ def cross_validate(rows: Displacements, scaling: Scaling, degrees: range) -> tup
 
 def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
     squares = _by_fold(rows, left_out(rows, degree, scaling) ** 2)
-    terms = design(rows.measured_px, rows.camera_degC, degree, scaling)
-    conditions = [solve(terms, rows.displacement_px[:, axis], rows.variance_px2[:, axis]).condition for axis in (0, 1)]
     rms = np.sqrt(squares.mean(axis=0))
     return DegreeScore(
         degree=degree,
         terms=len(exponents(degree)),
-        condition=max(conditions),
+        condition=max(solution.condition for solution in _solutions(_condensed(rows, degree, scaling))),
         rms_px=(float(rms[0]), float(rms[1])),
         fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
         fold_rms_px=tuple((float(i), float(j)) for i, j in np.sqrt(squares)),
@@ -112,14 +115,40 @@ def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
 
 def left_out(rows: Displacements, degree: int, scaling: Scaling) -> Float:
     """Residual displacement (M, 2) of each row, from a fit that has not seen its chamber set-point."""
-    terms = design(rows.measured_px, rows.camera_degC, degree, scaling)
+    folds = _condensed(rows, degree, scaling)
     residual = np.empty_like(rows.displacement_px)
-    for chamber_degC in np.unique(rows.chamber_degC):
-        held = rows.chamber_degC == chamber_degC
-        for axis in (0, 1):
-            known = solve(terms[~held], rows.displacement_px[~held, axis], rows.variance_px2[~held, axis])
-            residual[held, axis] = rows.displacement_px[held, axis] - terms[held] @ known.coefficients
+    for index, fold in enumerate(folds):
+        known = _solutions(folds[:index] + folds[index + 1 :])
+        coefficients = np.stack([solution.coefficients for solution in known], axis=1)
+        terms = design(rows.measured_px[fold.rows], rows.camera_degC[fold.rows], degree, scaling)
+        residual[fold.rows] = rows.displacement_px[fold.rows] - terms @ coefficients
     return residual
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fold:
+    """The rows (M,) of one chamber set-point, and their triangles for I and J."""
+
+    rows: Mask
+    triangles: tuple[Float, Float]
+
+
+def _condensed(rows: Displacements, degree: int, scaling: Scaling) -> list[_Fold]:
+    """All rows, a fold for each chamber set-point."""
+    folds: list[_Fold] = []
+    for chamber_degC in np.unique(rows.chamber_degC):
+        here = rows.chamber_degC == chamber_degC
+        terms = design(rows.measured_px[here], rows.camera_degC[here], degree, scaling)
+        values, variance = rows.displacement_px[here], rows.variance_px2[here]
+        i, j = (condense(terms, values[:, axis], variance[:, axis]) for axis in (0, 1))
+        folds.append(_Fold(here, (i, j)))
+    return folds
+
+
+def _solutions(folds: Sequence[_Fold]) -> list[Solution]:
+    """The fits of I and of J to all rows of the folds; LinAlgError when they do not determine them."""
+    count = sum(int(fold.rows.sum()) for fold in folds)
+    return [solve([fold.triangles[axis] for fold in folds], count) for axis in (0, 1)]
 
 
 def choose(scores: tuple[DegreeScore, ...]) -> int:

@@ -7,7 +7,9 @@ condition number at n = 4 is about 60 where monomials in pixels and degC have 4e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -63,17 +65,31 @@ class Solution:
     condition: float
 
 
-def solve(terms: Float, values: Float, variance: Float) -> Solution:
-    """Fit values (M,) with variances (M,) by terms (M, K), by QR; raises LinAlgError when they do not determine it."""
+def condense(terms: Float, values: Float, variance: Float) -> Float:
+    """Rows [terms | values] (M, K + 1) with variances (M,) as a triangle of at most K + 1 rows that gives the same fit:
+    the R of their weighted QR. So each group of rows is worked through once, however often it is then left out."""
     weight = 1 / np.sqrt(variance)
-    q, r = np.linalg.qr(terms * weight[:, None])
-    if len(values) < terms.shape[1]:
-        raise np.linalg.LinAlgError(f"{len(values)} values for {terms.shape[1]} terms")
-    singular = np.linalg.svd(r, compute_uv=False)
+    return _triangle(np.column_stack([terms, values]) * weight[:, None])
+
+
+def solve(triangles: Sequence[Float], count: int) -> Solution:
+    """The fit of all the rows, `count` of them, that were condensed into the triangles; raises LinAlgError when they
+    do not determine it."""
+    r = _triangle(np.concatenate(triangles))
+    terms = r.shape[1] - 1
+    if min(count, len(r)) < terms:
+        raise np.linalg.LinAlgError(f"{count} values for {terms} terms")
+    singular = np.linalg.svd(r[:terms, :terms], compute_uv=False)
     if not singular[-1] * _WORST_CONDITION > singular[0]:
         raise np.linalg.LinAlgError(f"singular values from {singular[0]:.2g} to {singular[-1]:.2g}")
-    inverse: Float = np.linalg.inv(r)
-    coefficients: Float = inverse @ (q.T @ (values * weight))
-    residual = (values - terms @ coefficients) * weight
-    chi2 = float(residual @ residual) / max(len(values) - terms.shape[1], 1)
-    return Solution(coefficients, inverse @ inverse.T * max(chi2, 1.0), float(singular[0] / singular[-1]))
+    inverse = cast(Float, np.linalg.inv(r[:terms, :terms]))
+    chi2 = float((r[terms:, terms] ** 2).sum()) / max(count - terms, 1)
+    return Solution(
+        coefficients=inverse @ r[:terms, terms],
+        covariance=inverse @ inverse.T * max(chi2, 1.0),
+        condition=float(singular[0] / singular[-1]),
+    )
+
+
+def _triangle(rows: Float) -> Float:
+    return cast(Float, np.linalg.qr(rows, mode="r"))  # for this mode numpy's stubs promise a pair

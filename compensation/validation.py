@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compensation.displacements import Displacements, displacements
 from compensation.drift import CompensationModel
-from compensation.fitting import left_out
+from compensation.fitting import degrees_for, left_out, scaling_of
 from compensation.observations import Float, Observations, Role
 from drivers.interface import SessionError
 
@@ -71,7 +71,7 @@ def evaluate(model: CompensationModel, observations: Observations) -> Evaluation
         method = "held-out temperatures"
     else:
         rows = displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
-        after = _left_out(model, rows)
+        after = _left_out(model, observations, rows)
         method = "no held-out frames: one temperature left out at a time"
     if len(rows.frame) == 0:
         raise SessionError("no markers are left to score the model with")
@@ -97,12 +97,13 @@ def _check_same(model: CompensationModel, observations: Observations) -> None:
         )
 
 
-def _left_out(model: CompensationModel, rows: Displacements) -> Float:
-    low, high = float(rows.camera_degC.min()), float(rows.camera_degC.max())
+def _left_out(model: CompensationModel, observations: Observations, rows: Displacements) -> Float:
+    """Residuals (M, 2) of new fits of the same degree."""
+    degrees_for(rows, model.degree)
     try:
-        return left_out(rows, model.degree, replace(model.scaling, camera_degC=(low, high)))
-    except (np.linalg.LinAlgError, ZeroDivisionError) as error:
-        raise SessionError(f"too few temperatures to leave one out of a fit of degree {model.degree}") from error
+        return left_out(rows, model.degree, scaling_of(observations, rows))
+    except np.linalg.LinAlgError as error:
+        raise SessionError(f"the markers do not determine a polynomial of degree {model.degree}") from error
 
 
 def _coverage(model: CompensationModel, rows: Displacements, after: Float) -> tuple[float, float]:

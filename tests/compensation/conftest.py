@@ -1,0 +1,91 @@
+"""A small recorded session: photographs of a target that moves with the temperature, through the stand's recorder."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.clock import NS_PER_S, VirtualClock
+from drivers.interface import Frame, Reading
+from stand.hub import Batch, Hub, Item, StepMark, StepState
+from stand.recorder import Recorder, RecordingSettings, SessionInfo
+
+from .rendered import Scene, photograph, render, true_centres_px
+
+START_NS = 1_767_290_400 * NS_PER_S
+TARGET_YAML = "name: small\ncolumns: 9\nrows: 6\npitch_mm: 30\ndiameter_mm: 10\n"
+SEQUENCE = (
+    [("warm_up", 24.0)] * 3
+    + [("reference", 24.0)] * 4
+    + [("fit", degC) for degC in (10.0, 17.0, 31.0, 38.0, 45.0, 52.0, 24.0)]
+    + [("validation", degC) for degC in (20.0, 34.0, 48.0)]
+)
+DARK = 9
+"""This frame (a fit at 31 degC) shows nothing."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A session on the disk and the truth about it: centres (F, 54, 2)."""
+
+    path: Path
+    true_px: NDArray[np.float64]
+
+
+def scene_at(index: int) -> Scene:
+    """The target drifts by 0.01 px/K along I and 0.03 px/K along J; in the warm-up by 0.3 px a frame along J."""
+    role, chamber_degC = SEQUENCE[index]
+    above_K = chamber_degC - 24 if role != "warm_up" else -30.0 + 10 * index
+    return Scene(
+        size=(640, 480), f_px=2000, distance_mm=1000, diameter_mm=10, shift_mm=(0.005 * above_K, 0.015 * above_K)
+    )
+
+
+def photo(index: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    return photograph(scene_at(index), render(scene_at(index)), index)
+
+
+def published(index: int, time_ns: int) -> Iterator[Item]:
+    role, chamber_degC = SEQUENCE[index]
+    parameters: dict[str, object] = {"frames": 1, "role": role, "chamber_degC": chamber_degC}
+    image = np.full((480, 640), 3, np.uint8) if index == DARK else photo(index)
+    if index < len(SEQUENCE) - 1:
+        air = Reading("thermometers.air", chamber_degC + 0.1, "degC", time_ns)
+        yield Batch("thermometers", time_ns, (air,))
+    yield StepMark(time_ns, f"step-{index}", index, "Capture", StepState.STARTED, parameters)
+    yield Frame("camera.image", image, time_ns, 0.1, 0.0, chamber_degC + 20, index, 0, 0, f"step-{index}")
+
+
+async def record(directory: Path, attachments: dict[str, str], frames: int = len(SEQUENCE)) -> None:
+    """The first frames of the sequence, one a minute."""
+    clock, hub = VirtualClock(START_NS), Hub()
+    info = SessionInfo(directory.name, "thermal-cycle", "TS-0001", "operator", "0.1.0", "virtual")
+    devices = {"thermometers": "thermometers", "camera": "camera"}
+    recorder = Recorder(directory, info, attachments, devices, hub, clock, RecordingSettings(telemetry_commit_s=60.0))
+    recorder.start()
+    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
+    for index in range(frames):
+        await clock.sleep_until(START_NS + index * 60 * NS_PER_S)
+        for item in published(index, clock.now_ns()):
+            hub.publish(item)
+    await clock.sleep_until(clock.now_ns() + NS_PER_S)
+    for task in tasks:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+    await recorder.finish()
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """The session, not to be changed."""
+    path = tmp_path_factory.mktemp("sessions") / "night"
+    asyncio.run(record(path, {"target.yaml": TARGET_YAML}))
+    return Recorded(path, np.array([true_centres_px(scene_at(index)) for index in range(len(SEQUENCE))]))

@@ -1,0 +1,174 @@
+"""The `compensate` command on a recorded session and on photographs, and what it says to bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from compensation import cli
+from compensation.detections import COLUMNS
+from compensation.drift import CompensationModel
+from compensation.report import analyse
+from compensation.validation import table
+from drivers.interface import SessionError
+from stand.progress import progress
+
+from .conftest import DARK, SEQUENCE, TARGET_YAML, Recorded, photo
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        rows = list(reader)
+    assert tuple(reader.fieldnames or ()) == COLUMNS
+    return rows
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    path = tmp_path / "target.yaml"
+    path.write_text(TARGET_YAML)
+    return path
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    path = tmp_path / "photo.png"
+    cv2.imwrite(str(path), photo(3))
+    return path
+
+
+def assert_refused(result: Result, sentence: str, out: Path):
+    """Status 2, one line that has the sentence, and nothing written."""
+    assert result.exit_code == 2, result.output
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("find markers")]
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert sentence in lines[0]
+    assert not out.exists()
+    assert not list(out.parent.glob(".*.part"))
+
+
+def test_detect_writes_a_row_per_marker_and_frame_of_a_session(recorded: Recorded, tmp_path: Path):
+    result = run("detect", recorded.path, "-o", tmp_path / "markers.csv")
+    assert result.exit_code == 0
+    rows = rows_of(tmp_path / "markers.csv")
+    assert len(rows) == 54 * len(SEQUENCE)
+    assert [row["image"] for row in rows[::54]] == [str(index) for index in range(len(SEQUENCE))]
+    got = np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows]).reshape(-1, 54, 2)
+    assert np.nanmax(np.abs(got - recorded.true_px)) < 0.04
+    dark = rows[54 * DARK : 54 * DARK + 54]
+    assert {(row["x_px"], row["flags"]) for row in dark} == {("nan", "MISSING")}
+    assert f"not found in {DARK}: " in result.stderr
+
+
+def test_detect_takes_photographs_and_an_installed_target(image: Path, target: Path, tmp_path: Path):
+    out = tmp_path / "markers.csv"
+    assert run("detect", image, "-o", out).exit_code == 0  # paper-9x6 has the same proportions but for the discs
+    assert run("detect", image, image, "--target", target, "-o", out).exit_code == 0
+    rows = rows_of(out)
+    assert [row["image"] for row in rows[::54]] == ["photo.png", "photo.png"]
+    assert rows[0]["time_ns"] == ""
+    assert (rows[0]["marker"], rows[0]["row"], rows[0]["column"]) == ("1", "0", "0")
+
+
+def test_fit_then_report_then_analyse_agree(recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    fitted = run("fit", recorded.path, "-o", tmp_path / "model.json")
+    assert fitted.exit_code == 0
+    assert "paper              0.191     0.100    48 %       0.576     0.090    84 %" in fitted.stdout
+    reported = run("report", recorded.path, "--model", tmp_path / "model.json", "-o", tmp_path / "report.html")
+    assert reported.exit_code == 0
+    evaluation = analyse([recorded.path], tmp_path / "model2.json", tmp_path / "report2.html", progress)
+    assert table(evaluation) == reported.stdout.rstrip("\n")
+    assert (tmp_path / "model2.json").read_bytes() == (tmp_path / "model.json").read_bytes()
+    assert (tmp_path / "report2.html").read_bytes() == (tmp_path / "report.html").read_bytes()
+    assert evaluation.rms_before_px[1] > 0.4
+    assert max(evaluation.rms_after_px) < 0.012  # discs of 10 px in radius: about 6 mpx of noise
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "model.json",
+        "model2.json",
+        "report.html",
+        "report2.html",
+    ]
+    assert "find markers: 100%" in capsys.readouterr().err
+
+
+def test_the_degree_can_be_given(recorded: Recorded, tmp_path: Path):
+    assert run("fit", recorded.path, "-o", tmp_path / "model.json", "--degree", "3").exit_code == 0
+    assert CompensationModel.load(tmp_path / "model.json").degree == 3
+    assert json.loads((tmp_path / "model.json").read_text())["session_ids"] == ["night"]
+    assert run("fit", recorded.path, "-o", tmp_path / "model.json", "--degree", "6").exit_code == 2
+
+
+def test_bad_input_to_detect_is_refused_with_a_sentence(image: Path, recorded: Recorded, tmp_path: Path):
+    out = tmp_path / "markers.csv"
+    text, blank = tmp_path / "notes.png", tmp_path / "blank.png"
+    text.write_text("not a picture")
+    cv2.imwrite(str(blank), np.full((480, 640), 128, np.uint8))
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert_refused(run("detect", tmp_path / "none.png", "-o", out), "none.png: no such file or folder", out)
+    assert_refused(run("detect", image, text, "-o", out), "notes.png: not an image", out)
+    assert_refused(run("detect", blank, "-o", out), "blank.png: ", out)
+    assert_refused(run("detect", empty, "-o", out), "empty: not a session", out)
+    assert_refused(run("detect", image, "--target", "dots", "-o", out), "installed targets: paper-9x6", out)
+    assert_refused(run("detect", image, "--target", text, "-o", out), "notes.png: ", out)
+    nowhere = tmp_path / "none" / "markers.csv"
+    assert_refused(run("detect", recorded.path, "-o", nowhere), "cannot be written", nowhere)
+
+
+def test_bad_input_to_fit_and_report_is_refused_with_a_sentence(recorded: Recorded, tmp_path: Path):
+    out, model = tmp_path / "out", tmp_path / "model.json"
+    model.write_text("{}")
+    damaged = tmp_path / "damaged"
+    shutil.copytree(recorded.path, damaged)
+    segment = next((damaged / "frames").iterdir())
+    segment.write_bytes(segment.read_bytes()[:1000])
+    assert_refused(run("fit", tmp_path, "-o", out), "not a session", out)
+    assert_refused(run("fit", damaged, "-o", out), segment.name, out)
+    assert_refused(run("fit", recorded.path, recorded.path, "-o", out), "given twice", out)
+    assert_refused(run("report", recorded.path, "--model", model, "-o", out), "model.json: not a drift model", out)
+    assert_refused(
+        run("report", recorded.path, "-o", tmp_path / "no" / "out"), "cannot be written", tmp_path / "no" / "out"
+    )
+
+
+def test_an_interrupted_command_leaves_older_files_as_they_were(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("compensation.observations.detect", interrupted)
+    monkeypatch.setattr("compensation.cli.detect", interrupted)
+    for command in ("detect", "fit", "report"):
+        out = tmp_path / command
+        out.write_text("older")
+        result = run(command, recorded.path, "-o", out)
+        assert result.exit_code == 130
+        assert out.read_text() == "older"
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_analyse_refuses_before_the_long_work(recorded: Recorded, tmp_path: Path):
+    with pytest.raises(SessionError, match="cannot be written"):
+        analyse([recorded.path], tmp_path / "model.json", tmp_path / "none" / "report.html", progress)
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_has_examples():
+    for arguments in ([], ["detect"], ["fit"], ["report"]):
+        result = run(*arguments, "--help")
+        assert result.exit_code == 0
+        assert "Example: compensate" in result.stdout
