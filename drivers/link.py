@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import socket
+import termios
 from dataclasses import dataclass
 from typing import Protocol
 
 import serial
 
-from drivers.interface import Unreachable
+from drivers.interface import ConfigError, Unreachable
+
+_CONNECT_S = 1.0
+_WRITE_S = 1.0  # a device that takes no bytes must not hold the caller
 
 
 class ByteLink(Protocol):
-    """What a byte protocol needs of its wire. All three raise Unreachable when the wire is gone."""
+    """What a byte protocol needs of its wire. write and read raise Unreachable when the wire is gone."""
 
     def write(self, data: bytes) -> None:
         """Send all of `data`."""
         ...
 
     def read(self, timeout_s: float) -> bytes:
-        """What has arrived, waiting at most `timeout_s` for the first byte; b"" when nothing came."""
+        """What has arrived, waiting at most `timeout_s` (0: not at all) for the first byte; b"" when nothing came."""
         ...
 
     def close(self) -> None:
@@ -37,14 +43,15 @@ class SerialSettings:
 
 
 def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
-    """Open `serial:PATH` (exclusively) or `tcp:HOST:PORT` for `device`; raises Unreachable."""
+    """Open `serial:PATH` (exclusively) or `tcp:HOST:PORT` for `device`; raises Unreachable, or ConfigError when
+    `address` is neither."""
     kind, _, place = address.partition(":")
-    if kind == "serial":
+    if kind == "serial" and place:
         return _SerialLink(device, place, settings)
-    if kind == "tcp":
-        host, _, port = place.rpartition(":")
+    host, _, port = place.rpartition(":")
+    if kind == "tcp" and host and port.isdecimal() and 0 < int(port) < 65536:
         return _TcpLink(device, host, int(port))
-    raise ValueError(f"{device}: an address is serial:PATH or tcp:HOST:PORT, not {address!r}")
+    raise ConfigError(f"{device}: an address is serial:PATH or tcp:HOST:PORT, not {address!r}")
 
 
 class _SerialLink:
@@ -52,14 +59,16 @@ class _SerialLink:
         self._device = device
         self._path = path
         try:
-            self._port = serial.Serial(path, settings.baud, stopbits=settings.stopbits, exclusive=True)
-        except (serial.SerialException, OSError) as error:
-            raise Unreachable(device, f"cannot open {path} ({error})") from error
+            self._port = serial.Serial(
+                path, settings.baud, stopbits=settings.stopbits, write_timeout=_WRITE_S, exclusive=True
+            )
+        except (OSError, termios.error) as error:
+            raise Unreachable(device, f"cannot open {path}: {_why_closed(error)}") from error
 
     def write(self, data: bytes) -> None:
         try:
             self._port.write(data)
-        except (serial.SerialException, OSError) as error:
+        except (OSError, termios.error) as error:
             raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
 
     def read(self, timeout_s: float) -> bytes:
@@ -67,12 +76,20 @@ class _SerialLink:
             self._port.timeout = timeout_s
             first = self._port.read(1)
             return first + self._port.read(self._port.in_waiting) if first else b""
-        except (serial.SerialException, OSError) as error:
+        except (OSError, termios.error) as error:
             raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
 
     def close(self) -> None:
-        with contextlib.suppress(serial.SerialException, OSError):
+        with contextlib.suppress(OSError, termios.error):
             self._port.close()
+
+
+def _why_closed(error: Exception) -> str:
+    """pyserial's reason in one clause."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return "another program has it open"
+    return os.strerror(number) if number else str(error)
 
 
 class _TcpLink:
@@ -80,13 +97,14 @@ class _TcpLink:
         self._device = device
         self._where = f"{host}:{port}"
         try:
-            self._socket = socket.create_connection((host, port), timeout=1.0)
+            self._socket = socket.create_connection((host, port), timeout=_CONNECT_S)
         except OSError as error:
-            raise Unreachable(device, f"cannot connect to {self._where} ({error})") from error
+            raise Unreachable(device, f"cannot connect to {self._where}: {error.strerror or error}") from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes) -> None:
         try:
+            self._socket.settimeout(_WRITE_S)
             self._socket.sendall(data)
         except OSError as error:
             raise Unreachable(self._device, f"{self._where} is gone ({error})") from error
@@ -95,7 +113,7 @@ class _TcpLink:
         try:
             self._socket.settimeout(timeout_s)
             data = self._socket.recv(4096)
-        except TimeoutError:
+        except (TimeoutError, BlockingIOError):
             return b""
         except OSError as error:
             raise Unreachable(self._device, f"{self._where} is gone ({error})") from error

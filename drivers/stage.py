@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 from drivers.clock import Clock, seconds_ns
-from drivers.interface import DeviceFault, GarbledReply, Quality, Reading, Refused, Unreachable
-from drivers.lane import Lane
+from drivers.interface import DeviceError, DeviceFault, GarbledReply, Quality, Reading, Refused, Unreachable
+from drivers.lane import Lane, Result
 from drivers.link import SerialSettings, open_link
 from drivers.ximc_client import XimcClient
 
@@ -21,7 +22,9 @@ _LINE = SerialSettings(baud=115200, stopbits=2)
 _MICROSTEPS = 256
 _MICROSTEP_MODE_256 = 9
 _POLL_S = 0.1
+_STOP_LIMIT_S = 2.0
 _HOME_LIMIT_S = 900.0  # the slowest profile crosses its whole travel at 100 steps/s
+_ARRIVED_MICROSTEPS = 256
 
 # GETS: MoveSts, MvCmdSts, PWRSts, EncSts, WindSts, CurPosition, uCurPosition, EncPosition, CurSpeed, uCurSpeed, Ipwr,
 # Upwr, Iusb, Uusb, CurT, Flags, GPIOFlags, CmdBufFree
@@ -33,6 +36,9 @@ _SERIAL = struct.Struct("<I")
 
 _RUNNING = 0x80  # of MvCmdSts; wait on this, never on MoveSts (vendor source)
 _FAILED = 0x40
+_COMMAND = 0x3F
+_COMMAND_MOVE, _COMMAND_HOME = 0x01, 0x06
+_POWER_OFF = 1  # PWRSts
 _HOMED = 0x20  # of Flags
 _DANGER = 0x01B3FFC0
 _EDGES = 0x3  # of GPIOFlags
@@ -40,7 +46,7 @@ _EDGES = 0x3  # of GPIOFlags
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """unit per full step, the way ended upwards (in units) before a downward target."""
+    """unit per full step, the way (in units) that every move ends upwards at least."""
 
     unit: Literal["mm", "deg"]
     unit_per_step: float
@@ -55,7 +61,11 @@ PROFILES: dict[str, Profile] = {
 
 @dataclass(frozen=True, slots=True)
 class AxisSettings:
-    """`address`: serial:PATH or tcp:HOST:PORT. `profile`: a key of PROFILES. `limits`: lowest and highest position."""
+    """`address`: serial:PATH or tcp:HOST:PORT. `profile`: a key of PROFILES.
+
+    `limits`: lowest and highest target. To reach a target from below, the stage passes the lowest by up to the
+    profile's overshoot, which must be free.
+    """
 
     address: str
     serial_number: int
@@ -65,8 +75,11 @@ class AxisSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Status:
+    """What of GETS is used; `position` in microsteps."""
+
     command: int
-    steps: float
+    power: int
+    position: int
     flags: int
     gpio: int
 
@@ -74,9 +87,31 @@ class _Status:
     def running(self) -> bool:
         return bool(self.command & _RUNNING)
 
+    @property
+    def homed(self) -> bool:
+        return bool(self.flags & _HOMED)
+
+    @property
+    def alarm(self) -> str:
+        return f"controller alarm, flags 0x{self.flags & _DANGER:08X}" if self.flags & _DANGER else ""
+
+    @property
+    def doubt(self) -> str:
+        """Why the position must not be relied upon, "" when it may."""
+        if self.alarm or not self.homed:
+            return self.alarm or "not homed"
+        return "motor off, the rotor may have moved by up to a step" if self.power == _POWER_OFF else ""
+
+    def answers(self, command: int) -> bool:
+        """The last motion is of this kind and has not failed."""
+        return self.command & (_COMMAND | _FAILED) == command
+
 
 class Axis:
-    """One axis. Identity and microstep division are checked at open and again after the link was lost."""
+    """One axis. Identity and microstep division are checked on every new link before anything else, and at homing.
+
+    A lost link is opened again by the next call.
+    """
 
     def __init__(self, name: str, settings: AxisSettings, clock: Clock) -> None:
         if settings.profile not in PROFILES:
@@ -85,112 +120,156 @@ class Axis:
         self._settings = settings
         self._profile = PROFILES[settings.profile]
         self._clock = clock
-        self._lane = Lane(name, clock)
+        self._lane: Lane | None = None
         self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
         self._speed_steps_s = 1000.0
-        self._checked = False
+        self._stops = 0  # how often make_safe was called
 
     async def open(self) -> None:
         """Connect and compare serial number and microstep division; Refused when another controller answers."""
-        await self._lane.call(self._check_identity)
+        if self._lane is None:
+            self._lane = Lane(self.name, self._clock)
+        await self._call(self._check_identity)
 
     async def close(self) -> None:
-        """Let go of the port."""
-        await self._lane.call(self._client.close)
-        self._lane.close()
+        """Let go of the port; may be called twice."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._client.close)
+            lane.close()
 
     async def read(self) -> tuple[Reading, ...]:
-        """(position in mm or deg, moving 0/1, homed 0/1); the position is STALE while the controller has an alarm."""
-        status = await self._lane.call(self._status)
+        """(position in mm or deg, moving 0/1, homed 0/1); the position is STALE, with the reason, while the controller
+        has an alarm, is not homed, or leaves the motor without current."""
+        status = await self._call(self._status)
         now_ns = self._clock.now_ns()
-        alarm = status.flags & _DANGER
         position = Reading(
             f"{self.name}.position",
-            status.steps * self._profile.unit_per_step,
+            self._units(status.position),
             self._profile.unit,
             now_ns,
-            Quality.STALE if alarm else Quality.GOOD,
-            f"controller flags 0x{alarm:08X}" if alarm else "",
+            Quality.STALE if status.doubt else Quality.GOOD,
+            status.doubt,
         )
         return (
             position,
             Reading(f"{self.name}.moving", float(status.running), "1", now_ns),
-            Reading(f"{self.name}.homed", float(bool(status.flags & _HOMED)), "1", now_ns),
+            Reading(f"{self.name}.homed", float(status.homed), "1", now_ns),
         )
 
     async def homed(self) -> bool:
         """Whether the position scale is calibrated."""
-        return bool((await self._lane.call(self._status)).flags & _HOMED)
+        return (await self._call(self._status)).homed
 
     async def home(self) -> float:
         """Run the controller's homing procedure and make its end the zero of the scale.
 
         Returns the residual: where the scale had this point before, mm or deg (after a power cycle without meaning).
-        DeviceFault when the procedure does not end homed.
+        DeviceFault in an alarm, or when the procedure does not end homed.
         """
-        await self._lane.call(self._start, "home", b"")
+        await self._call(self._check_identity)  # a power cycle may have brought other settings
+        self._refuse_alarm(await self._call(self._status))
+        await self._call(self._send, "home", b"", _homing)
         status = await self._wait(_HOME_LIMIT_S)
-        if not status.flags & _HOMED:
+        if not (status.homed and status.answers(_COMMAND_HOME)):
             raise DeviceFault(self.name, "the homing procedure ended without a home position")
-        await self._lane.call(self._zero)
-        return status.steps * self._profile.unit_per_step
+        await self._call(self._zero)
+        return self._units(status.position)
 
     async def move_to(self, position: float) -> None:
-        """Move to `position` (mm or deg) from below. Refused outside the limits or when not homed; DeviceFault when
-        the move fails."""
+        """Move to `position` (mm or deg), the last stretch upwards, from where the play has been taken up.
+
+        Refused outside the limits or when not homed; DeviceFault in an alarm or when the move fails.
+        """
         low, high = self._settings.limits
         unit = self._profile.unit
         if not low <= position <= high:
             raise Refused(self.name, f"{position} {unit} is outside the limits {low}..{high} {unit}")
-        status = await self._lane.call(self._status)
-        if not status.flags & _HOMED:
+        stops = self._stops
+        status = await self._call(self._status)
+        self._refuse_alarm(status)
+        if not status.homed:
             raise Refused(self.name, "not homed; its positions mean nothing until it is")
-        target_steps = position / self._profile.unit_per_step
-        if status.steps >= target_steps:
-            below = max(low, position - self._profile.overshoot)
-            await self._approach(status.steps, below / self._profile.unit_per_step)
-        await self._approach(status.steps, target_steps)
+        target, below = self._microsteps(position), self._microsteps(position - self._profile.overshoot)
+        for stop in (below, target) if status.position > below else (target,):
+            if stops != self._stops:
+                raise DeviceFault(self.name, f"stopped on the way to {position} {unit}")
+            status = await self._approach(status.position, stop)
 
     async def make_safe(self) -> None:
-        """Soft stop, confirmed; a hard stop when that does not help within 2 s."""
-        await self._lane.call(self._start, "sstp", b"")
-        deadline_ns = self._clock.now_ns() + seconds_ns(2.0)
-        while (await self._lane.call(self._status)).running:
-            if self._clock.now_ns() >= deadline_ns:
-                await self._lane.call(self._start, "stop", b"")
+        """Soft stop, confirmed; a hard stop when that does not help within 2 s, DeviceFault when nothing does."""
+        self._stops += 1
+        for letters in ("sstp", "stop"):
+            with contextlib.suppress(DeviceError):  # what counts is whether it stands still
+                await self._call(self._send, letters, b"", _at_rest)
+            if await self._at_rest_within(_STOP_LIMIT_S):
                 return
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+        raise DeviceFault(self.name, "still moving after a soft and a hard stop")
 
-    async def _approach(self, from_steps: float, target_steps: float) -> None:
-        whole, micro = divmod(round(target_steps * _MICROSTEPS), _MICROSTEPS)
-        await self._lane.call(self._start, "move", _TARGET.pack(whole, micro))
-        distance = abs(target_steps - from_steps) + self._profile.overshoot / self._profile.unit_per_step
-        status = await self._wait(distance / self._speed_steps_s * 1.5 + 2.0)
-        reached = whole + micro / _MICROSTEPS
-        if status.command & _FAILED or abs(status.steps - reached) > 1.0:
+    async def _at_rest_within(self, limit_s: float) -> bool:
+        deadline_ns = self._clock.now_ns() + seconds_ns(limit_s)
+        while (await self._call(self._status)).running:
+            if self._clock.now_ns() >= deadline_ns:
+                return False
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+        return True
+
+    async def _approach(self, start: int, target: int) -> _Status:
+        """One straight move between positions in microsteps; DeviceFault when it ends elsewhere."""
+
+        def carried_out(status: _Status) -> bool:
+            return status.position == target or (status.running and status.answers(_COMMAND_MOVE))
+
+        await self._call(self._send, "move", _TARGET.pack(*divmod(target, _MICROSTEPS)), carried_out)
+        status = await self._wait(abs(target - start) / _MICROSTEPS / self._speed_steps_s * 1.5 + 2.0)
+        if status.command & _FAILED or abs(status.position - target) > _ARRIVED_MICROSTEPS:
             edge = " at a limit switch" if status.gpio & _EDGES else ""
-            raise DeviceFault(self.name, f"stopped{edge} at step {status.steps:.2f} instead of {reached:.2f}")
+            stopped, wanted = status.position / _MICROSTEPS, target / _MICROSTEPS
+            raise DeviceFault(self.name, f"stopped{edge} at step {stopped:.2f} instead of {wanted:.2f}")
+        return status
 
     async def _wait(self, limit_s: float) -> _Status:
-        """Poll until the controller has finished; after `limit_s` of stand time stop softly, and say so."""
+        """Poll until the controller has finished; stop it in an alarm or after `limit_s` of stand time, and say so."""
         deadline_ns = self._clock.now_ns() + seconds_ns(limit_s)
         while True:
-            status = await self._lane.call(self._status)
-            if status.flags & _DANGER:
-                raise DeviceFault(self.name, f"controller alarm, flags 0x{status.flags & _DANGER:08X}")
+            status = await self._call(self._status)
+            if status.alarm or (status.running and self._clock.now_ns() >= deadline_ns):
+                if status.running:  # not every alarm stops the motor by itself, and a STOP at rest would clear it
+                    await self.make_safe()
+                raise DeviceFault(self.name, status.alarm or f"still moving after {limit_s:.0f} s; stopped")
             if not status.running:
                 return status
-            if self._clock.now_ns() >= deadline_ns:
-                await self.make_safe()
-                raise DeviceFault(self.name, f"still moving after {limit_s:.0f} s; stopped")
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+
+    def _refuse_alarm(self, status: _Status) -> None:
+        """STOP would clear an alarm, but only an operator may decide that."""
+        if status.alarm:
+            raise DeviceFault(self.name, f"{status.alarm}; it must be looked into before anything moves")
+
+    def _units(self, position: int) -> float:
+        return position / _MICROSTEPS * self._profile.unit_per_step
+
+    def _microsteps(self, position: float) -> int:
+        return round(position / self._profile.unit_per_step * _MICROSTEPS)
+
+    async def _call(self, function: Callable[..., Result], *args: object) -> Result:
+        if self._lane is None:
+            raise Unreachable(self.name, "not open")
+        return await self._lane.call(function, *args)
 
     # Below: in the lane's thread.
 
     def _check_identity(self) -> None:
+        """Leave the link open only when it leads to our controller with our settings."""
+        try:
+            self._compare_settings()
+        except DeviceError:
+            self._client.close()
+            raise
+
+    def _compare_settings(self) -> None:
         (serial_number,) = _SERIAL.unpack(self._client.query("gser", _SERIAL.size))
         if serial_number != self._settings.serial_number:
-            self._client.close()
             raise Refused(
                 self.name,
                 f"controller {serial_number} answers at {self._settings.address}, "
@@ -200,32 +279,45 @@ class Axis:
         if mode != _MICROSTEP_MODE_256:
             raise Refused(self.name, f"microstep mode {mode}, expected {_MICROSTEP_MODE_256} (1/256)")
         self._speed_steps_s = float(max(1, _MOVE.unpack(self._client.query("gmov", _MOVE.size))[0]))
-        self._checked = True
+
+    def _identified(self) -> XimcClient:
+        """The client, on a link whose other end has been checked."""
+        if not self._client.connected:
+            self._check_identity()
+        return self._client
 
     def _status(self) -> _Status:
-        if not self._checked:
-            self._check_identity()
+        values = _STATUS.unpack(self._identified().query("gets", _STATUS.size))
+        return _Status(values[1], values[2], values[5] * _MICROSTEPS + values[6], values[15], values[16])
+
+    def _send(self, letters: str, payload: bytes, carried_out: Callable[[_Status], bool]) -> None:
+        """Send a command. When its acknowledgement is lost the controller's state tells whether it was carried out;
+        only if it was not is it sent a second and last time."""
         try:
-            values = _STATUS.unpack(self._client.query("gets", _STATUS.size))
-        except Unreachable:
-            self._checked = False  # whoever answers next must prove to be the same controller
-            raise
-        return _Status(command=values[1], steps=values[5] + values[6] / _MICROSTEPS, flags=values[15], gpio=values[16])
+            self._identified().command(letters, payload)
+        except (Unreachable, GarbledReply):
+            if not carried_out(self._status()):
+                self._identified().command(letters, payload)
 
     def _zero(self) -> None:
-        """HOME leaves the step counter alone (libximc, command_homezero): zero it, and see that it is."""
-        with contextlib.suppress(Unreachable, GarbledReply):
-            self._client.command("zero")
-        if (steps := self._status().steps) != 0:
-            raise DeviceFault(self.name, f"the step counter could not be set to zero, it is {steps:.2f}")
+        """HOME leaves the step counter alone (libximc, command_homezero): zero it, and look whether that came."""
+        self._send("zero", b"", _at_zero)
+        if (position := self._status().position) != 0:
+            raise DeviceFault(
+                self.name, f"the step counter could not be set to zero, it is {position / _MICROSTEPS:.2f}"
+            )
 
-    def _start(self, letters: str, payload: bytes) -> None:
-        """Send a command once; when its acknowledgement is lost, the controller's state tells whether it came."""
-        if not self._checked:
-            self._check_identity()
-        commands = {"move": 0x01, "stop": 0x05, "home": 0x06, "sstp": 0x08}
-        try:
-            self._client.command(letters, payload)
-        except (Unreachable, GarbledReply):
-            if self._status().command & 0x3F != commands[letters]:
-                raise
+
+# What shows that a command whose acknowledgement was lost has been carried out:
+
+
+def _homing(status: _Status) -> bool:
+    return status.running and status.answers(_COMMAND_HOME)
+
+
+def _at_zero(status: _Status) -> bool:
+    return status.position == 0
+
+
+def _at_rest(status: _Status) -> bool:
+    return not status.running
