@@ -1,0 +1,48 @@
+"""`make bench`: every benchmark, one table. `python -m tests.bench modbus camera` runs the named ones only."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+
+from tests.bench import camera, markers, modbus, recorder, simulator, virtual_time, ximc
+from tests.bench.figures import Figure, progress, table
+
+BENCHMARKS = {
+    "virtual_time": virtual_time.figures,
+    "modbus": modbus.figures,
+    "ximc": ximc.figures,
+    "camera": camera.figures,
+    "recorder": recorder.figures,
+    "markers": markers.figures,
+    "simulator": simulator.figures,
+}
+
+
+def main() -> None:
+    """Run the benchmarks and print what there is, also when one fails or is interrupted."""
+    unknown = [name for name in sys.argv[1:] if name not in BENCHMARKS]
+    if unknown:
+        sys.exit(f"no benchmark {', '.join(unknown)}; there are {', '.join(BENCHMARKS)}")
+    found: list[Figure] = []
+    begin_s = time.monotonic()
+    try:
+        with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+            for name in sys.argv[1:] or BENCHMARKS:
+                progress(f"[{time.monotonic() - begin_s:4.0f} s] {name}")
+                found += BENCHMARKS[name](Path(folder))
+    finally:
+        sys.stdout.write(f"\n{_machine()}, {time.monotonic() - begin_s:.0f} s\n\n{table(found)}")
+
+
+def _machine() -> str:
+    return f"Python {platform.python_version()}, OpenCV {cv2.__version__}, {platform.system()} {platform.machine()}"
+
+
+if __name__ == "__main__":
+    main()

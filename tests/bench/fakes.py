@@ -1,0 +1,89 @@
+"""Fake devices in a process of their own, so that neither side of a benchmark waits for the other's interpreter.
+
+`python -m tests.bench.fakes NAME ARGUMENTS` builds them, prints one line when they answer, and ends with its standard
+input.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.clock import WallClock
+from drivers.sim.camera import FakeCamera, HEIGHT_px, WIDTH_px
+from drivers.sim.faults import LinkFaults
+from drivers.sim.modbus import RtuEngine, TcpEngine
+from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.regulator import FakeRegulator
+from drivers.sim.wire import PtyWire, TcpWire
+from drivers.sim.ximc import FakeAxis
+from drivers.sim.ximc_table import LINEAR_8MT160_300
+
+Close = Callable[[], None]
+
+
+@contextmanager
+def fakes(name: str, *arguments: object) -> Generator[str]:
+    """The fakes `name`, running; yields the line they printed."""
+    command = [sys.executable, "-m", "tests.bench.fakes", name, *map(str, arguments)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        if process.stdin is None or process.stdout is None:
+            raise ValueError("the fakes were started without their pipes")
+        try:
+            line = process.stdout.readline().strip()
+            if not line:
+                raise ValueError(f"the fakes {name} did not start")
+            yield line
+        finally:
+            process.stdin.close()
+
+
+def modbus(ours: str, other: str) -> tuple[str, list[Close]]:
+    """One regulator, unit 1, behind a TCP port and at the ends of two serial wires; prints the port."""
+    clock = WallClock()
+    units = (FakeRegulator(Plant(PlantSpec(), clock.now_ns()), clock, 1),)
+    tcp = TcpWire("127.0.0.1", 0, lambda: TcpEngine(units), LinkFaults())
+    ptys = [PtyWire(Path(path), RtuEngine(units), LinkFaults()) for path in (ours, other)]
+    return str(tcp.port), [tcp.close, *(pty.close for pty in ptys)]
+
+
+def ximc(ours: str, other: str) -> tuple[str, list[Close]]:
+    """One linear stage at the ends of two serial wires."""
+    clock = WallClock()
+    axis = FakeAxis(Plant(PlantSpec(), clock.now_ns()), clock, LINEAR_8MT160_300, 0x1234, "linear")
+    return "ready", [PtyWire(Path(path), axis.engine(), LinkFaults()).close for path in (ours, other)]
+
+
+def camera(address: str, serial_number: str, pace_MBps: str) -> tuple[str, list[Close]]:
+    """A camera whose image costs nothing and leaves at once when it is triggered, as in virtual time."""
+    clock = WallClock()
+    image = np.random.default_rng(1).integers(0, 256, (HEIGHT_px, WIDTH_px), dtype=np.uint8)
+
+    def render(time_ns: int, exposure_s: float, gain_dB: float) -> NDArray[np.uint8]:
+        return image
+
+    plant = Plant(PlantSpec(camera_powered=True), clock.now_ns())
+    fake = FakeCamera(plant, clock, render, address, serial_number, pace_MBps=float(pace_MBps))
+    fake.start()
+    return "ready", [fake.close]
+
+
+def main() -> None:
+    """Build, tell, wait, close."""
+    build = {"modbus": modbus, "ximc": ximc, "camera": camera}[sys.argv[1]]
+    line, closers = build(*sys.argv[2:])
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+    sys.stdin.read()
+    for close in closers:
+        close()
+
+
+if __name__ == "__main__":
+    main()

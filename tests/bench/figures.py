@@ -1,0 +1,119 @@
+"""A figure, the peer or limit it is held against, and how the two are measured side by side.
+
+The machine may be busy, so no figure is a pass or a fail on seconds: ours and the peer take turns (A B, B A, A B ...),
+and what counts is the median of the ratios of neighbours, with the quartiles that show how steady it was.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+Measurement = Callable[[], float]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One line of the table: `value` in `unit`, the same of `peer`, and value over peer value (quartiles).
+
+    Without a peer it is an absolute figure of this machine, for information only; a skipped one has no value either.
+    """
+
+    what: str
+    unit: str
+    value: float = math.nan
+    peer: str = ""
+    peer_value: float = math.nan
+    ratios: tuple[float, float, float] | None = None
+
+
+def absolute(what: str, unit: str, values: Sequence[float]) -> Figure:
+    """The median of `values`, with nothing to hold it against."""
+    return Figure(what, unit, statistics.median(values), "absolute, this machine now")
+
+
+def skipped(what: str, reason: object) -> Figure:
+    """A line for what could not be measured here."""
+    return Figure(what, "", peer=f"skipped: {' '.join(str(reason).split())[:60]}")
+
+
+def side_by_side(what: str, unit: str, peer: str, ours: Sequence[float], others: Sequence[float]) -> Figure:
+    """Medians, and quartiles of the ratios, of measurements made in pairs."""
+    ratios = [own / other for own, other in zip(ours, others, strict=True)]
+    low, middle, high = statistics.quantiles(ratios, n=4, method="inclusive") if len(ratios) > 1 else ratios * 3
+    return Figure(what, unit, statistics.median(ours), peer, statistics.median(others), (low, middle, high))
+
+
+def in_turns(ours: Measurement, other: Measurement, rounds: int) -> tuple[list[float], list[float]]:
+    """`rounds` measurements of each, after one of each that does not count; the order changes every round."""
+    ours()
+    other()
+    own_values: list[float] = []
+    other_values: list[float] = []
+    for number in range(rounds):
+        if number % 2:
+            other_values.append(other())
+            own_values.append(ours())
+        else:
+            own_values.append(ours())
+            other_values.append(other())
+    return own_values, other_values
+
+
+def per_second(work: Callable[[], object], count: int) -> float:
+    """How often a second `work` is done, over `count` times."""
+    begin_s = time.perf_counter()
+    for _ in range(count):
+        work()
+    return count / (time.perf_counter() - begin_s)
+
+
+def milliseconds(work: Callable[[], object]) -> float:
+    """How long `work` takes once, ms."""
+    return 1e3 / per_second(work, 1)
+
+
+def progress(text: str) -> None:
+    """A line on stderr, so that somebody who waits knows for what."""
+    sys.stderr.write(f"  {text}\n")
+    sys.stderr.flush()
+
+
+def table(figures: Sequence[Figure]) -> str:
+    """All figures, aligned; ratio is ours over the peer's, with the quartiles behind it."""
+    rows = [("measured", "ours", "peer's", "unit", "ratio", "quartiles", "peer or limit"), *map(_row, figures)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    aligned = (str.ljust, str.rjust, str.rjust, str.ljust, str.rjust, str.rjust, str.ljust)
+    lines = [
+        "  ".join(align(cell, width) for align, cell, width in zip(aligned, row, widths, strict=True)) for row in rows
+    ]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _row(figure: Figure) -> tuple[str, ...]:
+    if figure.ratios is None:
+        return (figure.what, _number(figure.value), "", figure.unit, "", "", figure.peer)
+    low, middle, high = figure.ratios
+    quartiles = f"{low:.2g}..{high:.2g}"
+    return (
+        figure.what,
+        _number(figure.value),
+        _number(figure.peer_value),
+        figure.unit,
+        f"{middle:.3g}",
+        quartiles,
+        figure.peer,
+    )
+
+
+def _number(value: float) -> str:
+    """Three significant digits, no exponent."""
+    if math.isnan(value):
+        return ""
+    digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+    return f"{value:.{digits}f}"

@@ -1,0 +1,125 @@
+"""How much faster than real a whole stand runs in virtual time, every device polled, beside time that only moves.
+
+Ours: a recipe of two soaks through `run_virtual` (daemon here, simulator in its own process, Modbus TCP, XIMC on
+pseudo-terminals, USB, GigE); only the soaks are timed, so start-up and the recipe's two frames are not in it. Limit:
+the same simulator, moved through its control socket by the same steps with nobody polling.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import shutil
+import socket
+import time
+from pathlib import Path
+
+import yaml
+
+from drivers.aravis_library import library
+from drivers.clock import NS_PER_S, seconds_ns
+from drivers.interface import StandError
+from stand.config import load_config, packaged
+from stand.hub import Hub, Item, StepMark, StepState
+from stand.recipe import load_recipe
+from stand.run import Order, run_virtual
+from stand.simulator import ControlSocket, Simulator, laboratory_of
+from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
+
+ROUNDS = 5
+SOAK_s = 1800.0
+STEP_s = 5.0  # the shortest poll period of configs/simulated.yaml: every device and the guard act on its multiples
+RECIPE = f"""
+name: bench
+experiments:
+  - thermal_cycle: {{equilibrium_s: {SOAK_s}, set_points_degC: [30], dwell_s: {SOAK_s}, reference_frames: 1}}
+"""
+CAMERA_ADDRESS = "127.0.0.92"
+
+
+def figures(directory: Path) -> list[Figure]:
+    """Simulated seconds per second, and bare control-socket round trips per second."""
+    what = "virtual time, whole stand polled"
+    try:
+        library()
+    except StandError as error:
+        return [skipped(what, error)]
+    order = _order(directory)
+    sessions = (directory / f"run-{number}" for number in itertools.count())
+    trips_per_s: list[float] = []
+
+    def run() -> float:
+        progress(f"{what}: a run of two soaks of {SOAK_s:g} s")
+        return _soaked_per_second(order, next(sessions))
+
+    def limit() -> float:
+        trips_per_s.append(asyncio.run(_round_trips_per_second(order)))
+        return trips_per_s[-1] * STEP_s
+
+    ours, bare = in_turns(run, limit, ROUNDS)
+    return [
+        side_by_side(what, "sim s/s", f"bare control-socket advances of {STEP_s:g} s", ours, bare),
+        absolute(f"bare control-socket advance of {STEP_s:g} s", "round trips/s", trips_per_s[1:]),
+    ]
+
+
+def _soaked_per_second(order: Order, out: Path) -> float:
+    """Simulated over real duration of the soaks of one run."""
+    begun_s: dict[str, float] = {}
+    soaks: list[tuple[float, float]] = []
+
+    def follow(item: Item) -> None:
+        if isinstance(item, StepMark) and item.kind == "Soak":
+            if item.state is StepState.STARTED:
+                begun_s[item.step_id] = time.perf_counter()
+            elif item.state is StepState.DONE:
+                soaks.append((SOAK_s, time.perf_counter() - begun_s[item.step_id]))
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(follow)
+
+    asyncio.run(run_virtual(order, out, None, watch))
+    shutil.rmtree(out)
+    simulated_s, real_s = map(sum, zip(*soaks, strict=True))
+    return simulated_s / real_s
+
+
+async def _round_trips_per_second(order: Order) -> float:
+    """`advance` by steps over as much simulated time as one run soaks."""
+    simulation = order.config.simulation
+    if simulation is None:
+        raise ValueError("the bench's configuration has lost its simulation section")
+    simulator = Simulator(laboratory_of(order.config, virtual=True, seed=None))
+    control = ControlSocket(simulation.control)
+    try:
+        await control.open()
+        now_ns = round(simulation.start.timestamp()) * NS_PER_S
+        steps = round(2 * SOAK_s / STEP_s)
+        begin_s = time.perf_counter()
+        for number in range(1, steps + 1):
+            await control.advance(now_ns + number * seconds_ns(STEP_s))
+        return steps / (time.perf_counter() - begin_s)
+    finally:
+        await control.close()
+        simulator.stop()
+
+
+def _order(directory: Path) -> Order:
+    """The recipe on the installed simulated stand, at addresses of its own."""
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["bus"]["address"] = f"tcp:127.0.0.1:{_free_port()}"
+    for name, axis in data["axes"].items():
+        axis["address"] = f"serial:{directory / name}"
+    data["flap"]["backend_address"] = f"tcp:127.0.0.1:{_free_port()}"
+    data["camera"]["address"] = CAMERA_ADDRESS
+    data["simulation"]["control"] = f"tcp:127.0.0.1:{_free_port()}"
+    config_file, recipe_file = directory / "config.yaml", directory / "recipe.yaml"
+    config_file.write_text(yaml.safe_dump(data))
+    recipe_file.write_text(RECIPE)
+    target = packaged("targets", "paper-9x6").read_text()
+    return Order(load_config(config_file), load_recipe(recipe_file), config_file.read_text(), RECIPE, target)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
