@@ -14,7 +14,7 @@ import typer
 
 from compensation.detections import DetectedImage, write_detections
 from compensation.drift import MAX_DEGREE, CompensationModel
-from compensation.edge_fit import EdgeState
+from compensation.edge_model import EdgeState
 from compensation.files import check_writable
 from compensation.fitting import fit as fit_model
 from compensation.markers import Detection, DetectionError, Flag, Image, detect, read_image

@@ -52,8 +52,8 @@ class CompensationModel:
     px^2, rows I and J, terms in the order of polynomial.exponents. discrepancy_px (2,): what the form leaves
     unexplained at temperatures not fitted, one standard deviation, marker noise taken off. hull_px (H, 2): convex hull
     of the training markers. reference_degC: the camera's temperature at the reference, reference_chamber_degC the
-    set-point. reference_centres_px (N, 2): of the first session that has reference frames, NaN for a marker never seen. scores: of every degree
-    tried.
+    set-point. reference_centres_px (N, 2): of the first session with reference frames, NaN for a marker never seen.
+    scores: of every degree tried.
     """
 
     degree: int

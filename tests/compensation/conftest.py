@@ -29,6 +29,8 @@ SEQUENCE = (
 )
 DARK = 9
 """This frame (a fit at 31 degC) shows nothing."""
+GLARE = (11, 20)
+"""In this frame a reflection lies on the edge of this marker (from 0)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,11 @@ def scene_at(index: int) -> Scene:
 
 
 def photo(index: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    return photograph(scene_at(index), render(scene_at(index)), index)
+    clean = render(scene_at(index))
+    if index == GLARE[0]:
+        x, y = true_centres_px(scene_at(index))[GLARE[1]].round().astype(int)
+        clean[y - 3 : y + 3, x + 6 : x + 10] = 180
+    return photograph(scene_at(index), clean, index)
 
 
 def published(index: int, time_ns: int) -> Iterator[Item]:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from compensation.displacements import displacements
-from compensation.drift import CompensationModel
-from compensation.fitting import convex_hull, fit
+from compensation.drift import CompensationModel, DegreeScore
+from compensation.files import write_whole
+from compensation.fitting import choose, convex_hull, fit
 from compensation.observations import Observations, Role, concatenate
 from compensation.polynomial import condense, design, solve
 from drivers.interface import SessionError
@@ -70,6 +71,21 @@ def test_what_is_left_at_held_out_temperatures_is_the_noise(noisy: Observations,
 def test_the_chosen_degree_is_the_simplest_that_explains_the_drift(degree: int, seed: int):
     drift, _ = polynomial_drift(degree, seed)
     assert fit(observations(drift, NOISE_PX, seed)).degree == degree
+
+
+def score(degree: int, *fold_rms_px: float) -> DegreeScore:
+    folds = tuple((rms_px, 0.0) for rms_px in fold_rms_px)
+    chamber_degC = tuple(float(number) for number in range(len(folds)))
+    return DegreeScore(
+        degree=degree, terms=1, condition=1.0, rms_px=(0, 0), fold_chamber_degC=chamber_degC, fold_rms_px=folds
+    )
+
+
+def test_one_standard_error_of_the_difference_decides():
+    best = score(3, 0.10, 0.20, 0.10, 0.30)
+    assert choose((score(1, 0.20, 0.30, 0.20, 0.40), score(2, 0.09, 0.23, 0.10, 0.30), best)) == 2
+    assert choose((score(1, 0.20, 0.30, 0.20, 0.40), score(2, 0.11, 0.21, 0.11, 0.31), best)) == 3
+    assert choose((best, score(4, 0.10, 0.20, 0.10, 0.31))) == 3
 
 
 def test_only_reference_and_fit_frames_are_fitted(noisy: Observations, model: CompensationModel, tmp_path: Path):
@@ -191,6 +207,13 @@ def test_a_model_that_cannot_be_written_leaves_nothing(model: CompensationModel,
     with pytest.raises(SessionError, match="cannot be written"):
         model.save(tmp_path / "folder")
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_a_file_that_cannot_be_finished_leaves_the_older_one(tmp_path: Path):
+    (tmp_path / "model.json").write_text("older")
+    with pytest.raises(UnicodeEncodeError):
+        write_whole(tmp_path / "model.json", "begun, then \ud800")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("model.json", "older")]
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from compensation.displacements import displacements, reference_centres
+from compensation.markers import Flag
 from compensation.observations import Observations, Role, concatenate, observe, session_target
 from drivers.interface import ConfigError, SessionError
 from stand.session import Session
 
-from .conftest import DARK, SEQUENCE, Recorded, record
+from .conftest import DARK, GLARE, SEQUENCE, Recorded, record
 from .synthetic import facts, observations, quadratic
 
 
@@ -36,7 +37,7 @@ def test_every_frame_has_its_role_and_temperatures(observed: Observations):
 
 def test_centres_are_where_they_truly_are(observed: Observations, recorded: Recorded):
     error = observed.centres_px - recorded.true_px
-    assert np.isfinite(error[observed.usable]).all()
+    assert np.argwhere(np.isnan(error[:, :, 0]) & observed.usable[:, None]).tolist() == [list(GLARE)]
     assert 1e3 * np.sqrt(np.nanmean(error**2)) < 8  # mpx; discs of 10 px in radius
     claimed = np.sqrt(np.nanmean(np.diagonal(observed.covariance_px2, axis1=2, axis2=3)))
     assert np.sqrt(np.nanmean(error**2)) == pytest.approx(claimed, rel=0.2)
@@ -49,6 +50,13 @@ def test_a_frame_without_the_target_stays_with_its_reason(observed: Observations
     assert "small" in observed.reasons[DARK]
     assert not observed.of(Role.FIT)[DARK]
     assert observed.of(Role.REFERENCE, Role.FIT).sum() == 10
+
+
+def test_a_flagged_centre_is_not_used(observed: Observations):
+    assert np.argwhere(observed.flags).tolist() == [list(GLARE)]
+    assert observed.flags[GLARE] == Flag.POOR_FIT  # it has a centre, but not one to be trusted
+    assert np.isnan(observed.centres_px[GLARE]).all()
+    assert np.isnan(observed.covariance_px2[GLARE]).all()
 
 
 def test_air_is_interpolated_between_readings_and_unknown_after_the_last(observed: Observations):
