@@ -14,7 +14,6 @@ h1 { font-size: 1.6rem; line-height: 1.2; margin-bottom: .2rem }
 h2 { font-size: 1.15rem; margin-top: 2.2rem }
 p.aside { color: #555; margin-top: 0 }
 table { border-collapse: collapse; margin: .6rem 0 }
-caption { text-align: left; color: #555; padding-bottom: .3rem }
 th, td { padding: .2rem .9rem .2rem 0; text-align: right; font-variant-numeric: tabular-nums }
 th:first-child, td:first-child { text-align: left }
 thead th { border-bottom: 1px solid #999 }
@@ -22,7 +21,7 @@ table.facts td { text-align: left; vertical-align: top }
 table.facts td:first-child { white-space: nowrap; color: #555 }
 tr.chosen td { font-weight: 600 }
 figure { margin: 1.2rem 0 }
-figure svg { max-width: 100%; height: auto; display: block }
+figure svg { width: 100%; height: auto; display: block }
 figcaption { color: #555; font-size: .92rem }
 """
 
@@ -47,12 +46,11 @@ def paragraph(text: str, *, aside: bool = False) -> str:
     return f"<p{' class=aside' if aside else ''}>{escape(text)}</p>"
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", chosen: int | None = None) -> str:
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], chosen: int | None = None) -> str:
     """A table of numbers, texts already formatted; row `chosen` is bold."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "\n".join(_row(row, index == chosen) for index, row in enumerate(rows))
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return f"<table>{title}<thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
+    return f"<table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
 
 
 def _row(cells: Sequence[str], chosen: bool) -> str:

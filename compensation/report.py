@@ -25,6 +25,7 @@ from compensation.validation import (
 )
 
 _LISTED_FRAMES = 20
+_LEAST_COVERAGE = 0.9
 _LIBRARIES = ("thermostand", "numpy", "opencv-python-headless", "matplotlib")
 _CYCLE = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 
@@ -95,6 +96,11 @@ def _result(evaluation: Evaluation) -> str:
         f"place at the reference temperature. Of the deviations after compensation, {100 * i:.0f} % (I) and "
         f"{100 * j:.0f} % (J) lie in the 95 % interval that the model claims."
     )
+    if min(evaluation.coverage_95) < _LEAST_COVERAGE:
+        note += (
+            " That is too few: at the held-out temperatures the camera did something that the fitted frames do not show. "
+            "Most often its drift depends on the way there (thermal lag, hysteresis), not on its temperature alone."
+        )
     if evaluation.outside.any():
         note += f" {evaluation.outside.mean():.1%} of the centres are outside the model's valid range."
     paper = (
@@ -182,14 +188,13 @@ def _model(model: CompensationModel) -> str:
         (f"{score.degree}", f"{score.terms}", f"{score.condition:.0f}", *(f"{value:.4f}" for value in score.rms_px))
         for score in model.scores
     ]
-    choice = table(
-        ("degree", "terms", "condition", "RMS I, px", "RMS J, px"),
-        rows,
-        "Leave-temperatures-out: each chamber set-point with all its visits predicted from the others. "
-        "In use is the simplest degree within one standard error of the best, or the one asked for.",
-        chosen=model.degree - 1,
+    choice = paragraph(
+        "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is the "
+        "simplest degree within one standard error of the best, or the one asked for.",
+        aside=True,
     )
-    return facts(lines) + "\n" + choice
+    heads = ("degree", "terms", "condition", "RMS I, px", "RMS J, px")
+    return "\n".join([facts(lines), choice, table(heads, rows, chosen=model.degree - 1)])
 
 
 def _data(observations: Observations) -> str:

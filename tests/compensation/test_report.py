@@ -92,6 +92,12 @@ def test_it_says_what_was_found_and_what_was_left_out(page: str, analysed: Analy
     assert [degree for chosen, degree, _ in rows if chosen] == [str(analysed[1].degree)]
 
 
+def test_an_interval_that_claims_too_much_is_told(analysed: Analysed, page: str):
+    night, model, evaluation = analysed
+    assert "thermal lag, hysteresis" not in page
+    assert "thermal lag, hysteresis" in report_page(night, model, replace(evaluation, coverage_95=(0.96, 0.34)))
+
+
 def test_a_simulated_session_is_called_so(analysed: Analysed):
     night, model, evaluation = analysed
     virtual = replace(night, sessions=(replace(night.sessions[0], clock_source="virtual"),))
