@@ -98,8 +98,8 @@ def _result(evaluation: Evaluation) -> str:
     )
     if min(evaluation.coverage_95) < _LEAST_COVERAGE:
         note += (
-            " That is too few: at the held-out temperatures the camera did something that the fitted frames do not show. "
-            "Most often its drift depends on the way there (thermal lag, hysteresis), not on its temperature alone."
+            " That is too few: at the held-out temperatures the camera did something that the fitted frames do not "
+            "show. Most often its drift depends on the way there (thermal lag, hysteresis), not on its temperature alone."
         )
     if evaluation.outside.any():
         note += f" {evaluation.outside.mean():.1%} of the centres are outside the model's valid range."
@@ -189,8 +189,8 @@ def _model(model: CompensationModel) -> str:
         for score in model.scores
     ]
     choice = paragraph(
-        "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is the "
-        "simplest degree within one standard error of the best, or the one asked for.",
+        "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is "
+        "the simplest degree within one standard error of the best, or the one asked for.",
         aside=True,
     )
     heads = ("degree", "terms", "condition", "RMS I, px", "RMS J, px")
