@@ -99,7 +99,8 @@ def _result(evaluation: Evaluation) -> str:
     if min(evaluation.coverage_95) < _LEAST_COVERAGE:
         note += (
             " That is too few: at the held-out temperatures the camera did something that the fitted frames do not "
-            "show. Most often its drift depends on the way there (thermal lag, hysteresis), not on its temperature alone."
+            "show. Most often its drift depends on the way there (thermal lag, hysteresis) and not on its temperature "
+            "alone."
         )
     if evaluation.outside.any():
         note += f" {evaluation.outside.mean():.1%} of the centres are outside the model's valid range."
