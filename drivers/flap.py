@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol, cast
 
@@ -13,16 +13,28 @@ import usb.core
 import usb.util
 
 from drivers.clock import Clock, seconds_ns
-from drivers.interface import DeviceError, DeviceFault, GarbledReply, Reading, Refused, Unreachable, bad_reading
-from drivers.lane import Lane
+from drivers.interface import (
+    DeviceError,
+    DeviceFault,
+    GarbledReply,
+    Quality,
+    Reading,
+    Refused,
+    Unreachable,
+    bad_reading,
+)
+from drivers.lane import Lane, Result
 
 _VENDOR_POLOLU = 0x1FFB
 _PRODUCTS_JRK_G2 = {0x00B7, 0x00B9, 0x00BF, 0x00C1, 0x00C5}
 _TO_DEVICE, _TO_HOST = 0x40, 0xC0
-_SET_TARGET, _STOP_MOTOR, _GET_VARIABLES, _GET_SETTINGS = 0x84, 0x87, 0xE5, 0xE3
+_SET_TARGET, _STOP_MOTOR, _GET_VARIABLES, _GET_RAM_SETTINGS = 0x84, 0x87, 0xE5, 0xEA
+_CLEAR_HALTING = 1  # value of _GET_VARIABLES: clear the errors whose cause is gone
 _TIMEOUT_MS = 1600  # the device may need 1,500 ms after restoring its defaults
 _VARIABLES_SIZE = 0x35
 _INPUT_MODE_OFFSET, _INPUT_MODE_SERIAL = 0x03, 0
+_MAX_DUTY_OFFSET, _MAX_DUTY = 0x68, struct.Struct("<HH")  # forward, reverse
+_ENGLISH = 0x0409  # the language of its string descriptors
 
 _AWAITING_COMMAND = 0x0001
 _FEEDBACK_DISCONNECT = 0x0020
@@ -34,8 +46,7 @@ _ERROR_NAMES = (
 
 _POLL_S = 0.05
 _CONFIRMATIONS = 3
-_FULL_DUTY = 600
-_JAM_DUTY = 0.9 * _FULL_DUTY
+_JAM_DUTY = 0.9  # of the configured maximum
 _JAM_S = 0.5
 _JAM_COUNTS = 8
 
@@ -65,7 +76,7 @@ class _UsbDevice(Protocol):
     """What of a pyusb device is used here; pyusb makes these attributes at run time."""
 
     idProduct: int
-    serial_number: str | None
+    iSerialNumber: int
 
     def ctrl_transfer(
         self, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data_or_wLength: int | None, timeout: int
@@ -73,42 +84,59 @@ class _UsbDevice(Protocol):
 
 
 class Flap:
-    """The flap. `backend` is a pyusb backend, None for libusb; the position is unknown until it was read."""
+    """The flap. `backend` is a pyusb backend, None for libusb; the position is unknown until it was read.
+
+    After any USB error the controller is found again, by its serial number, at the next call.
+    """
 
     def __init__(self, name: str, settings: FlapSettings, clock: Clock, backend: usb.backend.IBackend | None) -> None:
         self.name = name
         self._settings = settings
         self._clock = clock
         self._backend = backend
-        self._lane = Lane(name, clock)
+        self._lane: Lane | None = None
         self._device: _UsbDevice | None = None
+        self._max_duty = (0, 0)
+        self._commanded = False  # a target was sent and the motor not stopped since
 
     async def open(self) -> None:
         """Find the controller by its serial number and check its input mode; leaves the flap where it is."""
-        await self._lane.call(self._find)
+        if self._lane is None:
+            self._lane = Lane(self.name, self._clock)
+        await self._call(self._find)
 
     async def close(self) -> None:
-        """Let go of the USB device; the flap stays where it is."""
-        await self._lane.call(self._release)
-        self._lane.close()
+        """Let go of the USB device; the flap stays where it is. May be called twice."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._release)
+            lane.close()
 
     async def read(self) -> tuple[Reading, ...]:
-        """(position 0 closed .. 1 open, motor current mA); BAD position when the feedback is disconnected."""
-        variables = await self._lane.call(self._variables)
+        """(position 0 closed .. 1 open, motor current mA). The position is BAD when the feedback is disconnected, and
+        STALE, with the reason, when an error or a restart of the controller has taken the motor's force away."""
+        variables = await self._call(self._variables)
         now_ns = self._clock.now_ns()
         current = Reading(f"{self.name}.current", float(variables.current_mA), "mA", now_ns)
+        channel = f"{self.name}.position"
         if variables.halting & _FEEDBACK_DISCONNECT:
-            return bad_reading(f"{self.name}.position", "1", now_ns, "feedback disconnect"), current
+            return bad_reading(channel, "1", now_ns, "feedback disconnect"), current
         span = self._settings.open_target - self._settings.closed_target
         openness = (variables.position - self._settings.closed_target) / span
-        return Reading(f"{self.name}.position", openness, "1", now_ns), current
+        if variables.halting & ~_AWAITING_COMMAND or (variables.halting and self._commanded):
+            reason = f"the motor is without force: {_names(variables.halting)}"
+            return Reading(channel, openness, "1", now_ns, Quality.STALE, reason), current
+        return Reading(channel, openness, "1", now_ns), current
 
     async def move_open(self) -> None:
-        """Open and confirm; DeviceFault on a jam, an error flag or when the travel takes too long."""
+        """Open and confirm; DeviceFault on a jam, an error flag or when the travel takes too long.
+
+        Errors that stopped an earlier movement are cleared when their cause is gone.
+        """
         await self._move(self._settings.open_target)
 
     async def move_closed(self) -> None:
-        """Close and confirm; DeviceFault as in move_open."""
+        """Close and confirm; errors as in move_open."""
         await self._move(self._settings.closed_target)
 
     async def make_safe(self) -> None:
@@ -116,93 +144,160 @@ class Flap:
         await self.move_closed()
 
     async def _move(self, target: int) -> None:
-        await self._lane.call(self._set_target, target)
-        deadline_ns = self._clock.now_ns() + seconds_ns(self._settings.travel_s)
-        moved_ns, moved_position = self._clock.now_ns(), -(10**6)
+        variables = await self._call(self._set_target, target)
+        still_ns, still_position = self._clock.now_ns(), variables.position
+        deadline_ns = still_ns + seconds_ns(self._settings.travel_s)
         confirmed = 0
         while confirmed < _CONFIRMATIONS:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
-            variables = await self._lane.call(self._variables)
+            variables = await self._call(self._variables)
             now_ns = self._clock.now_ns()
             if variables.halting or variables.target != target:
                 raise DeviceFault(self.name, f"the motor stopped: {_names(variables.halting)}")
-            if abs(variables.position - moved_position) >= _JAM_COUNTS:
-                moved_ns, moved_position = now_ns, variables.position
-            if abs(variables.duty) >= _JAM_DUTY and now_ns - moved_ns >= seconds_ns(_JAM_S):
+            if abs(variables.position - still_position) >= _JAM_COUNTS:
+                still_ns, still_position = now_ns, variables.position
+            if self._saturated(variables.duty) and now_ns - still_ns >= seconds_ns(_JAM_S):
                 await self._stop_after(f"jammed at {variables.position} on the way to {target}")
             confirmed = confirmed + 1 if abs(variables.position - target) <= self._settings.tolerance else 0
             if now_ns > deadline_ns and not confirmed:
                 await self._stop_after(f"at {variables.position}, not at {target}, after {self._settings.travel_s} s")
 
+    def _saturated(self, duty: int) -> bool:
+        return duty != 0 and abs(duty) >= _JAM_DUTY * self._max_duty[duty < 0]
+
     async def _stop_after(self, reason: str) -> None:
-        await self._lane.call(self._transfer, _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
+        try:
+            await self._call(self._stop_motor)
+        except DeviceError as error:
+            raise DeviceFault(self.name, f"{reason}; the motor could not be stopped ({error})") from error
         raise DeviceFault(self.name, f"{reason}; the motor is stopped")
+
+    async def _call(self, function: Callable[..., Result], *args: object) -> Result:
+        if self._lane is None:
+            raise Unreachable(self.name, "not open")
+        return await self._lane.call(function, *args)
 
     # Below: in the lane's thread.
 
-    def _find(self) -> None:
+    def _find(self) -> _UsbDevice:
+        """Our controller among those that are plugged in, its settings checked; the others are left alone."""
         self._release()
         try:
             found = cast(
                 "Iterable[_UsbDevice]",
                 usb.core.find(find_all=True, backend=self._backend, idVendor=_VENDOR_POLOLU),
             )
-            devices = {str(device.serial_number): device for device in found if device.idProduct in _PRODUCTS_JRK_G2}
+            candidates = [device for device in found if device.idProduct in _PRODUCTS_JRK_G2]
         except usb.core.NoBackendError as error:
             raise Unreachable(self.name, "libusb is not installed (Debian package libusb-1.0-0)") from error
         except (usb.core.USBError, ValueError, OSError) as error:
             raise Unreachable(self.name, f"USB devices cannot be listed ({error})") from error
-        if self._settings.serial_number not in devices:
-            present = ", ".join(sorted(devices)) or "none"
-            raise Unreachable(self.name, f"no Jrk G2 with serial number {self._settings.serial_number}, only {present}")
-        self._device = devices[self._settings.serial_number]
-        (mode,) = self._transfer(_TO_HOST, _GET_SETTINGS, 0, _INPUT_MODE_OFFSET, 1)
-        if mode != _INPUT_MODE_SERIAL:
+        self._device = self._chosen(candidates)
+        try:
+            self._check_settings(self._device)
+        except DeviceError:
             self._release()
+            raise
+        return self._device
+
+    def _chosen(self, candidates: Iterable[_UsbDevice]) -> _UsbDevice:
+        """The one with our serial number; one that does not tell its own (no permission, busy) hides no other."""
+        chosen: _UsbDevice | None = None
+        present: list[str] = []
+        denied: usb.core.USBError | None = None
+        for device in candidates:
+            try:
+                serial_number = str(usb.util.get_string(device, device.iSerialNumber, _ENGLISH))
+            except (usb.core.USBError, ValueError, LookupError) as error:
+                serial_number = f"one that does not tell its own ({error})"
+                if isinstance(error, usb.core.USBError) and error.errno == errno.EACCES:
+                    denied = error
+            present.append(serial_number)
+            if serial_number == self._settings.serial_number:
+                chosen = device
+            else:
+                usb.util.dispose_resources(device)
+        if chosen is not None:
+            return chosen
+        if denied is not None:  # it may be ours
+            raise self._error(denied, "serial number") from denied
+        text = f"no Jrk G2 with serial number {self._settings.serial_number}"
+        raise Unreachable(self.name, f"{text}, only {', '.join(sorted(present)) or 'none'}")
+
+    def _check_settings(self, device: _UsbDevice) -> None:
+        """Those in force, that is in RAM; they are read before every target, because a restart may change them."""
+        (mode,) = self._read(device, _GET_RAM_SETTINGS, 0, _INPUT_MODE_OFFSET, 1)
+        if mode != _INPUT_MODE_SERIAL:
             raise Refused(self.name, f"the Jrk's input mode is {mode}, it must be 0 (serial) to obey targets")
+        self._max_duty = _MAX_DUTY.unpack(self._read(device, _GET_RAM_SETTINGS, 0, _MAX_DUTY_OFFSET, _MAX_DUTY.size))
 
     def _release(self) -> None:
         if self._device is not None:
             usb.util.dispose_resources(self._device)
         self._device = None
 
-    def _set_target(self, target: int) -> None:
-        """Idempotent, so it may be repeated once after a time-out."""
+    def _set_target(self, target: int) -> _Variables:
+        """Send the target, then clear old errors: in this order the motor never starts towards the old target. All of
+        it is idempotent and may be repeated once. The variables are those before the errors were cleared."""
         try:
-            self._transfer(_TO_DEVICE, _SET_TARGET, target, 0, 0)
+            return self._set_target_once(target)
         except Unreachable:
-            self._transfer(_TO_DEVICE, _SET_TARGET, target, 0, 0)
+            return self._set_target_once(target)
+
+    def _set_target_once(self, target: int) -> _Variables:
+        device = self._device or self._find()
+        self._check_settings(device)
+        self._transfer(device, _TO_DEVICE, _SET_TARGET, target, 0, 0)
+        self._commanded = True
+        return _decoded(self._read(device, _GET_VARIABLES, _CLEAR_HALTING, 0, _VARIABLES_SIZE))
+
+    def _stop_motor(self) -> None:
+        """Idempotent too."""
+        self._commanded = False
+        try:
+            self._transfer(self._device or self._find(), _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
+        except Unreachable:
+            self._transfer(self._device or self._find(), _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
 
     def _variables(self) -> _Variables:
-        block = self._transfer(_TO_HOST, _GET_VARIABLES, 0, 0, _VARIABLES_SIZE)
-        target, position, duty, halting = (
-            struct.unpack_from(kind, block, offset)[0]
-            for kind, offset in (("<H", 0x02), ("<H", 0x06), ("<h", 0x0C), ("<H", 0x12))
-        )
-        return _Variables(target, position, duty, halting, struct.unpack_from("<H", block, 0x19)[0])
+        return _decoded(self._read(self._device or self._find(), _GET_VARIABLES, 0, 0, _VARIABLES_SIZE))
 
-    def _transfer(self, request_type: int, request: int, value: int, index: int, size: int) -> bytes:
-        if self._device is None:
-            self._find()
-        device = cast("_UsbDevice", self._device)
+    def _read(self, device: _UsbDevice, request: int, value: int, index: int, size: int) -> bytes:
+        """`size` bytes from the device; a short answer is asked for once more."""
+        try:
+            return self._transfer(device, _TO_HOST, request, value, index, size)
+        except GarbledReply:
+            return self._transfer(device, _TO_HOST, request, value, index, size)
+
+    def _transfer(
+        self, device: _UsbDevice, request_type: int, request: int, value: int, index: int, size: int
+    ) -> bytes:
         try:
             answer = device.ctrl_transfer(request_type, request, value, index, size or None, _TIMEOUT_MS)
         except usb.core.USBError as error:
-            raise self._error(error, request) from error
+            self._release()
+            raise self._error(error, f"request 0x{request:02X}") from error
         data = b"" if isinstance(answer, int) else bytes(answer)
         if len(data) != size:
             raise GarbledReply(self.name, f"request 0x{request:02X} gave {len(data)} of {size} bytes")
         return data
 
-    def _error(self, error: usb.core.USBError, request: int) -> DeviceError:
+    def _error(self, error: usb.core.USBError, what: str) -> DeviceError:
         """pyusb's errors by errno, never by text."""
         if error.errno == errno.EPIPE:
-            return Refused(self.name, f"the Jrk stalled request 0x{request:02X}")
+            return Refused(self.name, f"the Jrk stalled {what}")
         if error.errno == errno.EACCES:
             return Refused(self.name, "no permission for the USB device; install Pololu's udev rule")
-        if error.errno in (errno.ENODEV, errno.EIO):
-            self._release()  # found again by serial number at the next call
-        return Unreachable(self.name, f"USB request 0x{request:02X} failed ({error})")
+        return Unreachable(self.name, f"USB: {what} failed ({error})")
+
+
+def _decoded(block: bytes) -> _Variables:
+    """Jrk G2 user's guide, section 12: variables."""
+    target, position, duty, halting, current_mA = (
+        struct.unpack_from(kind, block, offset)[0]
+        for kind, offset in (("<H", 0x02), ("<H", 0x06), ("<h", 0x0C), ("<H", 0x12), ("<H", 0x19))
+    )
+    return _Variables(target, position, duty, halting, current_mA)
 
 
 def _names(halting: int) -> str:

@@ -1,0 +1,242 @@
+"""The flap driver against a fake controller behind pyusb and a TCP connection; time is virtual."""
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+
+from drivers.flap import Flap
+from drivers.interface import DeviceFault, Quality, Reading, Refused, Unreachable
+from drivers.sim.flap import (
+    ERROR_FEEDBACK_DISCONNECT,
+    ERROR_HARD_OVER_CURRENT,
+    ERROR_NO_POWER,
+    ERROR_SOFT_OVER_CURRENT,
+)
+from drivers.sim.usb import TimedOut
+
+from .flap_bench import GET_VARIABLES, SET_TARGET, STOP_MOTOR, T0, Bench, running_bench
+
+
+@pytest.fixture
+async def bench() -> AsyncIterator[Bench]:
+    async with running_bench() as bench:
+        yield bench
+
+
+@pytest.fixture
+async def flap(bench: Bench) -> Flap:
+    await bench.flap.open()
+    return bench.flap
+
+
+# Opening and closing
+
+
+async def test_it_opens_and_closes_and_confirms_each(bench: Bench, flap: Flap) -> None:
+    """The whole way of 3000 counts takes 1 s; then come up to three looks, 0.05 s apart."""
+    assert await bench.position() == Reading("flap.position", 0.0, "1", T0)
+    await flap.move_open()
+    assert bench.openness == 1
+    assert bench.now_s == pytest.approx(1.1, abs=0.06)
+    assert await bench.position() == Reading("flap.position", 1.0, "1", bench.clock.now_ns())
+    await flap.move_closed()
+    assert bench.openness == 0
+    assert (await bench.position()).value == 0
+
+
+async def test_where_it_is_already_it_is_confirmed_at_once(bench: Bench, flap: Flap) -> None:
+    await flap.move_closed()
+    assert bench.now_s == pytest.approx(0.15)
+
+
+async def test_a_moving_flap_is_read_half_open_with_its_current(bench: Bench, flap: Flap) -> None:
+    readings: list[Reading] = []
+
+    async def look() -> None:
+        readings.extend(await flap.read())
+
+    await asyncio.gather(flap.move_open(), bench.after(0.5, look))
+    assert [reading.value for reading in readings] == [pytest.approx(0.5, abs=0.001), 150]
+
+
+async def test_the_flap_is_left_where_it_is_when_it_is_opened_and_closed_as_a_device(bench: Bench, flap: Flap) -> None:
+    await flap.move_open()
+    await flap.close()
+    await flap.close()
+    with pytest.raises(Unreachable, match=r"^flap: not open$"):
+        await flap.read()
+    await flap.open()
+    assert (await bench.position()).value == 1
+
+
+# Jams and errors of the drive
+
+
+@pytest.mark.parametrize("max_duty", [600, 300])
+@pytest.mark.parametrize("opening", [True, False])
+async def test_a_jam_on_the_way_is_found_within_half_a_second_and_the_motor_stopped(
+    bench: Bench, flap: Flap, max_duty: int, opening: bool
+) -> None:
+    """Reached after 0.5 s at full duty, 1 s at half; found 0.5 s later, to one look of 0.05 s."""
+    if not opening:
+        await flap.move_open()
+    bench.set_max_duty(max_duty)
+    bench.fake.jam_position = 2000
+    begun_s = bench.now_s
+    move = flap.move_open if opening else flap.move_closed
+    with pytest.raises(DeviceFault, match=r"^flap: jammed at 2000 on the way to \d+; the motor is stopped$"):
+        await move()
+    assert bench.now_s - begun_s == pytest.approx(300 / max_duty + 0.5, abs=0.051)
+    assert bench.fake.requests[-1] == (STOP_MOTOR, 0)
+    assert (await flap.read())[1].value == 0
+    bench.fake.jam_position = None
+    await move()
+    assert bench.openness == opening
+
+
+async def test_a_jam_from_the_start_is_found_after_half_a_second(bench: Bench, flap: Flap) -> None:
+    bench.fake.jam_position = 500
+    with pytest.raises(DeviceFault, match="jammed at 500"):
+        await flap.move_open()
+    assert bench.now_s == pytest.approx(0.5, abs=1e-6)
+    await flap.make_safe()
+
+
+async def test_a_jam_within_the_tolerance_is_good_enough(bench: Bench, flap: Flap) -> None:
+    bench.fake.jam_position = 3465
+    await flap.move_open()
+    assert (await bench.position()).value == pytest.approx(1.0, abs=0.02)
+
+
+async def test_a_flap_too_slow_for_its_time_is_stopped(bench: Bench, flap: Flap) -> None:
+    bench.set_max_duty(100)  # 6 s for the whole way
+    with pytest.raises(DeviceFault, match=r"not at 3500, after 5\.0 s; the motor is stopped"):
+        await flap.move_open()
+    assert bench.now_s == pytest.approx(5.05, abs=0.051)
+    assert 0.7 < bench.openness < 0.9
+
+
+async def test_a_jam_that_cannot_be_stopped_says_both(bench: Bench, flap: Flap) -> None:
+    bench.fake.jam_position = 2000
+    bench.fake.failures = [(STOP_MOTOR, TimedOut()), (STOP_MOTOR, TimedOut())]
+    with pytest.raises(DeviceFault, match=r"jammed at 2000 .*; the motor could not be stopped \(flap: USB: "):
+        await flap.move_open()
+
+
+ERRORS = [
+    (ERROR_NO_POWER, "no power"),
+    (ERROR_SOFT_OVER_CURRENT, "soft over-current"),
+    (ERROR_HARD_OVER_CURRENT, "hard over-current"),
+    (ERROR_NO_POWER | ERROR_SOFT_OVER_CURRENT, "no power, soft over-current"),
+]
+
+
+@pytest.mark.parametrize(("bits", "names"), ERRORS)
+async def test_an_error_of_the_drive_ends_the_move_and_stays_in_the_readings(
+    bench: Bench, flap: Flap, bits: int, names: str
+) -> None:
+    def strike() -> None:
+        bench.fake.active_errors = bits
+
+    with pytest.raises(DeviceFault, match=f"^flap: the motor stopped: {names}$"):
+        await asyncio.gather(flap.move_open(), bench.after(0.5, strike))
+    position = await bench.position()
+    assert (position.quality, position.value) == (Quality.STALE, pytest.approx(0.5, abs=0.001))
+    assert position.reason == f"the motor is without force: {names}"
+    with pytest.raises(DeviceFault, match=names):
+        await flap.make_safe()
+
+
+@pytest.mark.parametrize(("bits", "names"), ERRORS)
+async def test_when_the_cause_is_gone_the_flap_closes_though_the_error_is_latched(
+    bench: Bench, flap: Flap, bits: int, names: str
+) -> None:
+    await flap.move_open()
+    bench.fake.active_errors = bits
+    bench.fake.active_errors = 0
+    assert (await bench.position()).reason == f"the motor is without force: {names}"
+    await flap.make_safe()
+    assert bench.openness == 0
+    assert (await bench.position()).quality is Quality.GOOD
+
+
+async def test_a_disconnected_feedback_is_a_bad_reading_and_ends_the_move(bench: Bench, flap: Flap) -> None:
+    def cut() -> None:
+        bench.fake.active_errors = ERROR_FEEDBACK_DISCONNECT
+
+    with pytest.raises(DeviceFault, match="feedback disconnect"):
+        await asyncio.gather(flap.move_open(), bench.after(0.5, cut))
+    position = await bench.position()
+    assert (position.quality, position.reason) == (Quality.BAD, "feedback disconnect")
+    bench.fake.active_errors = 0
+    await flap.move_closed()
+    assert (await bench.position()).value == 0
+
+
+async def test_old_errors_are_cleared_only_after_the_new_target_is_set(bench: Bench, flap: Flap) -> None:
+    """Else the motor would start towards the old one."""
+    await flap.move_open()
+    bench.fake.requests.clear()
+    await flap.move_closed()
+    target, clearing = bench.fake.requests.index((SET_TARGET, 500)), bench.fake.requests.index((GET_VARIABLES, 1))
+    assert target < clearing
+
+
+# The controller restarts, or is set otherwise
+
+
+async def test_a_restart_while_open_shows_in_the_readings_and_closing_works(bench: Bench, flap: Flap) -> None:
+    assert (await bench.position()).quality is Quality.GOOD  # awaiting a command is normal before the first one
+    await flap.move_open()
+    bench.fake.restart()
+    position = await bench.position()
+    assert (position.value, position.quality) == (1.0, Quality.STALE)
+    assert position.reason == "the motor is without force: awaiting command"
+    await flap.make_safe()
+    assert bench.openness == 0
+    assert (await bench.position()).quality is Quality.GOOD
+
+
+async def test_a_restart_on_the_way_ends_the_move(bench: Bench, flap: Flap) -> None:
+    with pytest.raises(DeviceFault, match="the motor stopped: awaiting command"):
+        await asyncio.gather(flap.move_open(), bench.after(0.5, bench.fake.restart))
+
+
+async def test_a_wrong_input_mode_is_refused_when_opened(bench: Bench) -> None:
+    bench.fake.input_mode = 1
+    with pytest.raises(Refused, match=r"^flap: the Jrk's input mode is 1, it must be 0 \(serial\)"):
+        await bench.flap.open()
+
+
+async def test_an_input_mode_changed_since_is_found_before_the_target_is_sent(bench: Bench, flap: Flap) -> None:
+    bench.fake.input_mode = 2
+    with pytest.raises(Refused, match="input mode is 2"):
+        await flap.move_open()
+    assert bench.fake.targets == []
+
+
+# Safety
+
+
+async def test_make_safe_closes(bench: Bench, flap: Flap) -> None:
+    await flap.move_open()
+    await flap.make_safe()
+    assert bench.openness == 0
+
+
+async def test_make_safe_turns_an_opening_flap_round(bench: Bench, flap: Flap) -> None:
+    opening = asyncio.create_task(flap.move_open())
+    await bench.after(0.5, flap.make_safe)
+    assert bench.openness == 0
+    with pytest.raises(DeviceFault, match="its target was changed by someone else"):
+        await opening
+    assert bench.fake.targets == [3500, 500]
+
+
+async def test_make_safe_that_jams_is_a_fault_with_the_motor_stopped(bench: Bench, flap: Flap) -> None:
+    await flap.move_open()
+    bench.fake.jam_position = 1000
+    with pytest.raises(DeviceFault, match="jammed at 1000"):
+        await flap.make_safe()
+    assert bench.fake.requests[-1] == (STOP_MOTOR, 0)
