@@ -20,7 +20,7 @@ from drivers.ximc import encode
 
 T0 = 1_700_000_000_000_000_000
 SERIAL_NUMBER = 4101
-START_STEPS = {"linear": 400.0, "rotary": 1700.0}  # to the right of home, where the count is 0
+START_STEPS = {"linear": 100.0, "rotary": 1300.0}  # to the right of home, where the count is 0
 UNIT_PER_STEP = {"linear": 0.0025, "rotary": 0.01}
 OVERSHOOT = {"linear": 0.5, "rotary": 1.0}
 LIMITS = {"linear": (0.0, 299.95), "rotary": (-40.0, 40.0)}

@@ -66,7 +66,7 @@ async def test_a_homing_that_never_arrived_is_not_taken_for_the_one_before(bench
 async def test_a_lost_acknowledgement_does_not_spoil_homing(bench: Bench, letters: str) -> None:
     await bench.axis.open()
     bench.tap.lost_replies[letters] = 1
-    assert await bench.axis.home() == pytest.approx(-1.0, abs=1e-9)
+    assert await bench.axis.home() == pytest.approx(-0.25, abs=1e-9)
     assert bench.tap.count(letters) == 1
     assert (await bench.position()).value == 0
 
@@ -74,7 +74,7 @@ async def test_a_lost_acknowledgement_does_not_spoil_homing(bench: Bench, letter
 async def test_a_zero_that_never_comes_through_is_a_fault(bench: Bench) -> None:
     await bench.axis.open()
     bench.tap.ignored = {"zero"}
-    with pytest.raises(DeviceFault, match=r"could not be set to zero, it is -400\.00"):
+    with pytest.raises(DeviceFault, match=r"could not be set to zero, it is -100\.00"):
         await bench.axis.home()
 
 
