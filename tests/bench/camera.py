@@ -2,6 +2,7 @@
 
 Full 5 MP frames from the fake camera in its own process, whose image costs nothing and leaves without waiting for the
 exposure. Limit: all packets of a frame at the pace, 40 MB/s as in real time and 120 MB/s as in virtual time.
+The limit is worked out, not measured, so here other load on the machine does lower the ratio.
 """
 
 from __future__ import annotations
