@@ -1,12 +1,14 @@
-"""YAML file -> validated, frozen pydantic model, or a ConfigError that names the file and the path inside it."""
+"""YAML file -> validated, frozen pydantic model, or a ConfigError of one line that names file and path."""
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from pathlib import Path
 from typing import TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from drivers.interface import ConfigError
 
@@ -17,11 +19,22 @@ class Document(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML keeps the last of two equal keys without a word; here that is an error, because one of them was meant."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        twice = next((key for key in keys if keys.count(key) > 1), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(None, None, f"key {twice!r} is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 Model = TypeVar("Model", bound=BaseModel)
 
 
 def load_document(path: Path, model: type[Model]) -> Model:
-    """The file as `model`; raises ConfigError with one line per fault, each naming file and path."""
+    """The file as `model`; raises ConfigError that names file and path of every fault."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -32,7 +45,7 @@ def load_document(path: Path, model: type[Model]) -> Model:
 def parse_document(text: str, model: type[Model], where: str) -> Model:
     """YAML text as `model`; `where` (a file name) begins every message of the ConfigError it may raise."""
     try:
-        data = yaml.safe_load(text)
+        data = yaml.load(text, _Loader)  # a SafeLoader
     except yaml.YAMLError as error:
         raise ConfigError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(data, dict):
@@ -40,17 +53,27 @@ def parse_document(text: str, model: type[Model], where: str) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise ConfigError("\n".join(_sentence(where, fault) for fault in error.errors())) from error
+        raise ConfigError("; ".join(_sentence(where, fault) for fault in _causes(error.errors()))) from error
 
 
-def _sentence(where: str, fault: object) -> str:
+def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Without the faults that only follow from another one: a list is too short when its only entry is wrong."""
+    places = [fault["loc"] for fault in faults]
+    return [
+        fault
+        for fault in faults
+        if fault["type"] != "too_short"
+        or not any(place[: len(fault["loc"])] == fault["loc"] and place != fault["loc"] for place in places)
+    ]
+
+
+def _sentence(where: str, details: ErrorDetails) -> str:
     """One pydantic fault as `file: path: what is wrong (got value)`."""
-    details = fault if isinstance(fault, dict) else {}
-    path = ".".join(str(part) for part in details.get("loc", ())) or "(top)"
-    text = str(details.get("msg", "invalid")).removeprefix("Value error, ")
-    value = details.get("input")
+    path = ".".join(str(part) for part in details["loc"]) or "(top)"
+    text = details["msg"].removeprefix("Value error, ")
+    value = details["input"]
     shown = "" if isinstance(value, dict | list) or value is None else f" (got {value!r})"
-    if details.get("type") == "extra_forbidden":
+    if details["type"] == "extra_forbidden":
         text = "unknown key"
         shown = ""
     return f"{where}: {path}: {text}{shown}"

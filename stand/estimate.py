@@ -19,10 +19,10 @@ from experiments.steps import (
 )
 from stand.config import StandConfig
 
-# Recorded bytes per pixel and second, measured on simulated sessions (README, Decisions): PNG of a target image at
-# 1 DN of noise, raw 8 bit, and telemetry with every device polled at 1 Hz.
-_BYTES_PER_PIXEL = {"png": 0.36, "raw": 1.0}
-_TELEMETRY_BYTES_PER_S = 650.0
+# Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
+# with its share of the index, committed every second.
+_BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0}
+_TELEMETRY_BYTES_PER_MESSAGE = 116.0
 _SENSOR_PX = (2448, 2048)
 
 
@@ -53,11 +53,13 @@ def price(plan: Iterable[PlannedStep], config: StandConfig) -> tuple[PricedStep,
     width_px = config.camera.width_px or _SENSOR_PX[0]
     height_px = config.camera.height_px or _SENSOR_PX[1]
     frame_bytes = width_px * height_px * _BYTES_PER_PIXEL[config.recording.frame_encoding]
+    polled = (config.regulator, config.relays, config.thermometers, config.flap, config.camera, *config.axes.values())
+    messages_per_s = sum(1.0 / device.poll_s for device in polled)
     priced: list[PricedStep] = []
     for planned in plan:
         _check(planned, config)
         duration_s, frames = estimate_s(planned.step), frames_of(planned.step)
-        size_bytes = frames * frame_bytes + duration_s * _TELEMETRY_BYTES_PER_S
+        size_bytes = frames * frame_bytes + duration_s * messages_per_s * _TELEMETRY_BYTES_PER_MESSAGE
         priced.append(PricedStep(planned, duration_s, frames, size_bytes))
     return tuple(priced)
 

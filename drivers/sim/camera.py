@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import NS_PER_S, seconds_ns
+from drivers.clock import NS_PER_S, Now, seconds_ns
 from drivers.sim import gvcp, gvsp
 from drivers.sim.camera_registers import Registers
 from drivers.sim.camera_schedule import Schedule, Shot
@@ -52,14 +52,6 @@ class CameraPlant(Protocol):
         ...
 
 
-class SimulatedClock(Protocol):
-    """What the camera needs of a clock."""
-
-    def now_ns(self) -> int:
-        """ns since the epoch."""
-        ...
-
-
 class FakeCamera:
     """The camera with serial number `serial` at UDP `address`:3956.
 
@@ -74,7 +66,7 @@ class FakeCamera:
     def __init__(
         self,
         plant: CameraPlant,
-        clock: SimulatedClock,
+        clock: Now,
         render: Render,
         address: str,
         serial: str,

@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from drivers.clock import NS_PER_S, FollowedClock, WallClock
+from drivers.clock import NS_PER_S, Now
 from drivers.sim.usb import Stall, TimedOut
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class FakeFlap:
     def __init__(
         self,
         plant: Plant,
-        clock: FollowedClock | WallClock,
+        clock: Now,
         serial_number: str,
         open_position: int = 3_500,
         closed_position: int = 500,

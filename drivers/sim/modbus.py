@@ -59,14 +59,6 @@ class Timeline(Protocol):
         ...
 
 
-class Now(Protocol):
-    """The part of a clock a fake needs."""
-
-    def now_ns(self) -> int:
-        """ns since the epoch."""
-        ...
-
-
 class Refusal(Exception):
     """The unit answers with an exception code, 1..4."""
 

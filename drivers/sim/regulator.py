@@ -11,12 +11,11 @@ from contextlib import contextmanager
 from enum import IntEnum
 from typing import Protocol
 
-from drivers.clock import seconds_ns
+from drivers.clock import Now, seconds_ns
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
     OPERATION_ERROR,
-    Now,
     Refusal,
     Timeline,
     answer,

@@ -11,11 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.clock import NS_PER_S
+from drivers.clock import NS_PER_S, Now
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
-    Now,
     Refusal,
     Timeline,
     answer,

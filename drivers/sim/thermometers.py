@@ -11,11 +11,11 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Protocol
 
+from drivers.clock import Now
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
-    Now,
     Refusal,
     Timeline,
     answer,

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
-from drivers.clock import FollowedClock, WallClock
+from drivers.clock import Now
 from drivers.sim import ximc_table as table
 from drivers.sim.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Run, Shift, Stepper
 from drivers.sim.ximc_settings import Settings
@@ -66,7 +66,7 @@ class FakeAxis:
     def __init__(
         self,
         plant: Plant,
-        clock: FollowedClock | WallClock,
+        clock: Now,
         profile: table.Profile,
         serial_number: int,
         attach: Literal["linear", "rotary"],

@@ -62,6 +62,13 @@ def test_a_wrong_entry_names_file_and_path(tmp_path: Path, path: str, value: obj
     assert str(caught.value).startswith(str(file))
 
 
+def test_a_key_given_twice_is_refused(tmp_path: Path):
+    file = tmp_path / "twice.yaml"
+    file.write_text((CONFIGS / "laboratory.yaml").read_text() + "\nlimits: {chamber_degC: [-10, 50]}\n")
+    with pytest.raises(ConfigError, match=r"twice\.yaml: .*key 'limits' is given twice.*line"):
+        load_config(file)
+
+
 @pytest.mark.parametrize("text", ["", "- a\n- b\n", "name: [", "\x00"])
 def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path, text: str):
     file = tmp_path / "bad.yaml"

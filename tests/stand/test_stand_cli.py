@@ -1,0 +1,101 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from stand.cli import app
+from stand.config import packaged
+
+runner = CliRunner()
+
+
+@pytest.mark.parametrize("command", ["demo", "simulate", "plan", "run"])
+def test_every_command_explains_itself_with_an_example(command: str):
+    result = runner.invoke(app, [command, "--help"])
+    assert result.exit_code == 0
+    assert "Example: stand" in result.output
+
+
+def test_plan_lists_steps_and_totals():
+    result = runner.invoke(app, ["plan", "thermal-cycle"])
+    assert result.exit_code == 0
+    assert "SetTemperature chamber_degC=31.0" in " ".join(result.output.split())
+    assert "GB; started now it ends" in result.output
+
+
+def test_the_json_plan_adds_up():
+    result = runner.invoke(app, ["plan", "warm-up", "--json"])
+    plan = json.loads(result.stdout)
+    assert plan["frames"] == 3600
+    assert plan["duration_s"] == pytest.approx(sum(step["duration_s"] for step in plan["steps"]))
+    assert plan["duration_s"] == pytest.approx(7200 + 3599 * 0.5, rel=0.02)
+    assert plan["bytes"] == pytest.approx(3600 * 2448 * 2048 * 0.47, rel=0.05)
+    assert [step["index"] for step in plan["steps"]] == list(range(len(plan["steps"])))
+
+
+def recipe_file(tmp_path: Path, **parameters: object) -> str:
+    cycle = {"set_points_degC": [30], **parameters}
+    path = tmp_path / "recipe.yaml"
+    path.write_text(yaml.safe_dump({"name": "bad", "experiments": [{"thermal_cycle": cycle}]}))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"set_points_degC": [65]}, "outside limits.chamber_degC -10.0..60.0"),
+        ({"table_position": {"vertical": 1}}, "this stand has no axis 'vertical'"),
+        ({"table_position": {"linear": 290}}, "outside the limits (0.0, 280.0) of linear"),
+        ({"interval_s": 0.2, "frames_per_point": 2}, "faster than camera.frame_rate_hz"),
+        ({"dwel_s": 3}, "experiments.0.thermal_cycle.dwel_s: unknown key"),
+    ],
+)
+def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(
+    tmp_path: Path, parameters: dict[str, object], sentence: str
+):
+    result = runner.invoke(app, ["run", recipe_file(tmp_path, **parameters), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert sentence in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["plan", "no-such-recipe"], "no-such-recipe: no such file, and not one of those installed: demo,"),
+        (["plan", "demo", "--config", "nowhere.yaml"], "nowhere.yaml: no such file"),
+        (["run", "demo", "--seed", "3"], "--seed belongs to --virtual-time"),
+        (["run", "demo", "--config", "laboratory", "--virtual-time"], "no `simulation` section"),
+        (["simulate", "laboratory"], "no `simulation` section"),
+    ],
+)
+def test_bad_input_ends_with_status_2_and_one_line(arguments: list[str], sentence: str):
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == 2
+    assert sentence in result.output
+    assert len(result.output.strip().splitlines()) == 1
+
+
+def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_path: Path):
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["bus"]["address"] = f"serial:{tmp_path / 'unplugged'}"
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(data))
+    # In a process of its own: asyncio.run and signal handlers belong to a main thread.
+    result = subprocess.run(
+        [sys.executable, "-m", "stand.cli", "run", "demo", "--config", str(config), "--out", str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "COLUMNS": "200"},
+        check=False,
+    )
+    assert result.returncode == 1
+    assert "unplugged" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "out").exists()
