@@ -96,6 +96,7 @@ class VirtualClock:
         self._now_ns = start_ns
         self._advance = advance
         self._holds = 0
+        self._stirred = False  # a hold has come and gone since somebody last looked
         self._sleepers: list[tuple[int, int, asyncio.Future[None]]] = []
         self._order = itertools.count()
         self._changed = asyncio.Event()
@@ -115,6 +116,7 @@ class VirtualClock:
     def hold(self) -> Generator[None]:
         """Virtual time stands still inside."""
         self._holds += 1
+        self._stirred = True
         try:
             yield
         finally:
@@ -143,6 +145,9 @@ class VirtualClock:
                 quiet_turns = 0
                 self._changed.clear()
                 await self._changed.wait()
+            elif self._stirred:
+                quiet_turns, self._stirred = 0, False
+                await asyncio.sleep(0)
             else:
                 quiet_turns += 1
                 await asyncio.sleep(0)

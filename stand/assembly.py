@@ -20,7 +20,7 @@ from drivers.relays import Relays
 from drivers.stage import Axis, AxisSettings
 from drivers.thermometers import ThermometerChannel, Thermometers
 from stand.compressor import CompressorLimits
-from stand.config import StandConfig, packaged
+from stand.config import CameraConfig, StandConfig, packaged
 from stand.guard import Guard
 from stand.hub import Hub
 from stand.interlocks import Fault, safety_rules
@@ -92,7 +92,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
             for name, axis in config.axes.items()
         },
         flap=_flap(config, clock),
-        camera=Camera("camera", _camera_settings(config), clock),
+        camera=Camera("camera", camera_settings(config.camera), clock),
     )
     compressor = CompressorLimits(**config.compressor.model_dump())
     limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor)
@@ -131,8 +131,8 @@ def _flap(config: StandConfig, clock: Clock) -> Flap:
     return Flap("flap", settings, clock, backend)
 
 
-def _camera_settings(config: StandConfig) -> CameraSettings:
-    camera = config.camera
+def camera_settings(camera: CameraConfig) -> CameraSettings:
+    """The driver's settings from the configuration's."""
     temperature = None
     if camera.temperature is not None:
         entry = camera.temperature

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import signal
 import sys
@@ -38,7 +39,9 @@ RecipeArgument = Annotated[str, typer.Argument(help="A recipe file, or the name 
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Where the session and the report go.")] = Path("demo"),
+    out: Annotated[
+        Path, typer.Option(help="Where the session and the report go; numbered when there is a demo already.")
+    ] = Path("demo"),
 ) -> None:
     """Run a simulated thermal cycle, fit the drift, and print what compensation gains.
 
@@ -47,9 +50,10 @@ def demo(
     with _one_line_errors():
         config, recipe = _config("simulated"), _recipe("demo")
         order = _order(config, recipe)
+        directory = _unused(out)
         with _run_progress(price(recipe[0].plan(), config[0])) as watch:
-            session = asyncio.run(run_virtual(order, out, None, watch))
-        for line in run_demo(session, out):
+            session = asyncio.run(run_virtual(order, directory, None, watch))
+        for line in run_demo(session, directory):
             typer.echo(line)
 
 
@@ -129,6 +133,12 @@ def run(
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
             session = asyncio.run(work)
         typer.echo(session)
+
+
+def _unused(out: Path) -> Path:
+    """`out`, or `out-2`, `out-3` ... when it exists: a second demo never touches the first."""
+    candidates = (out.with_name(f"{out.name}-{number}") for number in itertools.count(2))
+    return out if not out.exists() else next(path for path in candidates if not path.exists())
 
 
 def _config(name: str) -> tuple[StandConfig, str]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from drivers.clock import NS_PER_S, WallClock
 
 # Plain output: a line each time this share of the work is done, so that a log stays readable.
 _PLAIN_STEP = 0.1
@@ -58,6 +61,8 @@ class _PlainLines:
         self._title = title
         self._total = max(total, 1e-9)
         self._next = _PLAIN_STEP
+        self._clock = WallClock()
+        self._start_ns = self._clock.now_ns()
 
     def __call__(self, done: float, text: str) -> None:
         share = done / self._total
@@ -65,4 +70,6 @@ class _PlainLines:
             return
         while self._next <= share + 1e-9:
             self._next += _PLAIN_STEP
-        print(f"{self._title}: {min(share, 1.0):4.0%}  {text}", file=sys.stderr, flush=True)  # noqa: T201 - plain log
+        elapsed_s = (self._clock.now_ns() - self._start_ns) / NS_PER_S
+        left = timedelta(seconds=round(max(0.0, elapsed_s * (1.0 / share - 1.0))))
+        print(f"{self._title}: {min(share, 1.0):4.0%}  {left} left  {text}", file=sys.stderr, flush=True)  # noqa: T201

@@ -4,14 +4,6 @@ That camera has no temperature, no gain in dB, no time stamp latch and no resend
 diagonal ramp: pixel = (x + y + frame) mod 255 at 10 ms of exposure.
 """
 
-import os
-import shutil
-import socket
-import subprocess
-import threading
-import time
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
@@ -21,49 +13,10 @@ from drivers.camera_connection import FrameCount
 from drivers.camera_settings import device_error
 from drivers.clock import NS_PER_S, WallClock
 from drivers.interface import DeviceError, Quality, Refused, Unreachable
+from tests.stock_camera import ADDRESS, SERIAL
 
-ADDRESS = "127.0.0.1"  # the only one it takes: it listens on addresses of interfaces
-PROGRAM = "arv-fake-gv-camera-0.8"
-DISCOVERY = bytes.fromhex("42 01 0002 0000 ffff")
-START_LIMIT_S = 20.0  # another test run on this machine may hold the port
 EXPOSURE_S = 0.01
 TEST_REGISTER = 0x1F0  # 0x12345678 in its XML
-
-
-SERIAL = f"TS{os.getpid()}"
-
-
-def answers() -> bool:
-    """Whether the camera we started answers, not that of another test run."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.settimeout(0.2)
-        probe.connect((ADDRESS, 3956))
-        try:
-            probe.send(DISCOVERY)
-            return SERIAL.encode() in probe.recv(1024)
-        except OSError:
-            return False
-
-
-@pytest.fixture(scope="module")
-def stock_camera() -> Iterator[None]:
-    if shutil.which(PROGRAM) is None:
-        if os.environ.get("CI") == "true":
-            pytest.fail(f"{PROGRAM} is missing: apt-get install aravis-tools libaravis-0.8-0")
-        pytest.skip(f"{PROGRAM} is missing")
-    deadline_s = time.monotonic() + START_LIMIT_S
-    while True:
-        process = subprocess.Popen([PROGRAM, "-i", ADDRESS, "-s", SERIAL], stdout=subprocess.DEVNULL)
-        while process.poll() is None and not answers():
-            pass
-        if process.poll() is None:
-            break
-        if time.monotonic() > deadline_s:
-            pytest.fail(f"{PROGRAM} does not start: is UDP port 3956 of {ADDRESS} in use?")
-        threading.Event().wait(0.5)
-    yield
-    process.kill()
-    process.wait()
 
 
 def settings(**changes: object) -> CameraSettings:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
+from drivers.clock import NS_PER_S, QUIET_TURNS, FollowedClock, VirtualClock, WallClock, seconds_ns
 from drivers.lane import Lane
 
 
@@ -74,6 +74,22 @@ async def test_a_chain_of_hand_overs_comes_to_rest_before_time_moves():
 
     await driven(clock, start(), other(), end(), *(relay(queues[k], queues[k + 1]) for k in range(4)))
     assert arrived == [NS_PER_S]
+
+
+async def test_holds_that_come_and_go_between_two_looks_keep_time_still():
+    clock = VirtualClock(0)
+    ended: list[int] = []
+
+    async def busy() -> None:
+        await clock.sleep_until(NS_PER_S)
+        for _ in range(4 * QUIET_TURNS):
+            with clock.hold():
+                pass
+            await asyncio.sleep(0)
+        ended.append(clock.now_ns())
+
+    await driven(clock, busy(), clock.sleep_until(2 * NS_PER_S))
+    assert ended == [NS_PER_S]
 
 
 async def test_the_simulator_is_told_before_the_sleeper_wakes():
