@@ -36,14 +36,18 @@ def run_stock_camera() -> Iterator[None]:
             pytest.fail(f"{_PROGRAM} is missing: apt-get install aravis-tools libaravis-0.8-0")
         pytest.skip(f"{_PROGRAM} is missing")
     deadline_s = time.monotonic() + _START_LIMIT_S
+    # setpriv: it must not outlive a test run that is killed, for it would keep the port from the next one.
+    command = ["setpriv", "--pdeathsig", "KILL", _PROGRAM, "-i", ADDRESS, "-s", SERIAL]
     while True:
-        process = subprocess.Popen([_PROGRAM, "-i", ADDRESS, "-s", SERIAL], stdout=subprocess.DEVNULL)
-        while process.poll() is None and not answers():
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        while process.poll() is None and not (answering := answers()) and time.monotonic() < deadline_s:
             pass
-        if process.poll() is None:
+        if process.poll() is None and answering:
             break
+        process.kill()
+        process.wait()
         if time.monotonic() > deadline_s:
-            pytest.fail(f"{_PROGRAM} does not start: is UDP port 3956 of {ADDRESS} in use?")
+            pytest.fail(f"{_PROGRAM} does not answer: is UDP port 3956 of {ADDRESS} in use by another one?")
         threading.Event().wait(0.5)
     yield
     process.kill()
