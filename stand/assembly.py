@@ -126,7 +126,10 @@ def _flap(config: StandConfig, clock: Clock) -> Flap:
             module = cast("_BackendModule", importlib.import_module(flap.backend))
         except ImportError as error:
             raise ConfigError(f"flap.backend: no module {flap.backend!r} ({error})") from error
-        backend = module.get_backend(flap.backend_address)
+        try:
+            backend = module.get_backend(flap.backend_address)
+        except ValueError as error:
+            raise ConfigError(f"flap.backend_address: {error}") from error
     settings = FlapSettings(flap.serial_number, flap.open_target, flap.closed_target, flap.tolerance, flap.travel_s)
     return Flap("flap", settings, clock, backend)
 

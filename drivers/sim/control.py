@@ -16,23 +16,21 @@ from collections.abc import Callable
 
 from drivers.sim.faults import LinkFaults
 from drivers.sim.laboratory import FAULTS, Laboratory
-from drivers.sim.wire import TcpWire
+from drivers.sim.wire import Lines, TcpWire
 
 
-class ControlEngine:
-    """One control conversation."""
+class Control:
+    """Answers control requests for one laboratory."""
 
     def __init__(self, laboratory: Laboratory, quit_: Callable[[], None]) -> None:
         self._laboratory = laboratory
         self._quit = quit_
-        self._pending = b""
 
-    def feed(self, data: bytes) -> bytes:
-        """Answer every complete line."""
-        *lines, self._pending = (self._pending + data).split(b"\n")
-        return b"".join(json.dumps(self._answer(line)).encode() + b"\n" for line in lines)
+    def answer(self, line: bytes) -> bytes:
+        """The answer to one request line."""
+        return json.dumps(self._result(line)).encode()
 
-    def _answer(self, line: bytes) -> dict[str, object]:
+    def _result(self, line: bytes) -> dict[str, object]:
         try:
             request = json.loads(line)
             if not isinstance(request, dict):
@@ -64,5 +62,6 @@ class ControlEngine:
 
 def serve_control(laboratory: Laboratory, quit_: Callable[[], None]) -> TcpWire:
     """Listen on the laboratory's control address; `quit_` is called for a `quit` request."""
+    control = Control(laboratory, quit_)
     host, port = laboratory.spec.control.removeprefix("tcp:").rsplit(":", 1)
-    return TcpWire(host, int(port), lambda: ControlEngine(laboratory, quit_), LinkFaults())
+    return TcpWire(host, int(port), lambda: Lines(control.answer), LinkFaults())

@@ -13,7 +13,6 @@ backend, so that the driver's code is the same for a fake and a real device.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import socket
@@ -26,6 +25,9 @@ from typing import Protocol
 
 from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
+
+from drivers.sim.faults import LinkFaults
+from drivers.sim.wire import Lines, TcpWire
 
 GET_DESCRIPTOR_IN, GET_DESCRIPTOR, STRING_DESCRIPTOR = 0x80, 6, 3
 LANGUAGES = b"\x04\x03\x09\x04"  # one language: English (United States)
@@ -90,42 +92,17 @@ class UsbServer:
 
     def __init__(self, host: str, port: int, devices: Sequence[UsbDevice]) -> None:
         self._devices = devices
-        self._server = socket.create_server((host, port))
-        self.port: int = self._server.getsockname()[1]
-        self._connections: set[socket.socket] = set()
-        self._lock = threading.Lock()
-        threading.Thread(target=self._accept, name=f"usb {self.port}", daemon=True).start()
+        self._wire = TcpWire(host, port, lambda: Lines(self._answer), LinkFaults())
+        self.port = self._wire.port
 
     def close(self) -> None:
         """Stop listening and drop every connection."""
-        with contextlib.suppress(OSError):
-            self._server.shutdown(socket.SHUT_RDWR)
-        self._server.close()
-        with self._lock:
-            connections = list(self._connections)
-        for connection in connections:
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
+        self._wire.close()
 
-    def _accept(self) -> None:
-        while True:
-            try:
-                connection, _ = self._server.accept()
-            except OSError:
-                return
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            with self._lock:
-                self._connections.add(connection)
-            threading.Thread(target=self._serve, args=(connection,), name=f"usb {self.port}", daemon=True).start()
+    def _answer(self, line: bytes) -> bytes:
+        return json.dumps(self._result(line)).encode()
 
-    def _serve(self, connection: socket.socket) -> None:
-        with contextlib.suppress(OSError), connection, connection.makefile("rb") as lines:
-            for line in lines:
-                connection.sendall(json.dumps(self._answer(line)).encode() + b"\n")
-        with self._lock:
-            self._connections.discard(connection)
-
-    def _answer(self, line: bytes) -> dict[str, object]:
+    def _result(self, line: bytes) -> dict[str, object]:
         try:
             request = json.loads(line)
             return {"devices": self._listing()} if request["op"] == "list" else {"data": self._control(request).hex()}

@@ -27,6 +27,19 @@ class Engine(Protocol):
         ...
 
 
+class Lines:
+    """An engine for requests of one line each: `answer(line) -> line`, both without their line feed."""
+
+    def __init__(self, answer: Callable[[bytes], bytes]) -> None:
+        self._answer = answer
+        self._pending = b""
+
+    def feed(self, data: bytes) -> bytes:
+        """Answer every complete line."""
+        *lines, self._pending = (self._pending + data).split(b"\n")
+        return b"".join(self._answer(line) + b"\n" for line in lines)
+
+
 class PtyWire:
     """A serial port: `path` becomes a symlink to a fresh pseudo-terminal in raw mode; replug by making a new one."""
 
