@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import csv
-import os
-import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from compensation.markers import Detection, DetectionError, Flag
+from compensation.files import whole_file
+from compensation.markers import Detection, Flag
 from compensation.target import Target
 
 COLUMNS = (
@@ -29,30 +28,14 @@ class DetectedImage:
 def write_detections(path: Path, target: Target, images: Iterable[DetectedImage]) -> None:
     """Write the table. Markers count from 1, rows and columns from 0; without a centre the numbers are nan.
 
-    The file appears when it is complete: it is written beside its place and then renamed. When writing fails, or
-    `images` raises, nothing is left behind and an older file stays as it was. Raises DetectionError when the place
-    cannot be written to.
+    The file appears when it is complete; when writing fails, or `images` raises, an older file stays as it was.
+    SessionError when the place cannot be written to.
     """
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    except OSError as error:
-        raise DetectionError(f"{path}: cannot be written ({error.strerror})") from error
-    try:
-        with os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            for image in images:
-                writer.writerows(_rows(image, target))
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except OSError as error:
-        Path(temporary).unlink(missing_ok=True)
-        raise DetectionError(f"{path}: cannot be written ({error.strerror})") from error
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with whole_file(path) as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for image in images:
+            writer.writerows(_rows(image, target))
 
 
 def flags_text(flags: int) -> str:

@@ -3,21 +3,38 @@
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from drivers.interface import SessionError
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write beside the place, then rename; an older file stays as it was until then. SessionError when refused."""
+    """Write the text beside the place, then rename; SessionError when refused."""
+    with whole_file(path) as file:
+        file.write(text)
+
+
+@contextmanager
+def whole_file(path: Path) -> Generator[TextIO]:
+    """A text file (UTF-8, line ends as written) that takes its place when the block ends well.
+
+    Until then, and for good when the block raises, an older file stays as it was and nothing else is left behind.
+    SessionError when the place refuses.
+    """
+    _check_place(path)
     temporary = _temporary(path)
     try:
-        with temporary.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)
+        _check_place(path)
         temporary.replace(path)
     except OSError as error:
         raise _refused(path, error) from error
@@ -27,9 +44,22 @@ def write_whole(path: Path, text: str) -> None:
 
 def check_writable(path: Path) -> None:
     """SessionError when nothing could be written to `path`: to be told before the work, not after it."""
-    if path.is_dir():
-        raise SessionError(f"{path}: cannot be written (it is a folder)")
+    _check_place(path)
     _temporary(path).unlink()
+
+
+def _check_place(path: Path) -> None:
+    """SessionError when something other than a regular file is there: the rename would replace a device or a pipe."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise _refused(path, error) from error
+    if stat.S_ISDIR(mode):
+        raise SessionError(f"{path}: cannot be written (it is a folder)")
+    if not stat.S_ISREG(mode):
+        raise SessionError(f"{path}: cannot be written (it is not a regular file)")
 
 
 def _temporary(path: Path) -> Path:

@@ -15,6 +15,7 @@ import pytest
 from compensation.detections import COLUMNS, DetectedImage, flags_text, write_detections
 from compensation.markers import Detection, DetectionError, Flag, Noise, detect, grey_image, read_image
 from compensation.target import OddMarker, Target, load_target
+from drivers.interface import SessionError
 
 from .rendered import Float, Scene, photograph, render, true_centres_px
 
@@ -228,5 +229,5 @@ def test_nothing_half_written_is_left_when_an_image_fails(tmp_path: Path):
         write_detections(tmp_path / "out.csv", PAPER, images())
     assert [path.name for path in tmp_path.iterdir()] == ["out.csv"]
     assert (tmp_path / "out.csv").read_text() == "older"
-    with pytest.raises(DetectionError, match="cannot be written"):
+    with pytest.raises(SessionError, match="cannot be written"):
         write_detections(tmp_path / "nowhere" / "out.csv", PAPER, [])
