@@ -57,13 +57,6 @@ def as_svg(figure: Figure, name: str) -> str:
     return svg[svg.index("<svg") :]
 
 
-def as_png(figure: Figure, dpi: int = 110) -> bytes:
-    """The figure as a PNG."""
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=dpi)
-    return data.getvalue()
-
-
 def drift(observations: Observations) -> Float:
     """(F, N, 2): where each marker is, minus where it was at its session's reference, px.
 

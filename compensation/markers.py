@@ -24,7 +24,17 @@ from compensation.grid import DetectionError, Identified, fit_homography, identi
 from compensation.noise import Image, Noise
 from compensation.target import Target
 
-__all__ = ["Detection", "DetectionError", "Flag", "Image", "Noise", "detect", "grey_image", "read_image"]
+__all__ = [
+    "Detection",
+    "DetectionError",
+    "Flag",
+    "Image",
+    "Noise",
+    "detect",
+    "grey_image",
+    "nothing_found",
+    "read_image",
+]
 
 Float = NDArray[np.float64]
 
@@ -82,6 +92,19 @@ def detect(
             if tracked is not None and _has_followed(tracked, previous):
                 return tracked
     return _search(grey, target, None if previous is None else previous.homography, noise)
+
+
+def nothing_found(target: Target) -> Detection:
+    """All markers missing: what an image without the target has instead of a detection."""
+    count = target.count
+    return Detection(
+        centres_px=np.full((count, 2), np.nan),
+        covariance_px2=np.full((count, 2, 2), np.nan),
+        flags=np.full(count, Flag.MISSING, np.uint8),
+        chi=np.full(count, np.nan),
+        homography=np.full((3, 3), np.nan),
+        state=EdgeState(np.full((count, 12), np.nan), np.full(count, np.nan)),
+    )
 
 
 def grey_image(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:

@@ -6,7 +6,7 @@ Pixels as in compensation/markers.py: x = column = I to the right, y = row = J d
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -36,7 +36,11 @@ _PREVIEW_WIDTH_PX = 816
 
 
 class Role(StrEnum):
-    """What a frame was taken for, as its capture step says. OTHER: no such step, or one without a set-point."""
+    """What a frame was taken for, as its capture step says. OTHER: no such step, or one without a set-point.
+
+    The first four are experiments.steps.Role, written out again because this package knows recorded sessions only and
+    may not import what plans them: the words in the recording are what the two share.
+    """
 
     REFERENCE = "reference"
     FIT = "fit"
@@ -47,14 +51,15 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SessionFacts:
-    """Where frames come from. incomplete: segments that a killed recorder left behind and nobody has read."""
+    """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
+    segments that a killed recorder left behind and nobody has read."""
 
     session_id: str
     recipe: str
     camera_serial: str
     operator: str
     software_version: str
-    clock_source: str
+    simulated: bool | None
     incomplete: int
 
 
@@ -91,6 +96,11 @@ class Observations:
         """(F,): frames with markers and a camera temperature."""
         return np.array([not reason for reason in self.reasons], bool)
 
+    @property
+    def simulated(self) -> bool:
+        """Whether any of the frames are known to be of a simulated laboratory."""
+        return any(session.simulated for session in self.sessions)
+
     def of(self, *roles: Role) -> Mask:
         """(F,): usable frames taken for one of these purposes."""
         return self.usable & np.isin(self.role, [str(role) for role in roles])
@@ -114,7 +124,7 @@ def observe(session: Session, target: Target, report: Report | None = None) -> O
     found: list[_Seen] = []
     previous: Detection | None = None
     first: Frame | None = None
-    for frame in session.frames():
+    for frame in read_frames(session):
         seen = _see(frame, target, previous, None if first is None else first.image.shape)
         if seen.detection is not None:
             previous, first = seen.detection, first or frame
@@ -125,6 +135,16 @@ def observe(session: Session, target: Target, report: Report | None = None) -> O
         why = found[0].reason if found else "it has no frames"
         raise SessionError(f"{session.path}: no frame can be used; {why}")
     return _arrays(session, target, found, captures, first)
+
+
+def read_frames(session: Session) -> Iterator[Frame]:
+    """The session's frames in order; the SessionError of one that cannot be read tells which it is."""
+    index = -1
+    try:
+        for index, frame in enumerate(session.frames()):
+            yield frame
+    except SessionError as error:
+        raise SessionError(f"frame {index + 1}, counted from 0: {error}") from error
 
 
 def observe_sessions(paths: Sequence[Path], progress: Progress, target: Target | None = None) -> Observations:
@@ -223,9 +243,10 @@ def _purpose(parameters: dict[str, object]) -> tuple[Role, float]:
 
 
 def _facts(session: Session) -> SessionFacts:
-    fields = ("session_id", "recipe", "camera_serial", "operator", "software_version", "clock_source")
+    fields = ("session_id", "recipe", "camera_serial", "operator", "software_version")
     texts = {name: session.metadata.get(name, "") for name in fields}
-    return SessionFacts(**texts, incomplete=len(session.incomplete))
+    simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
+    return SessionFacts(**texts, simulated=simulated, incomplete=len(session.incomplete))
 
 
 def _air_degC(session: Session, time_ns: NDArray[np.int64]) -> Float:

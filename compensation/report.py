@@ -79,15 +79,18 @@ def _lead(observations: Observations) -> str:
     recipes = ", ".join(dict.fromkeys(session.recipe for session in observations.sessions))
     times = observations.time_ns
     text = f"Recipe {recipes}, recorded {_utc(int(times.min()))} to {_utc(int(times.max()))}, {len(times)} frames."
-    if any(session.clock_source == "virtual" for session in observations.sessions):
-        text += " Recorded in virtual time, that is with a simulated laboratory."
+    if observations.simulated:
+        text += " Recorded in a simulated laboratory."
     return text
 
 
 def _result(evaluation: Evaluation) -> str:
     rows = [
         ("paper (measured)", *_gains(PAPER_BEFORE_PX, PAPER_AFTER_PX)),
-        ("this report", *_gains(evaluation.rms_before_px, evaluation.rms_after_px)),
+        (
+            "this report (simulated)" if evaluation.simulated else "this report",
+            *_gains(evaluation.rms_before_px, evaluation.rms_after_px),
+        ),
     ]
     heads = ("RMS deviation, px", "I before", "I after", "gain", "J before", "J after", "gain")
     i, j = evaluation.coverage_95

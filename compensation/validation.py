@@ -38,6 +38,7 @@ class Evaluation:
     method: what was held out, in words. frames: how many. before_px, after_px (M, 2): reference minus measured, and
     reference minus corrected. outside (M,): beyond the model's valid range. coverage_95 (I, J): part of the deviations
     after that lie in the 95 % interval the model and the markers claim; 0.95 is right. temperatures: one per set-point.
+    simulated: whether the frames are known to be of a simulated laboratory.
     """
 
     method: str
@@ -48,6 +49,7 @@ class Evaluation:
     outside: NDArray[np.bool_]
     coverage_95: tuple[float, float]
     temperatures: tuple[TemperatureRms, ...]
+    simulated: bool
 
     @property
     def rms_before_px(self) -> tuple[float, float]:
@@ -84,6 +86,7 @@ def evaluate(model: CompensationModel, observations: Observations) -> Evaluation
         outside=~model.inside(rows.measured_px, rows.camera_degC),
         coverage_95=_coverage(model, rows, after),
         temperatures=_by_temperature(rows, after),
+        simulated=observations.simulated,
     )
 
 
@@ -142,18 +145,19 @@ def improvement_percent(before_px: float, after_px: float) -> float:
 
 def table(evaluation: Evaluation) -> str:
     """The paper's result and ours side by side, as text."""
-    before, after = evaluation.rms_before_px, evaluation.rms_after_px
+    name = "this session (simulated)" if evaluation.simulated else "this session"
+    width = len(name) + 2
     lines = [
         "RMS deviation from the reference position, px",
-        f"{'':<14}{'along I':>26}{'along J':>30}",
-        f"{'':<14}" + 2 * f"{'before':>10}{'after':>10}{'gain':>8}  ",
-        _line("paper", PAPER_BEFORE_PX, PAPER_AFTER_PX),
-        _line("this session", before, after),
+        f"{'':<{width}}{'along I':>26}{'along J':>30}",
+        f"{'':<{width}}" + 2 * f"{'before':>10}{'after':>10}{'gain':>8}  ",
+        f"{'paper':<{width}}" + _cells(PAPER_BEFORE_PX, PAPER_AFTER_PX),
+        f"{name:<{width}}" + _cells(evaluation.rms_before_px, evaluation.rms_after_px),
         f"{evaluation.frames} frames; {evaluation.method}",
     ]
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _line(name: str, before: tuple[float, float], after: tuple[float, float]) -> str:
-    cells = (f"{b:10.3f}{a:10.3f}{improvement_percent(b, a):6.0f} %  " for b, a in zip(before, after, strict=True))
-    return f"{name:<14}" + "".join(cells)
+def _cells(before: tuple[float, float], after: tuple[float, float]) -> str:
+    pairs = zip(before, after, strict=True)
+    return "".join(f"{b:10.3f}{a:10.3f}{improvement_percent(b, a):6.0f} %  " for b, a in pairs)

@@ -24,7 +24,7 @@ HELD_OUT_DEGC = (14.0, 20.0, 27.0, 34.0, 41.0, 48.0)
 
 
 def facts(session_id: str = "night-1", camera: str = "TS-0001") -> SessionFacts:
-    return SessionFacts(session_id, "thermal-cycle", camera, "operator", "0.1.0", "wall", 0)
+    return SessionFacts(session_id, "thermal-cycle", camera, "operator", "0.1.0", None, 0)
 
 
 def places_px() -> Float:

@@ -80,7 +80,7 @@ def test_it_says_what_was_found_and_what_was_left_out(page: str, analysed: Analy
         "numpy",
     ):  # fmt: skip
         assert text in page, text
-    assert "virtual time" not in page
+    assert "simulated" not in page
     rows = re.findall(r"<tr( class=chosen)?><td>(\d)</td><td>(\d+)</td>", page)
     assert [(degree, terms) for _, degree, terms in rows] == [
         ("1", "4"),
@@ -100,8 +100,11 @@ def test_an_interval_that_claims_too_much_is_told(analysed: Analysed, page: str)
 
 def test_a_simulated_session_is_called_so(analysed: Analysed):
     night, model, evaluation = analysed
-    virtual = replace(night, sessions=(replace(night.sessions[0], clock_source="virtual"),))
-    assert "simulated laboratory" in report_page(virtual, model, evaluation)
+    for simulated, tells in ((True, True), (False, False), (None, False)):
+        own = replace(night, sessions=(replace(night.sessions[0], simulated=simulated),))
+        page = report_page(own, model, evaluate(model, own))
+        assert ("Recorded in a simulated laboratory." in page) is tells
+        assert ("<td>this report (simulated)</td>" in page) is tells
 
 
 def test_a_report_that_cannot_be_written_leaves_nothing(analysed: Analysed, tmp_path: Path):
@@ -133,4 +136,4 @@ def test_figures_bear_missing_frames_and_temperatures():
     holes = replace(night, centres_px=centres, air_degC=air)
     assert np.isnan(figures.drift(holes)[3]).all()
     for figure in (figures.trajectories(holes, holes.of(*Role)), figures.against_time(holes)):
-        assert figures.as_png(figure).startswith(b"\x89PNG")
+        assert figures.as_svg(figure, "holes").startswith("<svg")

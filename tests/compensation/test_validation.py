@@ -102,6 +102,14 @@ def test_the_table_stands_beside_the_papers(night: Observations, model: Compensa
         "this session       0.200     0.010    95 %       0.500     0.050    90 %",
         "12 frames; held-out temperatures",
     ]
+    assert table(replace(exact, simulated=True)).splitlines() == [
+        "RMS deviation from the reference position, px",
+        "                                             along I                       along J",
+        "                              before     after    gain      before     after    gain",
+        "paper                          0.191     0.100    48 %       0.576     0.090    84 %",
+        "this session (simulated)       0.200     0.010    95 %       0.500     0.050    90 %",
+        "12 frames; held-out temperatures",
+    ]
 
 
 def test_growth_is_a_negative_gain():
