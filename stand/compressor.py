@@ -45,7 +45,7 @@ def decide(
         if unwanted and held_ns >= seconds_ns(limits.min_on_s):
             return CompressorState(running=False, since_ns=now_ns, starts_ns=starts_ns)
         return replace(state, starts_ns=starts_ns)
-    wanted = mv_cool > limits.start_above_cool_percent and not mv_heat > 0
+    wanted = mv_cool > limits.start_above_cool_percent and mv_heat <= 0
     rested = held_ns >= seconds_ns(limits.min_off_s)
     if wanted and rested and len(starts_ns) < limits.max_starts_per_h:
         return CompressorState(running=True, since_ns=now_ns, starts_ns=(*starts_ns, now_ns))

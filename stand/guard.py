@@ -16,8 +16,9 @@ from stand.stand import Stand
 class Guard:
     """Every `period_s` the rules, every `renew_s` the permits.
 
-    On a fault, in this order: latch, actuators safe, `abort(fault)`, and the trip recorded. A permit that cannot be
-    renewed is not a fault by itself: the relay then drops, which is its safe state, and the event says so.
+    On a fault, in this order: `stop(fault)` latches the stand and cancels the run where it waits, the trip is
+    recorded, the actuators are made safe. A permit that cannot be renewed is not a fault by itself: the relay then
+    drops, which is its safe state, and the event says so.
     """
 
     stand: Stand
@@ -26,28 +27,27 @@ class Guard:
     clock: Clock
     period_s: float
     renew_s: float
-    abort: Callable[[Fault], None]
+    stop: Callable[[Fault], None]
+
+    async def check(self) -> bool:
+        """Whether every rule holds; when one does not, the stand has been made safe."""
+        fault = first_fault(self.rules, self.hub, self.clock.now_ns())
+        if fault is None:
+            return True
+        self.stop(fault)
+        self.hub.publish(Event(self.clock.now_ns(), "error", f"guard.{fault.rule}", fault.text))
+        await self.stand.make_safe()
+        return False
 
     async def run(self) -> None:
         """Watch until cancelled or tripped."""
-        renew_ns = self.clock.now_ns()
-        due_ns = self.clock.now_ns()
-        while True:
-            fault = first_fault(self.rules, self.hub.latest, self.clock.now_ns())
-            if fault is not None:
-                await self._trip(fault)
-                return
+        renew_ns = due_ns = self.clock.now_ns()
+        while await self.check():
             if self.clock.now_ns() >= renew_ns:
                 renew_ns = self.clock.now_ns() + seconds_ns(self.renew_s)
                 await self._renew()
             due_ns = max(due_ns + seconds_ns(self.period_s), self.clock.now_ns())
             await self.clock.sleep_until(due_ns)
-
-    async def _trip(self, fault: Fault) -> None:
-        self.stand.latch(fault)
-        await self.stand.make_safe()
-        self.abort(fault)
-        self.hub.publish(Event(self.clock.now_ns(), "error", f"guard.{fault.rule}", fault.text))
 
     async def _renew(self) -> None:
         try:

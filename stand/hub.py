@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from drivers.interface import Frame, Reading
+from drivers.interface import Frame, Quality, Reading
 
 
 class StepState(StrEnum):
@@ -60,6 +60,7 @@ class Hub:
 
     def __init__(self) -> None:
         self._latest: dict[str, Reading] = {}
+        self._good_ns: dict[str, int] = {}
         self._subscribers: list[Subscriber] = []
 
     def subscribe(self, subscriber: Subscriber) -> None:
@@ -71,9 +72,15 @@ class Hub:
         if isinstance(item, Batch):
             for reading in item.readings:
                 self._latest[reading.channel] = reading
+                if reading.quality is Quality.GOOD:
+                    self._good_ns[reading.channel] = reading.time_ns
         for subscriber in self._subscribers:
             subscriber(item)
 
     def latest(self, channel: str) -> Reading | None:
         """The last reading of `channel`, or None when there was none yet."""
         return self._latest.get(channel)
+
+    def last_good_ns(self, channel: str) -> int | None:
+        """When `channel` last gave a GOOD reading, or None when it never did."""
+        return self._good_ns.get(channel)

@@ -32,7 +32,8 @@ SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; FrameMeta has 
 class SessionInfo:
     """Who recorded what with which; the metadata record `session` of every segment.
 
-    On a virtual clock `host` is not recorded: the same run on another machine is the same session.
+    simulated: the devices were fakes, in whatever time. On a virtual clock `host` is not recorded: the same run on
+    another machine is the same session.
     """
 
     session_id: str
@@ -41,11 +42,12 @@ class SessionInfo:
     operator: str
     software_version: str
     clock_source: Literal["wall", "virtual"]
+    simulated: bool = False
     host: str = ""
 
     def metadata(self) -> dict[str, str]:
         """The fields as MCAP metadata."""
-        fields: dict[str, str] = asdict(self)
+        fields: dict[str, str] = {**asdict(self), "simulated": str(self.simulated).lower()}
         if self.clock_source == "virtual":
             del fields["host"]
         return fields
@@ -152,6 +154,11 @@ class Recorder:
         self._losses = Losses()
         self._telemetry_failing = False
         self._open = False
+
+    @property
+    def frames_lost(self) -> int:
+        """Frames published but not in the session."""
+        return self._losses.total
 
     def start(self) -> None:
         """Make the folders, begin the telemetry and listen to the hub; SessionError when the disk refuses."""
@@ -287,7 +294,7 @@ class Losses:
     """Frames that will not be in the session: counted, and told by reason."""
 
     def __init__(self) -> None:
-        self._total = 0
+        self.total = 0
         self._new: deque[tuple[str, int]] = deque()  # counted in the frames' lane, too, hence a deque
 
     def count(self, frame: Frame, reason: str) -> None:
@@ -300,8 +307,8 @@ class Losses:
         while self._new:
             reason, block_id = self._new.popleft()
             blocks.setdefault(reason, []).append(block_id)
-            self._total += 1
+            self.total += 1
         return [
-            f"frames lost: {len(ids)} (blocks {ids[0]} to {ids[-1]}), {self._total} in all; {reason}"
+            f"frames lost: {len(ids)} (blocks {ids[0]} to {ids[-1]}), {self.total} in all; {reason}"
             for reason, ids in blocks.items()
         ]

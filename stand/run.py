@@ -6,14 +6,14 @@ import asyncio
 import importlib.metadata
 import platform
 import signal
-from collections.abc import Callable, Coroutine
-from contextlib import AsyncExitStack
+from collections.abc import Callable, Coroutine, Mapping
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from drivers.clock import NS_PER_S, Clock, VirtualClock, WallClock
-from drivers.interface import ConfigError, StandError, StandTripped
+from drivers.clock import NS_PER_S, Clock, VirtualClock, WallClock, seconds_ns
+from drivers.interface import ConfigError, SessionError, StandError, StandTripped
 from stand.assembly import Assembly, assemble
 from stand.config import StandConfig
 from stand.hub import Event, Hub
@@ -22,6 +22,7 @@ from stand.recipe import Recipe
 from stand.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.scheduler import Scheduler
 from stand.simulator import ControlSocket, Simulator, laboratory_of
+from stand.stand import Stand
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,32 +37,93 @@ class Order:
 
 
 class Interrupted(StandError):
-    """The operator ended the run (Ctrl-C or SIGTERM); the stand was made safe first."""
+    """The operator ended the run (Ctrl-C or SIGTERM); the text says whether the stand confirmed its safe state."""
 
 
 async def run_virtual(order: Order, out: Path, seed: int | None, watch: Callable[[Hub], None]) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
     The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start.
+    Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
     """
     laboratory = laboratory_of(order.config, virtual=True, seed=seed)
     simulation = order.config.simulation
     if simulation is None:
         raise ConfigError(f"{order.config.name}: virtual time needs a `simulation` section")
-    simulator = await asyncio.to_thread(Simulator, laboratory)
-    control = ControlSocket(simulation.control)
-    try:
+    start_ns = seconds_ns(simulation.start.timestamp())
+    async with Stop() as stop, AsyncExitStack() as stack:
+        simulator = await _started(laboratory)
+        stack.push_async_callback(asyncio.to_thread, simulator.stop)
+        control = ControlSocket(simulation.control)
+        stack.push_async_callback(control.close)
         await control.open()
-        clock = VirtualClock(round(simulation.start.timestamp()) * NS_PER_S, control.advance)
-        return await _run(order, out, clock, clock.run, watch)
-    finally:
-        await control.close()
-        await asyncio.to_thread(simulator.stop)
+        clock = VirtualClock(start_ns, control.advance)
+        return await _run(order, out, clock, clock.run, watch, stop)
 
 
 async def run_real(order: Order, out: Path, watch: Callable[[Hub], None]) -> Path:
-    """Run on the host's clock, against whatever answers at the configured addresses; returns the session's folder."""
-    return await _run(order, out, WallClock(), None, watch)
+    """Run on the host's clock, against whatever answers at the configured addresses; else as run_virtual."""
+    async with Stop() as stop:
+        return await _run(order, out, WallClock(), None, watch, stop)
+
+
+class Stop:
+    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM): `stop(fault)`.
+
+    The run is cancelled where it waits, once, and not while it is being taken down; what it then raises becomes
+    Interrupted or StandTripped with the first reason. The stand's own latch is closed first.
+    """
+
+    def __init__(self) -> None:
+        self.stand: Stand | None = None
+        self.fault: Fault | None = None
+        self._cancellable = True
+
+    def __call__(self, fault: Fault) -> None:
+        """Latch and cancel; making safe is the caller's next step, and the run's last."""
+        self.fault = self.fault or fault
+        if self.stand is not None:
+            self.stand.latch(fault)
+        if self._cancellable:
+            self.taking_down()
+            self._run.cancel()
+
+    def taking_down(self) -> None:
+        """From here on the run cleans up and must not be cancelled."""
+        self._cancellable = False
+
+    async def __aenter__(self) -> Stop:
+        running = asyncio.current_task()
+        if running is None:
+            raise ValueError("a run is stopped by its task; there is none")
+        self._run = running
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, self, Fault("operator", "stopped by the operator"))
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().remove_signal_handler(number)
+        if self.fault is None or error is None:
+            return
+        unsafe = self.stand.unconfirmed if self.stand is not None else ()
+        text = f"{self.fault.text}; " + (f"NOT SAFE: {'; '.join(unsafe)}" if unsafe else "the stand is safe")
+        if isinstance(error, SessionError):
+            text = f"{text}; {error}"
+        if isinstance(error, asyncio.CancelledError):
+            self._run.uncancel()
+        raise (Interrupted(text) if self.fault.rule == "operator" else StandTripped(text)) from error
+
+
+async def _started(laboratory: Mapping[str, object]) -> Simulator:
+    """The simulator process; when the run is stopped meanwhile, it is ended again."""
+    starting = asyncio.ensure_future(asyncio.to_thread(Simulator, laboratory))
+    try:
+        return await asyncio.shield(starting)
+    except asyncio.CancelledError:
+        simulator = await starting
+        await asyncio.to_thread(simulator.stop)
+        raise
 
 
 async def _run(
@@ -70,6 +132,7 @@ async def _run(
     clock: Clock,
     time: Callable[[], Coroutine[None, None, None]] | None,
     watch: Callable[[Hub], None],
+    stop: Stop,
 ) -> Path:
     hub = Hub()
     watch(hub)
@@ -81,95 +144,52 @@ async def _run(
         if time is not None:
             background.append(asyncio.create_task(time()))
         stack.push_async_callback(_close, assembly)
-        await _watched(_open(assembly), background)
-        recorder = Recorder(
-            directory,
-            _session_info(order, directory, clock, assembly),
-            {"config.yaml": order.config_text, "recipe.yaml": order.recipe_text, "target.yaml": order.target_text},
-            _kinds(order.config),
-            hub,
-            clock,
-            RecordingSettings(order.config.recording.frame_encoding, order.config.recording.telemetry_commit_s),
-        )
+        stop.stand = assembly.stand
+        await _opened(assembly, background, stop)
+        recorder = _recorder(order, directory, assembly)
         recorder.start()
-        stack.push_async_callback(recorder.finish)
-        background.append(asyncio.create_task(recorder.run()))
-        await _perform(assembly, order.recipe, background)
+        recording = asyncio.create_task(recorder.run())
+        stack.push_async_callback(_finish, recorder, recording)
+        await _perform(assembly, order.recipe, [*background, recording], stop)
+    if recorder.frames_lost:
+        raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
     return directory
 
 
-async def _perform(assembly: Assembly, recipe: Recipe, background: list[asyncio.Task[None]]) -> None:
+async def _perform(assembly: Assembly, recipe: Recipe, background: list[asyncio.Task[None]], stop: Stop) -> None:
     """Poll, guard and run the plan; on every way out the actuators are safe before anything else is taken down."""
     hub, clock, stand = assembly.hub, assembly.clock, assembly.stand
-    pollers = assembly.pollers()
-    stopping: list[Fault] = []
-    plan = asyncio.create_task(Scheduler(stand, hub, clock).run(recipe.plan()))
-
-    def abort(fault: Fault) -> None:
-        stopping.append(fault)
-        plan.cancel()
-
+    pollers, guard = assembly.pollers(), assembly.guard(stop)
+    watchers: list[asyncio.Task[None]] = []
     try:
         for poller in pollers:
             await _watched(poller.first(), background)
-        background.extend(asyncio.create_task(poller.run()) for poller in pollers)
-        background.append(asyncio.create_task(assembly.guard(abort).run()))
         hub.publish(Event(clock.now_ns(), "info", "run.start", f"recipe {recipe.name}"))
-        with _signals(assembly, abort):
-            await _watched(plan, background)
-    except asyncio.CancelledError:
-        if not stopping:
-            raise
-        hub.publish(Event(clock.now_ns(), "error", "run.end", f"aborted: {stopping[0].text}"))
-        if stopping[0].rule == "operator":
-            raise Interrupted(stopping[0].text) from None
-        raise StandTripped(f"the run was aborted: {stopping[0].text}") from None
+        await guard.check()  # nothing moves before the rules have held once
+        watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
+        watchers.append(asyncio.create_task(guard.run()))
+        await _watched(Scheduler(stand, hub, clock).run(recipe.plan()), [*background, *watchers])
     except BaseException as error:
-        hub.publish(Event(clock.now_ns(), "error", "run.end", f"failed: {error}"))
+        reason = f"aborted: {stop.fault.text}" if stop.fault is not None else f"failed: {error or 'cancelled'}"
+        hub.publish(Event(clock.now_ns(), "error", "run.end", reason))
         raise
     else:
         hub.publish(Event(clock.now_ns(), "info", "run.end", "complete"))
     finally:
-        plan.cancel()
-        if not stopping:  # else that was the first thing done
-            await stand.make_safe()
+        stop.taking_down()
+        await stand.make_safe()
+        await _cancel(watchers)
         # One more look at every device, so that the recording ends with the safe state as the wire tells it.
         for poller in pollers:
             await poller.poll()
 
 
-class _signals:
-    """SIGINT and SIGTERM make the stand safe, then abort the plan."""
+async def _watched(work: Coroutine[None, None, None], background: list[asyncio.Task[None]]) -> None:
+    """Await `work`, but raise at once what a background task raises: without time or polls nothing would wake it.
 
-    def __init__(self, assembly: Assembly, abort: Callable[[Fault], None]) -> None:
-        self._assembly = assembly
-        self._abort = abort
-        self._task: asyncio.Task[None] | None = None
-
-    def __enter__(self) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, self._stop)
-
-    def __exit__(self, *_: object) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().remove_signal_handler(number)
-
-    def _stop(self) -> None:
-        if self._task is None:
-            self._task = asyncio.create_task(self._make_safe())
-
-    async def _make_safe(self) -> None:
-        fault = Fault("operator", "stopped by the operator")
-        self._assembly.stand.latch(fault)
-        await self._assembly.stand.make_safe()
-        self._abort(fault)
-
-
-async def _watched(
-    work: Coroutine[None, None, None] | asyncio.Task[None], background: list[asyncio.Task[None]]
-) -> None:
-    """Await `work`, but raise at once what a background task raises: without time or polls nothing would wake it."""
-    task = asyncio.ensure_future(work)
+    On any other way out than its own, `work` has ended before this returns.
+    """
+    task = asyncio.create_task(work)
     try:
         pending = set(background)
         while not task.done():
@@ -179,7 +199,17 @@ async def _watched(
                 finished.result()
         await task
     finally:
-        task.cancel()
+        await _cancel([task])
+
+
+async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop: Stop) -> None:
+    """Open everything; when that fails or is stopped half-way, whatever already answers is made safe."""
+    try:
+        await _watched(_open(assembly), background)
+    except BaseException:
+        stop.taking_down()
+        await assembly.stand.make_safe()
+        raise
 
 
 async def _open(assembly: Assembly) -> None:
@@ -199,11 +229,15 @@ async def _open(assembly: Assembly) -> None:
 
 async def _close(assembly: Assembly) -> None:
     devices = assembly.devices
-    await devices.camera.close()
-    for axis in devices.axes.values():
-        await axis.close()
-    await devices.flap.close()
+    for close in (devices.camera.close, *(axis.close for axis in devices.axes.values()), devices.flap.close):
+        with suppress(StandError):  # closing never decides a run, and one device must not keep the next from it
+            await close()
     await assembly.bus.close()
+
+
+async def _finish(recorder: Recorder, recording: asyncio.Task[None]) -> None:
+    await _cancel([recording])
+    await recorder.finish()
 
 
 async def _cancel(tasks: list[asyncio.Task[None]]) -> None:
@@ -220,16 +254,25 @@ def _session_directory(out: Path, order: Order, clock: Clock) -> Path:
     return directory
 
 
-def _session_info(order: Order, directory: Path, clock: Clock, assembly: Assembly) -> SessionInfo:
-    return SessionInfo(
+def _recorder(order: Order, directory: Path, assembly: Assembly) -> Recorder:
+    config, clock = order.config, assembly.clock
+    info = SessionInfo(
         session_id=directory.name,
         recipe=order.recipe.name,
-        operator=order.config.operator,
+        operator=config.operator,
         camera_serial=assembly.devices.camera.identity.serial_number,
         software_version=importlib.metadata.version("thermostand"),
         clock_source="virtual" if isinstance(clock, VirtualClock) else "wall",
+        simulated=config.simulation is not None,
         host=platform.node(),
     )
+    attachments = {
+        "config.yaml": order.config_text,
+        "recipe.yaml": order.recipe_text,
+        "target.yaml": order.target_text,
+    }
+    settings = RecordingSettings(config.recording.frame_encoding, config.recording.telemetry_commit_s)
+    return Recorder(directory, info, attachments, _kinds(config), assembly.hub, clock, settings)
 
 
 def _kinds(config: StandConfig) -> dict[str, str]:

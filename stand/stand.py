@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from drivers.camera import Camera
 from drivers.clock import Clock, seconds_ns
 from drivers.flap import Flap
-from drivers.interface import ConfigError, Frame, StandError, StandTripped, Unreachable
+from drivers.interface import ConfigError, Frame, StandTripped, Unreachable
 from drivers.regulator import Regulator
 from drivers.relays import Relays
 from drivers.stage import Axis
@@ -58,6 +58,9 @@ class Stand:
         self._permitted = False
         # After a start nobody knows when the compressor last ran: assume it was switched off just now.
         self._compressor = CompressorState(running=False, since_ns=clock.now_ns())
+        self._compressor_until_ns = 0  # when its timed-on relay drops unless renewed
+        self._making_safe = asyncio.Lock()
+        self.unconfirmed: tuple[str, ...] = ()  # what the last make_safe could not confirm
 
     def latch(self, fault: Fault) -> None:
         """Close the gate until an operator clears it; the first fault stays."""
@@ -68,8 +71,10 @@ class Stand:
         """Permit heating and cooling, set the set-point, run the regulator."""
         self._check(chamber_degC)
         await self.devices.regulator.set_temperature(chamber_degC)
+        self._check()  # after every wait: a fault may have closed the gate meanwhile
         self._permitted = True
         await self.renew_permits()
+        self._check()
         await self.devices.regulator.run()
 
     async def set_temperature(self, chamber_degC: float) -> None:
@@ -82,25 +87,34 @@ class Stand:
         self._permitted = False
         await self.devices.regulator.stop()
         await self.devices.relays.switch("heater_enable", on=False)
-        await self._switch_compressor_off()
+        await self.devices.relays.switch("compressor", on=False)
+        self._compressor_is_off()
 
     async def renew_permits(self) -> None:
         """Re-arm the timed-on relays of the heater and the compressor; only the guard calls this, while all is well.
 
         Both drop by themselves `hold_s` after the last call: a dead daemon neither heats nor cools.
         """
-        if not self._permitted:
-            return
-        await self.devices.relays.hold_on("heater_enable", self._limits.hold_s)
+        if self._permitted:
+            await self.devices.relays.hold_on("heater_enable", self._limits.hold_s)
+        if self._permitted:  # still, after the wait
+            await self._renew_compressor()
+
+    async def _renew_compressor(self) -> None:
+        now_ns = self._clock.now_ns()
+        if self._compressor.running and now_ns >= self._compressor_until_ns:
+            # It could not be renewed in time and has dropped by itself: its rest began there.
+            self._compressor = CompressorState(False, self._compressor_until_ns, self._compressor.starts_ns)
         wanted = decide(
             self._compressor,
             self._limits.compressor,
             self._latest("regulator.mv_heat"),
             self._latest("regulator.mv_cool"),
-            self._clock.now_ns(),
+            now_ns,
         )
         if wanted.running:
             await self.devices.relays.hold_on("compressor", self._limits.hold_s)
+            self._compressor_until_ns = now_ns + seconds_ns(self._limits.hold_s)
         elif self._compressor.running:
             await self.devices.relays.switch("compressor", on=False)
         if wanted.running != self._compressor.running:
@@ -124,12 +138,13 @@ class Stand:
 
     async def capture(self, frames: int, interval_s: float, exposure_s: float, step_id: str) -> None:
         """`frames` images, one each `interval_s` by absolute deadlines; each published as soon as it is there."""
-        start_ns = self._clock.now_ns()
-        for number in range(frames):
+        due_ns = self._clock.now_ns()
+        for _ in range(frames):
+            await self._clock.sleep_until(due_ns)
             self._check()
-            await self._clock.sleep_until(start_ns + number * seconds_ns(interval_s))
             frame = await self._grab(exposure_s)
             self._hub.publish(replace(frame, step_id=step_id))
+            due_ns = max(due_ns + seconds_ns(interval_s), self._clock.now_ns())  # no burst after a lost camera
 
     async def _grab(self, exposure_s: float) -> Frame:
         """One frame; a camera lost meanwhile is opened anew and asked once more, and the event says so."""
@@ -164,26 +179,30 @@ class Stand:
         await self._open_camera()
 
     async def make_safe(self) -> None:
-        """Every actuator to its safe state, all at once, within a real-time limit; failures become events."""
+        """Every actuator to its safe state, all at once, within a real-time limit; what failed is in `unconfirmed`."""
         self._permitted = False
-        devices = self.devices
-        actions = {
-            "regulator": devices.regulator.make_safe(),
-            "relays": devices.relays.make_safe(),
-            "flap": devices.flap.make_safe(),
-            **{name: axis.make_safe() for name, axis in devices.axes.items()},
-        }
-        await asyncio.gather(*(self._safely(name, action) for name, action in actions.items()))
-        if self._compressor.running:
-            self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
+        async with self._making_safe:
+            devices = self.devices
+            actions = {
+                "regulator": devices.regulator.make_safe(),
+                "relays": devices.relays.make_safe(),
+                "flap": devices.flap.make_safe(),
+                **{name: axis.make_safe() for name, axis in devices.axes.items()},
+            }
+            failures = await asyncio.gather(*(self._safely(name, action) for name, action in actions.items()))
+            self.unconfirmed = tuple(failure for failure in failures if failure)
+            self._compressor_is_off()
 
-    async def _safely(self, name: str, action: Awaitable[None]) -> None:
+    async def _safely(self, name: str, action: Awaitable[None]) -> str:
+        """Why the safe state of `name` is not confirmed, "" when it is."""
         try:
             async with asyncio.timeout(_SAFE_LIMIT_S):
                 await action
-        except (StandError, TimeoutError) as error:
+        except Exception as error:  # noqa: BLE001 - whatever one actuator does, the others must still be made safe
             text = f"{name} did not confirm its safe state: {str(error) or 'no answer in time'}"
             self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text))
+            return text
+        return ""
 
     async def _open_camera(self) -> None:
         deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S)
@@ -195,8 +214,7 @@ class Stand:
                     raise
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_CAMERA_RETRY_S))
 
-    async def _switch_compressor_off(self) -> None:
-        await self.devices.relays.switch("compressor", on=False)
+    def _compressor_is_off(self) -> None:
         if self._compressor.running:
             self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.clock import FollowedClock, WallClock
+from drivers.clock import FollowedClock, WallClock, seconds_ns
 from drivers.documents import Document
 from drivers.interface import ConfigError
 from drivers.sim.camera import FakeCamera
@@ -193,6 +193,18 @@ def _silent_bus(laboratory: Laboratory, value: object) -> None:
     laboratory.bus_faults.silent = bool(value)
 
 
+def _silent_relays(laboratory: Laboratory, value: object) -> None:
+    """The board does not answer for so many s of simulated time."""
+    relays, plant = laboratory.relays, laboratory.plant
+    until_ns = plant.now_ns + seconds_ns(float(str(value)))
+    relays.silent = True
+
+    def wait(time_ns: int, dt_s: float) -> None:
+        relays.silent = relays.silent and time_ns < until_ns
+
+    plant.on_step.append(wait)
+
+
 def _flap_jam(laboratory: Laboratory, value: object) -> None:
     laboratory.flap.jam_position = None if value is None else int(str(value))
 
@@ -207,6 +219,7 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "regulator.sensor_break": _sensor_break,
     "regulator.pv_offset_K": _pv_offset,  # the probe reads wrong by this much
     "bus.silent": _silent_bus,
+    "relays.silent_s": _silent_relays,  # its timed-on relays go on and drop
     "flap.jam": _flap_jam,  # feedback counts at which it stops
     "camera.loss": _camera_loss,  # share of stream packets lost
 }

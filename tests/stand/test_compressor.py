@@ -1,5 +1,6 @@
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,9 +25,10 @@ def test_it_runs_on_while_the_heater_trims_and_stops_when_it_works_hard_against_
     assert not decide(state, LIMITS, 90.0, 0.0, seconds_ns(180)).running
 
 
-def test_an_unknown_output_never_starts_it():
+@pytest.mark.parametrize(("mv_heat", "mv_cool"), [(math.nan, math.nan), (math.nan, 80.0), (0.0, math.nan)])
+def test_an_unknown_output_never_starts_it(mv_heat: float, mv_cool: float):
     state = CompressorState(running=False, since_ns=0)
-    assert not decide(state, LIMITS, math.nan, math.nan, seconds_ns(10_000)).running
+    assert not decide(state, LIMITS, mv_heat, mv_cool, seconds_ns(10_000)).running
 
 
 @given(st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=400))

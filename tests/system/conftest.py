@@ -54,7 +54,9 @@ def config_text(tmp_path: Path) -> Callable[..., str]:
         for name, axis in data["axes"].items():
             axis["address"] = f"serial:{tmp_path / name}"
         data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
-        data["camera"]["address"] = "127.0.0.41"
+        data["camera"]["address"] = (
+            f"127.0.{10 + os.getpid() % 200}.{1 + os.getpid() // 200 % 250}"  # runs side by side
+        )
         data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
         for section, entries in sections.items():
             data[section].update(entries)

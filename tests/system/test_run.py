@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import hashlib
+import itertools
+import os
 import pickle
 import signal
 import sys
@@ -14,11 +16,11 @@ import pytest
 
 from drivers.clock import seconds_ns
 from drivers.interface import ConfigError, StandTripped, Unreachable
-from stand.hub import Event, Hub, Item, StepMark, StepState
-from stand.run import Order, run_virtual
+from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
+from stand.run import Interrupted, Order, run_virtual
 from stand.session import Session
 from stand.simulator import ControlSocket
-from tests.system.conftest import require_aravis
+from tests.system.conftest import SHORT_RECIPE, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 
@@ -104,7 +106,8 @@ def check_temperatures(session: Session) -> None:
     [
         ("thermometer.open", "air", "thermometers.air is BAD"),
         ("regulator.sensor_break", True, "regulator.pv is BAD"),
-        ("bus.silent", True, "BAD|last read"),
+        ("bus.silent", True, "BAD|last good"),
+        ("regulator.pv_offset_K", 60, "regulator.pv is 8.* above the limit of 65.0 degC"),
     ],
 )
 async def test_a_lost_safety_sensor_makes_the_stand_safe_and_ends_the_run(
@@ -183,6 +186,64 @@ async def test_a_dead_daemon_does_not_heat(tmp_path: Path, order: Callable[..., 
     if number is signal.SIGSTOP:
         daemon.kill()
         await daemon.wait()
+
+
+EVERY_KIND = SHORT_RECIPE.replace("frames_per_point: 1", "frames_per_point: 20")
+
+
+@pytest.mark.parametrize("kind", ["MoveTo", "StartChamber", "Soak", "OpenFlap", "Capture", "CloseFlap"])
+async def test_an_interrupt_in_any_step_leaves_the_stand_safe(tmp_path: Path, order: Callable[..., Order], kind: str):
+    """The step's own command is on the wire when the interrupt comes: it must not win over making safe."""
+    with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
+        await run_virtual(
+            order(EVERY_KIND), tmp_path / "out", None, at_step(kind, lambda: os.kill(os.getpid(), signal.SIGINT))
+        )
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    assert session.incomplete == ()
+    for channel in ("regulator.running", "relays.heater_enable", "relays.compressor", "linear.moving"):
+        assert session.readings(channel)[1][-1] == 0, channel
+    assert session.readings("flap.position")[1][-1] == pytest.approx(0, abs=0.02)
+    assert [event.text for event in session.events() if event.kind == "run.end"] == ["aborted: stopped by the operator"]
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.2, 0.6, 1.0])
+async def test_an_interrupt_while_the_stand_is_opened_leaves_no_simulator(
+    tmp_path: Path, order: Callable[..., Order], delay_s: float
+):
+    ordered = order()
+    asyncio.get_running_loop().call_later(delay_s, os.kill, os.getpid(), signal.SIGTERM)
+    with pytest.raises(Interrupted, match="stopped by the operator"):
+        await run_virtual(ordered, tmp_path / "out", None, ignore)
+    simulation = ordered.config.simulation
+    assert simulation is not None
+    with pytest.raises(Unreachable, match="nobody listens"):
+        await ControlSocket(simulation.control).open()
+
+
+async def test_a_compressor_that_dropped_by_itself_rests_before_it_starts_again(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    """The relay board is silent for longer than the compressor's timed-on relay holds, then answers again."""
+    recipe = SHORT_RECIPE.replace("[30, 20, 24]", "[10]").replace("held_out_degC: [20]", "held_out_degC: []")
+    ordered = order(recipe.replace("dwell_s: 600", "dwell_s: 1500"), bus={"timeout_s": 0.05})
+    states: list[tuple[int, float]] = []
+    tasks: list[asyncio.Task[None]] = []
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Batch) and item.device == "relays":
+            states.append((item.time_ns, next(r.value for r in item.readings if r.channel == "relays.compressor")))
+            if states[-1][1] == 1 and not tasks:
+                tasks.append(asyncio.create_task(fault(ordered, "relays.silent_s", 40)))
+
+    await run_virtual(ordered, tmp_path / "out", None, lambda hub: hub.subscribe(follow))
+    await asyncio.gather(*tasks)
+    known = [(time_ns, value) for time_ns, value in states if value == value]
+    offs = [later for (_, was), (later, value) in itertools.pairwise(known) if was == 1 and value == 0]
+    ons = [later for (_, was), (later, value) in itertools.pairwise(known) if was == 0 and value == 1]
+    assert offs
+    rests_s = [(min(on for on in ons if on > off) - off) / 1e9 for off in offs if any(on > off for on in ons)]
+    assert rests_s
+    assert min(rests_s) >= 270  # min_off_s 300, seen by a poll every 10 s after a drop during the silence
 
 
 async def test_a_second_laboratory_at_the_same_addresses_is_refused_with_a_reason(
