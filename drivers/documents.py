@@ -12,6 +12,8 @@ from pydantic_core import ErrorDetails
 
 from drivers.interface import ConfigError
 
+_LONGEST_VALUE = 200  # characters of a faulty value that a message shows
+
 
 class Document(BaseModel):
     """Base of every configuration model: unknown keys are errors, values do not change after loading."""
@@ -46,8 +48,12 @@ def parse_document(text: str, model: type[Model], where: str) -> Model:
     """YAML text as `model`; `where` (a file name) begins every message of the ConfigError it may raise."""
     try:
         data = yaml.load(text, _Loader)  # a SafeLoader
-    except yaml.YAMLError as error:
+    except RecursionError:
+        raise ConfigError(f"{where}: not YAML that can be read (nested too deeply)") from None
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a number or a date that Python cannot represent
         raise ConfigError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
+    except (LookupError, AttributeError) as error:  # what PyYAML lets out at a tag such as !!bool x
+        raise ConfigError(f"{where}: not YAML (a value does not fit its tag)") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{where}: expected keys and values at the top, found {type(data).__name__}")
     try:
@@ -72,8 +78,17 @@ def _sentence(where: str, details: ErrorDetails) -> str:
     path = ".".join(str(part) for part in details["loc"]) or "(top)"
     text = details["msg"].removeprefix("Value error, ")
     value = details["input"]
-    shown = "" if isinstance(value, dict | list) or value is None else f" (got {value!r})"
+    shown = "" if isinstance(value, dict | list) or value is None else f" (got {_shown(value)})"
     if details["type"] == "extra_forbidden":
         text = "unknown key"
         shown = ""
     return f"{where}: {path}: {text}{shown}"
+
+
+def _shown(value: object) -> str:
+    """The value as it was given, shortened to what a reader needs to find it."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        return "a huge integer"
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."

@@ -77,6 +77,29 @@ def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path
         load_config(file)
 
 
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("name: " + "[" * 5000 + "]" * 5000, "nested too deeply"),
+        ("name: " + "1" * 5000, "5000 digits"),
+        ("name: 0x" + "f" * 9000, "name: Input should be a valid string (got a huge integer)"),
+        ("name: 2026-13-45", "month must be in 1..12"),
+        ("name: !!bool x", "does not fit its tag"),
+        ("name: !!int ''", "does not fit its tag"),
+        ("name: !!timestamp x", "does not fit its tag"),
+    ],
+    ids=["nested", "digits", "hexadecimal", "date", "bool", "int", "timestamp"],
+)
+def test_yaml_that_python_cannot_hold_is_refused_with_a_sentence(tmp_path: Path, text: str, sentence: str):
+    file = tmp_path / "hostile.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(file)
+    assert str(caught.value).startswith(f"{file}: ")
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_missing_file_lists_what_there_is():
     with pytest.raises(ConfigError, match=r"thermal_cycle: no such file.*demo, thermal-cycle, warm-up"):
         packaged("recipes", "thermal_cycle")
