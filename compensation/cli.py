@@ -7,18 +7,18 @@ import sys
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
-import numpy as np
 import typer
+from typer.core import TyperGroup
 
 from compensation.detections import DetectedImage, write_detections
 from compensation.drift import MAX_DEGREE, CompensationModel
-from compensation.edge_model import EdgeState
 from compensation.files import check_writable
+from compensation.fitting import check_degree
 from compensation.fitting import fit as fit_model
-from compensation.markers import Detection, DetectionError, Flag, Image, detect, read_image
-from compensation.observations import observe_sessions, session_target
+from compensation.markers import Detection, DetectionError, Image, detect, nothing_found, read_image
+from compensation.observations import observe_sessions, read_frames, session_target
 from compensation.report import write_report
 from compensation.target import Target, load_target
 from compensation.validation import evaluate, table
@@ -26,7 +26,35 @@ from drivers.interface import ConfigError, StandError
 from stand.progress import progress
 from stand.session import Session
 
+# The base of what typer raises for wrong arguments; it exports only this descendant.
+_UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
+
+
+class _OneLineUsage(TyperGroup):
+    """Says what is wrong with the arguments in one line, as every other error is said; no arguments ask for help."""
+
+    def make_context(self, info_name: str | None, args: list[str], *rest: Any, **extra: Any) -> Any:
+        if not args:
+            return super().make_context(info_name, args, *rest, **extra)
+        with _one_line_usage():
+            return super().make_context(info_name, args, *rest, **extra)
+
+    def invoke(self, ctx: Any) -> Any:
+        with _one_line_usage():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _one_line_usage() -> Generator[None]:
+    try:
+        yield
+    except _UsageError as error:
+        _tell(error.format_message())
+        raise typer.Exit(2) from error
+
+
 app = typer.Typer(
+    cls=_OneLineUsage,
     no_args_is_help=True,
     add_completion=False,
     help="Find markers, fit the thermal drift of a camera, report what compensation gains.\n\n"
@@ -38,7 +66,7 @@ TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
 ]
 DegreeOption = Annotated[
-    int | None, typer.Option(min=1, max=MAX_DEGREE, help="Degree of the polynomial; else chosen by cross-validation.")
+    int | None, typer.Option(help=f"Degree of the polynomial, 1 to {MAX_DEGREE}; else chosen by cross-validation.")
 ]
 
 _DEFAULT_TARGET = "paper-9x6"
@@ -68,7 +96,7 @@ def detect_images(
 
             write_detections(out, chosen, counted())
         for failure in failures:
-            typer.echo(f"not found in {failure}", err=True)
+            typer.echo(f"not found in {_one_line(failure)}", err=True)
 
 
 @app.command()
@@ -83,6 +111,7 @@ def fit(
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
     with _one_line_errors():
+        check_degree(degree)
         check_writable(out)
         observations = observe_sessions(sessions, progress, _named_target(target))
         model = fit_model(observations, degree)
@@ -168,33 +197,20 @@ def _detections(sources: Sequence[Session | Path], target: Target, failures: lis
                 previous = found if isinstance(source, Session) else None
             except DetectionError as error:
                 failures.append(f"{name}: {error}")
-                found = _nothing(target)
+                found = nothing_found(target)
             yield DetectedImage(name, time_ns, found)
     if len(failures) == images:
         raise DetectionError(f"{failures[0] if failures else 'there are no images'}")
 
 
 def _images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | None, Image]]:
-    """Name, time and pixels of each image of a source."""
+    """Name (escaped), time and pixels of each image of a source."""
     if not isinstance(source, Session):
-        yield source.name, None, read_image(source)
+        yield _one_line(source.name), None, read_image(source)
         return
-    prefix = f"{source.path.name}/" if several else ""
-    for index, frame in enumerate(source.frames()):
+    prefix = f"{_one_line(source.path.name)}/" if several else ""
+    for index, frame in enumerate(read_frames(source)):
         yield f"{prefix}{index}", frame.time_ns, frame.image
-
-
-def _nothing(target: Target) -> Detection:
-    """All markers missing."""
-    count = target.count
-    return Detection(
-        centres_px=np.full((count, 2), np.nan),
-        covariance_px2=np.full((count, 2, 2), np.nan),
-        flags=np.full(count, Flag.MISSING, np.uint8),
-        chi=np.full(count, np.nan),
-        homography=np.full((3, 3), np.nan),
-        state=EdgeState(np.full((count, 12), np.nan), np.full(count, np.nan)),
-    )
 
 
 @contextmanager
@@ -203,14 +219,25 @@ def _one_line_errors() -> Generator[None]:
     try:
         yield
     except StandError as error:
-        typer.echo(f"error: {error}", err=True)
+        _tell(str(error))
         raise typer.Exit(2) from error
     except OSError as error:
-        typer.echo(f"error: {error}", err=True)
+        _tell(str(error))
         raise typer.Exit(1) from error
     except KeyboardInterrupt as error:
         typer.echo("interrupted; nothing was written", err=True)
         raise typer.Exit(130) from error
+
+
+def _tell(sentence: str) -> None:
+    typer.echo(f"error: {_one_line(sentence)}", err=True)
+
+
+def _one_line(text: str) -> str:
+    """The text with line ends, and what else cannot be printed, as escapes: a file's name may hold anything."""
+    return "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode() for character in text
+    )
 
 
 if __name__ == "__main__":

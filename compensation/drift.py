@@ -26,6 +26,9 @@ MAX_DEGREE = 5
 _HULL_MARGIN_PX = 1.0
 """The markers themselves move by this much over the calibrated temperatures."""
 
+_LEAST_HULL_WIDTH_PX = 5.0
+"""Markers in one line, too, span a few px across it when they drift; a second row of them is many px away."""
+
 Pair = tuple[float, float]
 
 
@@ -89,13 +92,13 @@ class CompensationModel:
     def inside(self, xy_px: Float, camera_degC: float | Float) -> NDArray[np.bool_]:
         """(N,): whether the points and temperatures are in the calibrated range: the hull of the training markers
         (plus 1 px) and the interval of the camera's temperature. NaN is outside."""
-        ends = np.roll(self.hull_px, -1, axis=0)
-        edge = (ends - self.hull_px) / np.linalg.norm(ends - self.hull_px, axis=1, keepdims=True)
-        offset = xy_px[:, None] - self.hull_px
-        distance = edge[:, 0] * offset[:, :, 1] - edge[:, 1] * offset[:, :, 0]
         low, high = self.scaling.camera_degC
         temperature = np.broadcast_to(camera_degC, len(xy_px))
-        return (distance >= -_HULL_MARGIN_PX).all(axis=1) & (temperature >= low) & (temperature <= high)
+        return (
+            (_distances_px(xy_px, self.hull_px) >= -_HULL_MARGIN_PX).all(axis=1)
+            & (temperature >= low)
+            & (temperature <= high)
+        )
 
     @property
     def score(self) -> DegreeScore:
@@ -124,6 +127,24 @@ class CompensationModel:
             raise SessionError(f"{path}: not a drift model of this program ({where}: {fault['msg']})") from error
         except ValueError as error:
             raise SessionError(f"{path}: not a drift model of this program ({error})") from error
+
+
+def is_area(hull_px: Float) -> bool:
+    """Whether the corners (H, 2) are those of a convex polygon, in the sense that turns x towards y, and not so thin
+    that it may be a line."""
+    sides = np.linalg.norm(np.roll(hull_px, -1, axis=0) - hull_px, axis=1)
+    if len(hull_px) < 3 or sides.min() == 0:
+        return False
+    distances = _distances_px(hull_px, hull_px)
+    return bool(distances.min() > -_HULL_MARGIN_PX and distances.max(axis=0).min() > _LEAST_HULL_WIDTH_PX)
+
+
+def _distances_px(xy_px: Float, hull_px: Float) -> Float:
+    """How far points (N, 2) are inside each side of the hull (H, 2), shape (N, H); negative is outside."""
+    sides = np.roll(hull_px, -1, axis=0) - hull_px
+    along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+    offset = xy_px[:, None] - hull_px
+    return along[:, 0] * offset[:, :, 1] - along[:, 1] * offset[:, :, 0]
 
 
 class ModelFile(Document):
@@ -181,6 +202,8 @@ def _model(file: ModelFile) -> CompensationModel:
         raise ValueError("camera_range_degC: not low, high")
     if file.degree not in {score.degree for score in file.scores}:
         raise ValueError(f"scores: none for degree {file.degree}")
+    if not is_area(np.array(file.hull_px)):
+        raise ValueError("hull_px: not the corners of a convex area, in order")
     return CompensationModel(
         degree=file.degree,
         scaling=Scaling(file.image_size_px, file.camera_range_degC),

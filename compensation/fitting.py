@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensation.displacements import Displacements, displacements, reference_centres
-from compensation.drift import MAX_DEGREE, CompensationModel, DegreeScore
+from compensation.drift import MAX_DEGREE, CompensationModel, DegreeScore, is_area
 from compensation.observations import Mask, Observations, Role
 from compensation.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from drivers.interface import SessionError
@@ -33,13 +33,16 @@ def fit(observations: Observations, degree: int | None = None) -> CompensationMo
     held_out = left_out(rows, chosen, scaling)
     reference = observations.of(Role.REFERENCE)
     centres, _ = reference_centres(observations)
+    hull_px = convex_hull(rows.measured_px)
+    if not is_area(hull_px):
+        raise SessionError("the markers lie in one line; a model of the image needs an area of them")
     return CompensationModel(
         degree=chosen,
         scaling=scaling,
         coefficients=np.array([solution.coefficients for solution in solutions]),
         coefficient_covariance=np.array([solution.covariance for solution in solutions]),
         discrepancy_px=_discrepancy_px(rows, held_out),
-        hull_px=convex_hull(rows.measured_px),
+        hull_px=hull_px,
         reference_degC=float(observations.camera_degC[reference].mean()),
         reference_chamber_degC=_reference_chamber_degC(observations),
         reference_centres_px=centres[observations.session[reference][0]],
@@ -59,14 +62,19 @@ def _reference_chamber_degC(observations: Observations) -> float:
     return float(set_points[0])
 
 
+def check_degree(degree: int | None) -> None:
+    """SessionError when there is no model of this degree; None, the choice by cross-validation, is fine."""
+    if degree is not None and not 1 <= degree <= MAX_DEGREE:
+        raise SessionError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
+
+
 def degrees_for(rows: Displacements, degree: int | None) -> range:
     """The degrees that the temperatures can decide on: T^n needs n + 1 of them, and one more to be left out.
 
     SessionError when `degree` (None: any at all) is not among them.
     """
+    check_degree(degree)
     set_points = np.unique(rows.chamber_degC)
-    if degree is not None and not 1 <= degree <= MAX_DEGREE:
-        raise SessionError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
     least = _LEAST_TEMPERATURES if degree is None else degree + 2
     if len(set_points) < least:
         of_degree = "" if degree is None else f" of degree {degree}"

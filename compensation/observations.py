@@ -139,12 +139,13 @@ def observe(session: Session, target: Target, report: Report | None = None) -> O
 
 def read_frames(session: Session) -> Iterator[Frame]:
     """The session's frames in order; the SessionError of one that cannot be read tells which it is."""
-    index = -1
+    done = 0
     try:
-        for index, frame in enumerate(session.frames()):
+        for frame in session.frames():
             yield frame
+            done += 1
     except SessionError as error:
-        raise SessionError(f"frame {index + 1}, counted from 0: {error}") from error
+        raise SessionError(f"{error}; this was frame {done}, counted from 0") from error
 
 
 def observe_sessions(paths: Sequence[Path], progress: Progress, target: Target | None = None) -> Observations:

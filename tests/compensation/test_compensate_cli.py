@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
+import stat
 from pathlib import Path
 
 import cv2
@@ -110,7 +112,60 @@ def test_the_degree_can_be_given(recorded: Recorded, tmp_path: Path):
     assert run("fit", recorded.path, "-o", tmp_path / "model.json", "--degree", "3").exit_code == 0
     assert CompensationModel.load(tmp_path / "model.json").degree == 3
     assert json.loads((tmp_path / "model.json").read_text())["session_ids"] == ["night"]
-    assert run("fit", recorded.path, "-o", tmp_path / "model.json", "--degree", "6").exit_code == 2
+
+
+@pytest.mark.parametrize("degree", ["0", "6", "-1"])
+def test_a_degree_that_does_not_exist_is_refused_before_the_long_work(recorded: Recorded, tmp_path: Path, degree: str):
+    out = tmp_path / "model.json"
+    result = run("fit", recorded.path, "-o", out, "--degree", degree)
+    assert_refused(result, f"the degree is 1 to 5, not {degree}", out)
+    assert "find markers" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["fit", "night", "-o", "model.json", "--degree", "two"], "'--degree'"),
+        (["fit", "night"], "'--out'"),
+        (["fit", "-o", "model.json"], "SESSION..."),
+        (["report", "night", "--modle", "m.json"], "--modle"),
+        (["fits"], "'fits'"),
+        (["--loud"], "--loud"),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(arguments: list[str], sentence: str, tmp_path: Path):
+    assert_refused(run(*arguments), sentence, tmp_path / "out")
+
+
+def test_no_arguments_ask_for_help():
+    result = run()
+    assert result.exit_code == 2
+    assert "Example: compensate" in result.output
+
+
+def test_what_is_not_a_file_is_refused_before_the_work_and_stays(recorded: Recorded, tmp_path: Path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for command in ("detect", "fit", "report"):
+        result = run(command, recorded.path, "-o", pipe)
+        assert result.exit_code == 2
+        assert result.stderr == f"error: {pipe}: cannot be written (it is not a regular file)\n"
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_name_with_line_ends_or_no_text_at_all_stays_in_one_line(image: Path, target: Path, tmp_path: Path):
+    out = tmp_path / "markers.csv"
+    odd = tmp_path / os.fsdecode(b"two\nlines\r\xff.png")
+    assert_refused(run("detect", odd, "-o", out), r"two\nlines\r\udcff.png: no such file or folder", out)
+    shutil.copy(image, odd)
+    blank = tmp_path / "blank\n.png"
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full((480, 640), 128, np.uint8))
+    (tmp_path / "blank.png").rename(blank)
+    result = run("detect", odd, blank, "--target", target, "-o", out)
+    assert result.exit_code == 0
+    assert r"not found in blank\n.png: " in result.stderr
+    assert {row["image"] for row in rows_of(out)} == {r"two\nlines\r\udcff.png", r"blank\n.png"}
 
 
 def test_bad_input_to_detect_is_refused_with_a_sentence(image: Path, recorded: Recorded, tmp_path: Path):

@@ -182,6 +182,9 @@ def damaged(text: str) -> dict[str, str]:
         "terms": json.dumps({**data, "terms_abc": data["terms_abc"][::-1]}),
         "range": json.dumps({**data, "camera_range_degC": [67.0, 25.0]}),
         "hull": json.dumps({**data, "hull_px": data["hull_px"][:2]}),
+        "hull a line": json.dumps({**data, "hull_px": [[0, 0], [100, 100], [200, 200]]}),
+        "hull a point": json.dumps({**data, "hull_px": [[5, 5]] * 3}),
+        "hull turned over": json.dumps({**data, "hull_px": data["hull_px"][::-1]}),
     }
 
 
@@ -263,6 +266,15 @@ def test_markers_in_one_line_are_refused(noisy: Observations):
     row[:, :, 1] = np.where(np.isfinite(level), 1000.0, np.nan)
     with pytest.raises(SessionError, match="all in one line"):
         fit(replace(noisy, centres_px=row))
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.05])
+def test_markers_in_one_line_with_their_noise_are_refused(noise_px: float):
+    """With noise across the line the polynomial is determined, but by nothing."""
+    night = observations(quadratic, noise_px, seed=3)
+    row = np.where(np.arange(54)[:, None] < 9, night.centres_px, np.nan)
+    with pytest.raises(SessionError, match="in one line"):
+        fit(replace(night, centres_px=row))
 
 
 def test_two_rows_of_markers_do_not_determine_degree_4(noisy: Observations):

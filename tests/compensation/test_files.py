@@ -46,9 +46,14 @@ def test_a_folder_is_refused(tmp_path: Path):
 
 def test_a_pipe_that_appears_during_the_work_is_refused_at_the_rename(tmp_path: Path):
     out = tmp_path / "out"
-    with pytest.raises(SessionError, match="it is not a regular file"), whole_file(out) as file:
-        file.write("text")
-        os.mkfifo(out)
+
+    def write() -> None:
+        with whole_file(out) as file:
+            file.write("text")
+            os.mkfifo(out)
+
+    with pytest.raises(SessionError, match="it is not a regular file"):
+        write()
     assert stat.S_ISFIFO(out.stat().st_mode)
     assert list(tmp_path.iterdir()) == [out]
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +14,10 @@ import pytest
 from compensation.displacements import displacements, reference_centres
 from compensation.markers import Flag
 from compensation.observations import Observations, Role, concatenate, observe, session_target
-from drivers.interface import ConfigError, SessionError
+from drivers.interface import ConfigError, Frame, SessionError
 from stand.session import Session
 
-from .conftest import DARK, GLARE, SEQUENCE, Recorded, record
+from .conftest import DARK, GLARE, SEQUENCE, TARGET_YAML, Recorded, record
 from .synthetic import facts, observations, quadratic
 
 
@@ -23,6 +25,14 @@ from .synthetic import facts, observations, quadratic
 def observed(recorded: Recorded) -> Observations:
     session = Session.open(recorded.path)
     return observe(session, session_target(session))
+
+
+@pytest.fixture(scope="module")
+def recorded_frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of one frame."""
+    path = tmp_path_factory.mktemp("frame") / "night"
+    asyncio.run(record(path, {"target.yaml": TARGET_YAML}, frames=1))
+    return path
 
 
 def test_every_frame_has_its_role_and_temperatures(observed: Observations):
@@ -69,6 +79,28 @@ def test_progress_counts_frames(recorded: Recorded):
     observe(session, session_target(session), lambda done, text: told.append((done, text)))
     assert [done for done, _ in told] == list(range(1, len(SEQUENCE) + 1))
     assert told[0][1] == f"frame 1 of {len(SEQUENCE)}"
+
+
+@pytest.mark.parametrize(("word", "simulated"), [("true", True), ("false", False), (None, None), ("maybe", None)])
+def test_a_session_says_whether_it_is_simulated_or_nothing(recorded_frame: Path, word: str | None, simulated: object):
+    session = Session.open(recorded_frame)
+    session.metadata.pop("simulated", None)
+    session.metadata.update({} if word is None else {"simulated": word})
+    seen = observe(session, session_target(session))
+    assert seen.sessions[0].simulated is simulated
+    assert seen.simulated is bool(simulated)
+
+
+def test_a_damaged_frame_is_named(recorded: Recorded, monkeypatch: pytest.MonkeyPatch):
+    session = Session.open(recorded.path)
+
+    def frames() -> Iterator[Frame]:
+        yield from itertools.islice(Session.open(recorded.path).frames(), 2)
+        raise SessionError("000000.mcap: damaged")
+
+    monkeypatch.setattr(session, "frames", frames)
+    with pytest.raises(SessionError, match=r"^000000\.mcap: damaged; this was frame 2, counted from 0$"):
+        observe(session, session_target(session))
 
 
 def test_a_session_without_or_with_a_wrong_target_is_refused(tmp_path: Path):

@@ -99,8 +99,8 @@ def test_an_interval_that_claims_too_much_is_told(analysed: Analysed, page: str)
 
 
 def test_a_simulated_session_is_called_so(analysed: Analysed):
-    night, model, evaluation = analysed
-    for simulated, tells in ((True, True), (False, False), (None, False)):
+    night, model, _ = analysed
+    for simulated, tells in ((True, True), (False, False)):
         own = replace(night, sessions=(replace(night.sessions[0], simulated=simulated),))
         page = report_page(own, model, evaluate(model, own))
         assert ("Recorded in a simulated laboratory." in page) is tells
