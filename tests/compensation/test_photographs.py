@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from compensation import cli
 from compensation.grid import project
 from compensation.markers import Detection, detect, read_image
 from compensation.target import load_target
@@ -18,15 +22,48 @@ TARGET = load_target(ROOT / "configs" / "targets" / "robot-cal-tools-10x10.yaml"
 IMAGES = ROOT.parent / "shared" / "data" / "robot_cal_tools_10x10" / "images"
 
 
-@pytest.fixture(scope="module", params=range(15), ids="{}.png".format)
-def photograph(request: pytest.FixtureRequest) -> tuple[np.ndarray, Detection]:
-    path = IMAGES / f"{request.param}.png"
-    if not path.exists():
-        if os.environ.get("CI") == "true":
-            pytest.fail(f"{path} is missing")
-        pytest.skip(f"{path} is missing")
-    image = read_image(path)
-    return image, detect(image, TARGET)
+COUNT = 15
+Detected = tuple[Path, list[Detection]]
+
+
+@pytest.fixture(scope="module")
+def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
+    """The table that `compensate detect` writes of all the photographs, and the detections it was written from."""
+    paths = [IMAGES / f"{number}.png" for number in range(COUNT)]
+    for path in paths:
+        if not path.exists():
+            if os.environ.get("CI") == "true":
+                pytest.fail(f"{path} is missing")
+            pytest.skip(f"{path} is missing")
+    detections: list[Detection] = []
+
+    def kept(*arguments: Any) -> Detection:
+        detections.append(detect(*arguments))
+        return detections[-1]
+
+    out = tmp_path_factory.mktemp("photographs") / "markers.csv"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "detect", kept)
+        arguments = ["detect", *map(str, paths), "--target", "robot-cal-tools-10x10", "-o", str(out)]
+        result = CliRunner().invoke(cli.app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "not found" not in result.stderr
+    return out, detections
+
+
+@pytest.fixture(params=range(COUNT), ids="{}.png".format)
+def photograph(request: pytest.FixtureRequest, detected: Detected) -> tuple[np.ndarray, Detection]:
+    return read_image(IMAGES / f"{request.param}.png"), detected[1][request.param]
+
+
+def test_the_table_has_every_marker_of_every_photograph(detected: Detected):
+    with detected[0].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 100 * COUNT
+    for number in range(COUNT):
+        own = [row for row in rows if row["image"] == f"{number}.png"]
+        assert [int(row["marker"]) for row in own] == list(range(1, 101))
+        assert not [row for row in own if row["x_px"] == "nan" or "MISSING" in row["flags"].split("|")]
 
 
 def test_all_hundred_dots_are_found_where_opencv_finds_them(photograph: tuple[np.ndarray, Detection]):
