@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from drivers.camera import Camera
 from drivers.clock import Clock, seconds_ns
 from drivers.flap import Flap
-from drivers.interface import ConfigError, Frame, StandTripped, Unreachable
+from drivers.interface import Actuator, ConfigError, Frame, GarbledReply, StandTripped, Unreachable
 from drivers.regulator import Regulator
 from drivers.relays import Relays
 from drivers.stage import Axis
@@ -183,23 +183,21 @@ class Stand:
         self._permitted = False
         async with self._making_safe:
             devices = self.devices
-            actions = {
-                "regulator": devices.regulator.make_safe(),
-                "relays": devices.relays.make_safe(),
-                "flap": devices.flap.make_safe(),
-                **{name: axis.make_safe() for name, axis in devices.axes.items()},
-            }
-            failures = await asyncio.gather(*(self._safely(name, action) for name, action in actions.items()))
+            actuators = (devices.regulator, devices.relays, devices.flap, *devices.axes.values())
+            failures = await asyncio.gather(*(self._safely(actuator) for actuator in actuators))
             self.unconfirmed = tuple(failure for failure in failures if failure)
             self._compressor_is_off()
 
-    async def _safely(self, name: str, action: Awaitable[None]) -> str:
-        """Why the safe state of `name` is not confirmed, "" when it is."""
+    async def _safely(self, actuator: Actuator) -> str:
+        """Why the actuator's safe state is not confirmed, "" when it is; a lost answer is worth a second try."""
         try:
             async with asyncio.timeout(_SAFE_LIMIT_S):
-                await action
+                try:
+                    await actuator.make_safe()
+                except (Unreachable, GarbledReply):
+                    await actuator.make_safe()
         except Exception as error:  # noqa: BLE001 - whatever one actuator does, the others must still be made safe
-            text = f"{name} did not confirm its safe state: {str(error) or 'no answer in time'}"
+            text = f"{actuator.name} did not confirm its safe state: {str(error) or 'no answer in time'}"
             self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text))
             return text
         return ""
