@@ -86,14 +86,13 @@ class PowerCamera:
 
 Step = StartChamber | SetTemperature | StopChamber | Soak | OpenFlap | CloseFlap | Capture | MoveTo | PowerCamera
 
-# What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves, camera boot.
+# What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves.
 _FLAP_S = 3.0
 _MOVE_S = 15.0
-_CAMERA_BOOT_S = 8.0
 
 
-def estimate_s(step: Step) -> float:
-    """How long the step is expected to take on the stand's clock, s."""
+def estimate_s(step: Step, camera_boot_s: float) -> float:
+    """How long the step is expected to take on the stand's clock, s, with a camera that boots in `camera_boot_s`."""
     match step:
         case Soak():
             return step.duration_s
@@ -104,7 +103,7 @@ def estimate_s(step: Step) -> float:
         case MoveTo():
             return _MOVE_S
         case PowerCamera():
-            return _CAMERA_BOOT_S if step.on else 0.0
+            return camera_boot_s if step.on else 0.0
         case StartChamber() | SetTemperature() | StopChamber():
             return 0.0
 

@@ -7,10 +7,11 @@ for the captures. Set-points listed as held out are recorded for validation and 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Self
+from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from experiments.parameters import CaptureParameters, Chamber_degC, FrameCount, Wait_s
 from experiments.steps import (
     Capture,
     CloseFlap,
@@ -24,36 +25,32 @@ from experiments.steps import (
     StopChamber,
 )
 
-Chamber_degC = Annotated[float, Field(ge=-10, le=70)]  # the paper's chamber, section 2
 
-
-class ThermalCycle(BaseModel):
+class ThermalCycle(CaptureParameters):
     """Parameters of a thermal cycle; temperatures are chamber set-points."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
     reference_degC: Chamber_degC = 24.0
-    equilibrium_s: float = Field(default=2700.0, ge=0)
-    set_points_degC: tuple[Chamber_degC, ...] = Field(min_length=1)
-    held_out_degC: tuple[Chamber_degC, ...] = ()
-    dwell_s: float = Field(default=2700.0, ge=0)
-    cycles: int = Field(default=1, ge=1)
-    reference_frames: int = Field(default=20, ge=1)
-    frames_per_point: int = Field(default=1, ge=1)
-    interval_s: float = Field(default=0.5, gt=0)
-    exposure_s: float = Field(default=0.1, gt=0)
-    table_position: dict[str, float] = Field(default_factory=dict)  # axis -> mm or deg, taken before anything else
+    equilibrium_s: Wait_s = 2700.0
+    set_points_degC: tuple[Chamber_degC, ...] = Field(min_length=1, max_length=1000)
+    held_out_degC: tuple[Chamber_degC, ...] = Field(default=(), max_length=1000)
+    dwell_s: Wait_s = 2700.0
+    cycles: int = Field(default=1, ge=1, le=100)
+    reference_frames: FrameCount = 20
+    frames_per_point: FrameCount = 1
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _held_out_visits(self) -> Self:
         unvisited = sorted(set(self.held_out_degC) - set(self.set_points_degC))
         if unvisited:
             raise ValueError(f"held_out_degC has {unvisited}, which set_points_degC never visits")
         if self.reference_degC in self.held_out_degC:
             raise ValueError(f"the reference {self.reference_degC} degC cannot be held out")
-        if self.exposure_s > self.interval_s:
-            raise ValueError(f"exposure_s {self.exposure_s} does not fit into interval_s {self.interval_s}")
         return self
+
+    @property
+    def visits(self) -> int:
+        """How often a set-point is visited, over all cycles."""
+        return len(self.set_points_degC) * self.cycles
 
 
 def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:

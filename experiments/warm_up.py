@@ -7,10 +7,8 @@ throughout the capture so that frames come without a pause.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-
+from experiments.parameters import CaptureParameters, Chamber_degC, FrameCount, Wait_s
 from experiments.steps import (
     Capture,
     CloseFlap,
@@ -23,26 +21,14 @@ from experiments.steps import (
     Step,
     StopChamber,
 )
-from experiments.thermal_cycle import Chamber_degC
 
 
-class WarmUp(BaseModel):
+class WarmUp(CaptureParameters):
     """Parameters of a warm-up; the paper took 3600 frames every 500 ms at 24 degC."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
     chamber_degC: Chamber_degC = 24.0
-    cool_down_s: float = Field(default=7200.0, ge=0)
-    frames: int = Field(default=3600, ge=1)
-    interval_s: float = Field(default=0.5, gt=0)
-    exposure_s: float = Field(default=0.1, gt=0)
-    table_position: dict[str, float] = Field(default_factory=dict)  # axis -> mm or deg, taken before anything else
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.exposure_s > self.interval_s:
-            raise ValueError(f"exposure_s {self.exposure_s} does not fit into interval_s {self.interval_s}")
-        return self
+    cool_down_s: Wait_s = 7200.0
+    frames: FrameCount = 3600
 
 
 def warm_up(parameters: WarmUp) -> Iterator[Step]:

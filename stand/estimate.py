@@ -25,6 +25,8 @@ _BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0}
 _TELEMETRY_BYTES_PER_MESSAGE = 116.0
 _SENSOR_PX = (2448, 2048)
 
+_LONGEST_S = 366 * 86400.0  # a longer plan is a slip of the keyboard, and its end soon beyond any calendar
+
 
 @dataclass(frozen=True, slots=True)
 class PricedStep:
@@ -49,7 +51,8 @@ class PricedStep:
 
 
 def price(plan: Iterable[PlannedStep], config: StandConfig) -> tuple[PricedStep, ...]:
-    """Every step priced; ConfigError naming the first step that goes outside the stand's limits."""
+    """Every step priced; ConfigError naming the first step that goes outside the stand's limits, or saying that
+    the whole would take more than a year."""
     width_px = config.camera.width_px or _SENSOR_PX[0]
     height_px = config.camera.height_px or _SENSOR_PX[1]
     frame_bytes = width_px * height_px * _BYTES_PER_PIXEL[config.recording.frame_encoding]
@@ -58,9 +61,12 @@ def price(plan: Iterable[PlannedStep], config: StandConfig) -> tuple[PricedStep,
     priced: list[PricedStep] = []
     for planned in plan:
         _check(planned, config)
-        duration_s, frames = estimate_s(planned.step), frames_of(planned.step)
+        duration_s, frames = estimate_s(planned.step, config.camera.boot_s), frames_of(planned.step)
         size_bytes = frames * frame_bytes + duration_s * messages_per_s * _TELEMETRY_BYTES_PER_MESSAGE
         priced.append(PricedStep(planned, duration_s, frames, size_bytes))
+    total_s = sum(step.duration_s for step in priced)
+    if total_s > _LONGEST_S:
+        raise ConfigError(f"the plan takes {total_s / 86400:.0f} days, and at most a year is believed")
     return tuple(priced)
 
 

@@ -13,6 +13,8 @@ from experiments.steps import PlannedStep, Step, number_steps
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from experiments.warm_up import WarmUp, warm_up
 
+_MOST_VISITS = 10_000  # of set-points; more than any camera lives through, and a plan is still listed within a second
+
 
 class Experiment(Document):
     """One entry of the recipe: exactly one of the keys."""
@@ -37,9 +39,17 @@ class Experiment(Document):
 class Recipe(Document):
     """A whole recipe file."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=100)
     description: str = ""
-    experiments: tuple[Experiment, ...] = Field(min_length=1)
+    experiments: tuple[Experiment, ...] = Field(min_length=1, max_length=100)
+
+    @model_validator(mode="after")
+    def _ends(self) -> Self:
+        cycles = (experiment.thermal_cycle for experiment in self.experiments)
+        visits = sum(cycle.visits for cycle in cycles if cycle is not None)
+        if visits > _MOST_VISITS:
+            raise ValueError(f"{visits} visits of set-points are more than {_MOST_VISITS}")
+        return self
 
     def plan(self) -> Iterator[PlannedStep]:
         """Every step in order, numbered and identified."""

@@ -18,6 +18,7 @@ from experiments.steps import (
 )
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from experiments.warm_up import WarmUp, warm_up
+from stand.recipe import Recipe
 
 CYCLE = ThermalCycle(set_points_degC=(34.0, 44.0, 24.0), held_out_degC=(34.0,), cycles=2)
 
@@ -77,7 +78,7 @@ def test_ids_follow_place_and_parameters():
 
 
 def test_a_capture_lasts_from_its_first_to_its_last_frame():
-    assert estimate_s(Capture(5, 0.5, 0.1, Role.FIT, 24.0)) == pytest.approx(2.1)
+    assert estimate_s(Capture(5, 0.5, 0.1, Role.FIT, 24.0), 8.0) == pytest.approx(2.1)
 
 
 @pytest.mark.parametrize(
@@ -89,8 +90,44 @@ def test_a_capture_lasts_from_its_first_to_its_last_frame():
         ({"interval_s": 0.05}, "does not fit"),
         ({"dwell_minutes": 45}, "Extra inputs"),
         ({"set_points_degC": (71.0,)}, "less than or equal to 70"),
+        ({"set_points_degC": (34.0,) * 1001}, "at most 1000 items"),
+        ({"dwell_s": 604801}, "less than or equal to 604800"),
+        ({"equilibrium_s": 604801}, "less than or equal to 604800"),
+        ({"cycles": 101}, "less than or equal to 100"),
+        ({"frames_per_point": 1_000_001}, "less than or equal to 1000000"),
+        ({"interval_s": 86401}, "less than or equal to 86400"),
+        ({"interval_s": 60, "exposure_s": 11}, "less than or equal to 10"),
     ],
 )
 def test_impossible_parameters_are_refused_with_a_reason(change: dict[str, object], sentence: str):
     with pytest.raises(ValidationError, match=sentence):
         ThermalCycle.model_validate({"set_points_degC": (34.0, 24.0), **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"cool_down_s": 604801}, "less than or equal to 604800"),
+        ({"frames": 1_000_001}, "less than or equal to 1000000"),
+        ({"interval_s": 0.05}, "does not fit"),
+        ({"dwell_s": 5}, "Extra inputs"),
+    ],
+)
+def test_an_impossible_warm_up_is_refused_with_a_reason(change: dict[str, object], sentence: str):
+    with pytest.raises(ValidationError, match=sentence):
+        WarmUp.model_validate(change)
+
+
+def test_switching_the_camera_on_takes_its_own_boot_time():
+    assert estimate_s(PowerCamera(on=True), 4.0) == 4.0
+    assert estimate_s(PowerCamera(on=False), 4.0) == 0.0
+
+
+def test_the_longest_recipe_is_planned_and_a_longer_one_refused():
+    cycle = {"set_points_degC": (34.0,) * 1000, "cycles": 10}
+    recipe = {"name": "long", "experiments": [{"thermal_cycle": cycle}]}
+    assert sum(isinstance(planned.step, Soak) for planned in Recipe.model_validate(recipe).plan()) == 10_001
+    with pytest.raises(ValidationError, match="20000 visits"):
+        Recipe.model_validate({"name": "longer", "experiments": [{"thermal_cycle": cycle}] * 2})
+    with pytest.raises(ValidationError, match="at most 100 items"):
+        Recipe.model_validate({"name": "more", "experiments": [{"warm_up": {}}] * 101})

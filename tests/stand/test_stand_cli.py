@@ -38,6 +38,12 @@ def test_the_json_plan_adds_up():
     assert [step["index"] for step in plan["steps"]] == list(range(len(plan["steps"])))
 
 
+def test_a_plan_counts_the_cameras_own_boot_time():
+    plan = json.loads(runner.invoke(app, ["plan", "warm-up", "--json"]).stdout)
+    boot = [step["duration_s"] for step in plan["steps"] if step["parameters"] == {"on": True}]
+    assert boot == [4.0]  # camera.boot_s of the simulated stand
+
+
 def recipe_file(tmp_path: Path, **parameters: object) -> str:
     cycle = {"set_points_degC": [30], **parameters}
     path = tmp_path / "recipe.yaml"
@@ -52,6 +58,7 @@ def recipe_file(tmp_path: Path, **parameters: object) -> str:
         ({"table_position": {"vertical": 1}}, "this stand has no axis 'vertical'"),
         ({"table_position": {"linear": 290}}, "outside the limits (0.0, 280.0) of linear"),
         ({"interval_s": 0.2, "frames_per_point": 2}, "faster than camera.frame_rate_hz"),
+        ({"dwell_s": 604800, "cycles": 60}, "the plan takes 420 days"),
         ({"dwel_s": 3}, "experiments.0.thermal_cycle.dwel_s: unknown key"),
     ],
 )
