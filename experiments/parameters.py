@@ -1,4 +1,4 @@
-"""What the experiments' parameters have in common: the chamber's range, durations that end, and how frames are taken."""
+"""What the experiments' parameters have in common: the chamber's range, waits that end, and how frames are taken."""
 
 from __future__ import annotations
 

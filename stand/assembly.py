@@ -126,6 +126,8 @@ def _flap(config: StandConfig, clock: Clock) -> Flap:
             module = cast("_BackendModule", importlib.import_module(flap.backend))
         except ImportError as error:
             raise ConfigError(f"flap.backend: no module {flap.backend!r} ({error})") from error
+        if not callable(getattr(module, "get_backend", None)):
+            raise ConfigError(f"flap.backend: module {flap.backend!r} has no get_backend(address)")
         try:
             backend = module.get_backend(flap.backend_address)
         except ValueError as error:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import importlib.resources
 import ipaddress
 import re
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -15,12 +15,40 @@ from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
 from drivers.documents import Document, load_document
 from drivers.interface import ConfigError
+from experiments.parameters import Chamber_degC
+
+
+def _tcp_address(address: str) -> str:
+    found = re.fullmatch(r"tcp:[^:\s]+:([0-9]{1,5})", address)
+    if found is None or not 0 < int(found[1]) < 65536:
+        raise ValueError("expected tcp:HOST:PORT with a port of 1..65535")
+    return address
 
 
 def _byte_address(address: str) -> str:
-    if re.fullmatch(r"serial:\S+", address) or re.fullmatch(r"tcp:[^:\s]+:\d{1,5}", address):
+    if re.fullmatch(r"serial:[^\s\x00]+", address):
         return address
+    if address.startswith("tcp:"):
+        return _tcp_address(address)
     raise ValueError("expected serial:PATH (such as serial:/dev/ttyUSB0) or tcp:HOST:PORT")
+
+
+def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+    if bounds[0] >= bounds[1]:
+        raise ValueError(f"{bounds} is not in ascending order")
+    return bounds
+
+
+def _printable(path: Path) -> Path:
+    if not str(path).isprintable():
+        raise ValueError("expected a path of printable characters")
+    return path
+
+
+def _of_this_century(start: datetime) -> datetime:
+    if not 2000 <= start.year < 2100:
+        raise ValueError("expected a time of the years 2000 to 2099")
+    return start
 
 
 def _ip_address(address: str) -> str:
@@ -31,8 +59,10 @@ def _ip_address(address: str) -> str:
 
 
 ByteAddress = Annotated[str, AfterValidator(_byte_address)]
+TcpAddress = Annotated[str, AfterValidator(_tcp_address)]
 IpAddress = Annotated[str, AfterValidator(_ip_address)]
-Seconds = Annotated[float, Field(gt=0)]
+Line = Annotated[str, Field(pattern=r"^\P{Cc}*$", max_length=200)]  # free text without control characters
+ModuleName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*$")]
 PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]
 Unit = Annotated[int, Field(ge=1, le=247)]
 ThermometerName = Literal["granite_inside", "granite_outside", "artifact", "air", "laboratory"]
@@ -47,8 +77,8 @@ class BusConfig(Document):
     baud: int = Field(default=9600, ge=1200, le=921600)
     parity: Literal["N", "E", "O"] = "N"
     stopbits: Literal[1, 2] = 1
-    timeout_s: Seconds = 0.3
-    gap_s: float = Field(default=0.005, ge=0)
+    timeout_s: float = Field(default=0.3, gt=0, le=10)
+    gap_s: float = Field(default=0.005, ge=0, le=1)
 
 
 class RegulatorConfig(Document):
@@ -82,10 +112,10 @@ class ThermometerConfig(Document):
     where t is what the module indicates."""
 
     channel: int = Field(ge=0, le=15)
-    offset_K: float = 0.0
-    polynomial: tuple[float, ...] = ()
-    certificate: str = ""
-    plausible_degC: tuple[float, float] = (-40.0, 100.0)
+    offset_K: float = Field(default=0.0, ge=-10, le=10)  # a Pt100 that is further off is broken
+    polynomial: tuple[float, ...] = Field(default=(), max_length=8)
+    certificate: Line = ""
+    plausible_degC: Annotated[tuple[float, float], AfterValidator(_ascending)] = (-40.0, 100.0)
 
 
 class ThermometersConfig(Document):
@@ -110,15 +140,16 @@ class AxisConfig(Document):
     """A stage behind a Standa XIMC controller; lengths in `unit`, software limits included."""
 
     address: ByteAddress
-    serial_number: int = Field(ge=0)
+    serial_number: int = Field(ge=0, le=0xFFFFFFFF)
     profile: Literal["8MT160-300", "8MR151"]
-    limits: tuple[float, float]
+    limits: Annotated[tuple[float, float], AfterValidator(_ascending)]
     poll_s: PollPeriod_s = 5.0
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.limits[0] >= self.limits[1]:
-            raise ValueError(f"limits {self.limits} are not in ascending order")
+    def _within_travel(self) -> Self:
+        travel = 300.0 if self.unit == "mm" else 360.0  # the table goes round, its cables do not
+        if max(map(abs, self.limits)) > travel:
+            raise ValueError(f"limits {self.limits} are beyond the travel of {travel:g} {self.unit}")
         return self
 
     @property
@@ -131,15 +162,16 @@ class FlapConfig(Document):
     """The inspection flap's Pololu Jrk G2, found by its USB serial number.
 
     backend: a module with `get_backend(address)` that gives a pyusb backend; none means libusb, the real bus.
+    open_target, closed_target, tolerance: scaled feedback counts.
     """
 
-    serial_number: str
-    backend: str | None = None
-    backend_address: str | None = None
+    serial_number: str = Field(pattern=r"^[!-~]{1,32}$")
+    backend: ModuleName | None = None
+    backend_address: TcpAddress | None = None
     open_target: int = Field(default=3500, ge=0, le=4095)
     closed_target: int = Field(default=500, ge=0, le=4095)
     tolerance: int = Field(default=40, ge=1, le=500)
-    travel_s: Seconds = 5.0
+    travel_s: float = Field(default=5.0, gt=0, le=60)
     poll_s: PollPeriod_s = 1.0
 
     @model_validator(mode="after")
@@ -160,46 +192,48 @@ class CameraTemperatureConfig(Document):
     min_degC: float = -40.0
     max_degC: float = 120.0
 
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.min_degC >= self.max_degC:
+            raise ValueError(f"min_degC {self.min_degC} is not below max_degC {self.max_degC}")
+        if (self.selector is None) != (self.entry is None):
+            raise ValueError("selector and entry go together")
+        return self
+
 
 class CameraConfig(Document):
     """The GigE Vision camera, by IP address. boot_s: from its supply being switched on until it answers."""
 
     address: IpAddress
-    serial_number: str | None = None
+    serial_number: str | None = Field(default=None, pattern=r"^[ -~]{1,16}$")  # as the bootstrap register holds it
     pixel_format: Literal["Mono8", "Mono12", "Mono16"] = "Mono8"
-    width_px: int | None = Field(default=None, ge=16)
-    height_px: int | None = Field(default=None, ge=16)
-    exposure_s: Seconds = 0.1
-    gain_dB: float = Field(default=0.0, ge=0)
+    width_px: int | None = Field(default=None, ge=16, le=65535)
+    height_px: int | None = Field(default=None, ge=16, le=65535)
+    exposure_s: float = Field(default=0.1, gt=0, le=10)
+    gain_dB: float = Field(default=0.0, ge=0, le=60)
     trigger: Literal["software", "free_run"] = "software"
-    frame_rate_hz: float = Field(default=2.0, gt=0)
+    frame_rate_hz: float = Field(default=2.0, gt=0, le=1000)
     packet_size: int | None = Field(default=None, ge=220, le=16112)
-    heartbeat_s: float = Field(default=3.0, ge=1.5)  # Aravis asks once a second
+    heartbeat_s: float = Field(default=3.0, ge=1.5, le=60)  # Aravis asks once a second
     temperature: CameraTemperatureConfig | None = None
-    boot_s: float = Field(default=8.0, ge=0)
+    boot_s: float = Field(default=8.0, ge=0, le=600)
     poll_s: PollPeriod_s = 1.0
 
 
 class LimitsConfig(Document):
     """What no step and no operator may exceed."""
 
-    chamber_degC: tuple[float, float] = (-10.0, 60.0)
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.chamber_degC[0] >= self.chamber_degC[1]:
-            raise ValueError(f"chamber_degC {self.chamber_degC} is not in ascending order")
-        return self
+    chamber_degC: Annotated[tuple[Chamber_degC, Chamber_degC], AfterValidator(_ascending)] = (-10.0, 60.0)
 
 
 class GuardConfig(Document):
-    """When the guard makes the stand safe."""
+    """When the guard makes the stand safe. The upper bounds are what the chamber survives: no file may lift them."""
 
-    period_s: Seconds = 1.0
-    max_air_degC: float = 65.0
-    max_granite_degC: float = 60.0
-    max_camera_degC: float = 85.0
-    stale_after_s: Seconds = 15.0
+    period_s: float = Field(default=1.0, gt=0, le=10)
+    max_air_degC: float = Field(default=65.0, le=80)
+    max_granite_degC: float = Field(default=60.0, le=80)
+    max_camera_degC: float = Field(default=85.0, le=100)
+    stale_after_s: float = Field(default=15.0, gt=0, le=120)
     heater_hold_s: float = Field(default=15.0, ge=2.0, le=60.0)
     heater_renew_s: float = Field(default=5.0, gt=0)
 
@@ -207,15 +241,17 @@ class GuardConfig(Document):
     def _renewed_in_time(self) -> Self:
         if self.heater_renew_s * 2 > self.heater_hold_s:
             raise ValueError("heater_renew_s must be at most half of heater_hold_s, or one lost command cuts the heat")
+        if self.period_s + self.heater_renew_s >= self.heater_hold_s:  # renewals fall on the guard's own looks
+            raise ValueError("period_s + heater_renew_s must be below heater_hold_s, or the heat drops out in between")
         return self
 
 
 class CompressorConfig(Document):
     """The refrigeration compressor's own protection and when it is wanted (outputs of the regulator, %)."""
 
-    min_off_s: float = Field(default=300.0, ge=0)
-    min_on_s: float = Field(default=180.0, ge=0)
-    max_starts_per_h: int = Field(default=6, ge=1)
+    min_off_s: float = Field(default=300.0, ge=0, le=3600)
+    min_on_s: float = Field(default=180.0, ge=0, le=3600)
+    max_starts_per_h: int = Field(default=6, ge=1, le=60)
     start_above_cool_percent: float = Field(default=10.0, gt=0, le=100)
     stop_above_heat_percent: float = Field(default=60.0, gt=0, le=100)
 
@@ -223,16 +259,16 @@ class CompressorConfig(Document):
 class RecordingConfig(Document):
     """Where sessions go and how often telemetry is committed."""
 
-    directory: Path = Path("sessions")
+    directory: Annotated[Path, AfterValidator(_printable)] = Path("sessions")
     frame_encoding: Literal["png", "raw"] = "png"
-    telemetry_commit_s: Seconds = 1.0
+    telemetry_commit_s: float = Field(default=1.0, gt=0, le=300)
 
 
 class SimulationConfig(Document):
     """The simulated laboratory behind these addresses; a real laboratory has no such section."""
 
-    control: Annotated[str, Field(pattern=r"^tcp:[^:\s]+:\d{1,5}$")]
-    start: AwareDatetime = datetime.fromisoformat("2026-01-01T18:00:00+00:00")
+    control: TcpAddress
+    start: Annotated[AwareDatetime, AfterValidator(_of_this_century)] = datetime(2026, 1, 1, 18, tzinfo=UTC)
     seed: int = Field(default=1, ge=0)
     camera: Literal["modified", "unmodified"] = "modified"
     laboratory_degC: float = Field(default=24.0, ge=-10, le=40)
@@ -241,8 +277,8 @@ class SimulationConfig(Document):
 class StandConfig(Document):
     """The whole file."""
 
-    name: str
-    operator: str = ""
+    name: Line = Field(min_length=1)
+    operator: Line = ""
     target: str
     bus: BusConfig
     regulator: RegulatorConfig
@@ -262,6 +298,10 @@ class StandConfig(Document):
         units = [self.regulator.unit, self.relays.unit, self.thermometers.unit]
         if len(set(units)) < len(units):
             raise ValueError(f"regulator, relays and thermometers need different units on one bus, not {units}")
+        addresses = [self.bus.address, *(axis.address for axis in self.axes.values())]
+        twice = next((address for address in addresses if addresses.count(address) > 1), None)
+        if twice is not None:
+            raise ValueError(f"bus and axes need addresses of their own, {twice} is given twice")
         if self.limits.chamber_degC[1] >= self.guard.max_air_degC:
             raise ValueError("guard.max_air_degC must be above the upper limits.chamber_degC, or a normal run trips it")
         slowest_s = max(self.regulator.poll_s, self.thermometers.poll_s, self.camera.poll_s)
@@ -280,12 +320,12 @@ def packaged(folder: Literal["", "registers", "recipes", "targets"], name: str) 
 
     Raises ConfigError that lists what there is.
     """
-    given = Path(name)
-    if given.is_file():
-        return given
     root = Path(str(importlib.resources.files("configs"))) / folder
     known = sorted(path.stem for path in root.glob("*.yaml"))
-    for candidate in (root / name, root / f"{name}.yaml"):
-        if candidate.is_file():
-            return candidate
+    for candidate in (Path(name), root / name, root / f"{name}.yaml"):
+        try:
+            if candidate.is_file():
+                return candidate
+        except OSError as error:  # such as a name longer than the file system takes
+            raise ConfigError(f"{name}: cannot be looked up ({error.strerror})") from error
     raise ConfigError(f"{name}: no such file, and not one of those installed: {', '.join(known)}")

@@ -66,7 +66,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig) -> tuple[PricedStep,
         priced.append(PricedStep(planned, duration_s, frames, size_bytes))
     total_s = sum(step.duration_s for step in priced)
     if total_s > _LONGEST_S:
-        raise ConfigError(f"the plan takes {total_s / 86400:.0f} days, and at most a year is believed")
+        raise ConfigError(f"the plan takes {total_s / 86400:.0f} days; more than a year is refused")
     return tuple(priced)
 
 

@@ -3,8 +3,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from drivers.clock import WallClock
 from drivers.interface import ConfigError
+from stand.assembly import assemble
 from stand.config import load_config, packaged
+from stand.hub import Hub
 from stand.recipe import load_recipe
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -46,11 +49,48 @@ def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
         ("relays.unit", 1, "need different units on one bus"),
         ("relays.channels", {"heater_enable": 0}, "relays: channels lacks camera_power, compressor"),
         ("thermometers.channels.air.channel", 0, "thermometers: two thermometers share one channel"),
-        ("axes.linear.limits", [10, 0], "axes.linear: limits (10.0, 0.0) are not in ascending order"),
+        ("axes.linear.limits", [10, 0], "axes.linear.limits: (10.0, 0.0) is not in ascending order"),
         ("axes.vertical", {}, "axes.vertical"),
-        ("limits.chamber_degC", [-10, 80], "guard.max_air_degC must be above"),
+        ("limits.chamber_degC", [-10, 70], "guard.max_air_degC must be above"),
         ("guard.heater_renew_s", 10, "at most half of heater_hold_s"),
         ("guard.stale_after_s", 1, "at least twice the slowest safety poll"),
+        ("limits.chamber_degC", [-10, 71], "limits.chamber_degC.1: Input should be less than or equal to 70"),
+        ("limits.chamber_degC", [-11, 60], "limits.chamber_degC.0: Input should be greater than or equal to -10"),
+        ("limits.chamber_degC", [60, 20], "limits.chamber_degC: (60.0, 20.0) is not in ascending order"),
+        ("guard.period_s", 10.5, "guard.period_s: Input should be less than or equal to 10"),
+        ("guard.period_s", 10, "period_s + heater_renew_s must be below heater_hold_s"),
+        ("guard.stale_after_s", 121, "guard.stale_after_s: Input should be less than or equal to 120"),
+        ("guard.max_air_degC", 81, "guard.max_air_degC: Input should be less than or equal to 80"),
+        ("guard.max_granite_degC", 81, "guard.max_granite_degC: Input should be less than or equal to 80"),
+        ("guard.max_camera_degC", 101, "guard.max_camera_degC: Input should be less than or equal to 100"),
+        ("guard.max_camera_degC", float("inf"), "guard.max_camera_degC: Input should be a finite number"),
+        ("thermometers.channels.air.plausible_degC", [50, -40], "air.plausible_degC: (50.0, -40.0) is not in asc"),
+        ("thermometers.channels.air.offset_K", -40, "air.offset_K: Input should be greater than or equal to -10"),
+        ("bus.address", "tcp:localhost:70000", "bus.address: expected tcp:HOST:PORT with a port of 1..65535"),
+        ("bus.address", "tcp:localhost:0", "bus.address: expected tcp:HOST:PORT with a port of 1..65535"),
+        ("axes.linear.address", "tcp:localhost:65536", "axes.linear.address: expected tcp:HOST:PORT with a port"),
+        ("axes.linear.address", "serial:/dev/ximc/00001006", "serial:/dev/ximc/00001006 is given twice"),
+        ("axes.linear.limits", [0, 301], "beyond the travel of 300 mm"),
+        ("axes.rotary.limits", [-361, 40], "beyond the travel of 360 deg"),
+        ("axes.linear.serial_number", 2**32, "less than or equal to 4294967295"),
+        ("flap.serial_number", "", "flap.serial_number: String should match pattern"),
+        ("flap.travel_s", 61, "flap.travel_s: Input should be less than or equal to 60"),
+        ("flap.backend", "..sim", "flap.backend: String should match pattern"),
+        ("flap.backend_address", "tcp:localhost:65536", "flap.backend_address: expected tcp:HOST:PORT with a port"),
+        ("camera.serial_number", "12345678901234567", "camera.serial_number: String should match pattern"),
+        ("camera.serial_number", "Kamera-µ", "camera.serial_number: String should match pattern"),
+        ("camera.exposure_s", 11, "camera.exposure_s: Input should be less than or equal to 10"),
+        ("camera.temperature.min_degC", 130, "min_degC 130.0 is not below max_degC 120.0"),
+        ("name", "two\nlines", "name: String should match pattern"),
+        ("name", "", "name: String should have at least 1 character"),
+        ("recording.directory", "a\0b", "recording.directory: expected a path of printable characters"),
+        ("operator", "\x1b[2J", "operator: String should match pattern"),
+        ("simulation", {"control": "tcp:localhost:99999"}, "simulation.control: expected tcp:HOST:PORT with a port"),
+        (
+            "simulation",
+            {"control": "tcp:localhost:1", "start": "1999-12-31T00:00:00Z"},
+            "simulation.start: expected a time of the years 2000 to 2099",
+        ),
         ("flap.backend", "drivers.sim.usb", "backend and backend_address go together"),
     ],
 )
@@ -60,6 +100,22 @@ def test_a_wrong_entry_names_file_and_path(tmp_path: Path, path: str, value: obj
         load_config(file)
     assert sentence in str(caught.value)
     assert str(caught.value).startswith(str(file))
+
+
+@pytest.mark.parametrize(
+    ("module", "sentence"),
+    [
+        ("no_such_module", "no module 'no_such_module'"),
+        ("json.decoder", r"'json\.decoder' has no get_backend\(address\)"),
+    ],
+)
+def test_a_flap_backend_that_is_none_is_refused_before_anything_is_opened(tmp_path: Path, module: str, sentence: str):
+    changed(tmp_path, "flap.backend_address", "tcp:localhost:1")
+    data = yaml.safe_load((tmp_path / "changed.yaml").read_text())
+    data["flap"]["backend"] = module
+    (tmp_path / "changed.yaml").write_text(yaml.safe_dump(data))
+    with pytest.raises(ConfigError, match=f"flap.backend: .*{sentence}"):
+        assemble(load_config(tmp_path / "changed.yaml"), Hub(), WallClock())
 
 
 def test_a_key_given_twice_is_refused(tmp_path: Path):
