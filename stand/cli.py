@@ -7,6 +7,7 @@ import itertools
 import json
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -15,6 +16,7 @@ from typing import Annotated
 
 import typer
 
+from compensation.target import load_target
 from drivers.clock import NS_PER_S, WallClock
 from drivers.interface import ConfigError, StandError
 from experiments.steps import kind_of, parameters_of
@@ -30,6 +32,8 @@ from stand.simulator import Simulator, laboratory_of
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,  # usage errors as plain lines, which survive a log file
+    pretty_exceptions_enable=False,
     help="Drive the thermal test stand: plan, run, simulate.\n\nExample: stand run overnight --config my-stand.yaml",
 )
 
@@ -51,6 +55,7 @@ def demo(
         config, recipe = _config("simulated"), _recipe("demo")
         order = _order(config, recipe)
         directory = _unused(out)
+        _check_writable(directory)
         with _run_progress(price(recipe[0].plan(), config[0])) as watch:
             session = asyncio.run(run_virtual(order, directory, None, watch))
         for line in run_demo(session, directory):
@@ -126,9 +131,12 @@ def run(
     with _one_line_errors():
         if seed is not None and not virtual_time:
             raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
+        if seed is not None and seed < 0:
+            raise ConfigError(f"--seed is 0 or more, not {seed}")
         config_file, recipe_file = _config(config), _recipe(recipe)
         order = _order(config_file, recipe_file)
         directory = out or config_file[0].recording.directory
+        _check_writable(directory)
         with _run_progress(price(recipe_file[0].plan(), config_file[0])) as watch:
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
             session = asyncio.run(work)
@@ -137,8 +145,20 @@ def run(
 
 def _unused(out: Path) -> Path:
     """`out`, or `out-2`, `out-3` ... when it exists: a second demo never touches the first."""
+    if not out.name:
+        raise ConfigError(f"--out {out}: a demo needs a folder of its own name")
     candidates = (out.with_name(f"{out.name}-{number}") for number in itertools.count(2))
     return out if not out.exists() else next(path for path in candidates if not path.exists())
+
+
+def _check_writable(directory: Path) -> None:
+    """ConfigError when no session could be made below `directory`: to be told before anything is opened."""
+    try:
+        places = (directory, *directory.absolute().parents)
+        existing = next(path for path in places if path.exists() or path.is_symlink())
+        Path(tempfile.mkdtemp(prefix=".writable-", dir=existing)).rmdir()
+    except OSError as error:
+        raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error
 
 
 def _config(name: str) -> tuple[StandConfig, str]:
@@ -152,8 +172,9 @@ def _recipe(name: str) -> tuple[Recipe, str]:
 
 
 def _order(config: tuple[StandConfig, str], recipe: tuple[Recipe, str]) -> Order:
-    target = packaged("targets", config[0].target).read_text(encoding="utf-8")
-    return Order(config[0], recipe[0], config[1], recipe[1], target)
+    target = packaged("targets", config[0].target)
+    load_target(target)  # only its text is attached, but never one that compensation could not read
+    return Order(config[0], recipe[0], config[1], recipe[1], target.read_text(encoding="utf-8"))
 
 
 @contextmanager
@@ -178,14 +199,19 @@ def _one_line_errors() -> Generator[None]:
     try:
         yield
     except ConfigError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {_one_line(error)}", err=True)
         raise typer.Exit(2) from error
     except Interrupted as error:
         typer.echo(f"{error}; the stand is safe", err=True)
         raise typer.Exit(130) from error
     except (StandError, OSError) as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {_one_line(error)}", err=True)
         raise typer.Exit(1) from error
+
+
+def _one_line(error: Exception) -> str:
+    """The sentence with whatever a terminal would not print (a line feed in a file's name) escaped."""
+    return "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in str(error))
 
 
 def _line(step: PricedStep) -> str:

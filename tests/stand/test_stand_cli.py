@@ -78,6 +78,13 @@ def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(
         (["plan", "no-such-recipe"], "no-such-recipe: no such file, and not one of those installed: demo,"),
         (["plan", "demo", "--config", "nowhere.yaml"], "nowhere.yaml: no such file"),
         (["run", "demo", "--seed", "3"], "--seed belongs to --virtual-time"),
+        (["run", "demo", "--virtual-time", "--seed", "-1"], "--seed is 0 or more, not -1"),
+        (["run", "demo", "--out", "/proc/x"], "/proc/x: no session can be written there"),
+        (["run", "demo", "--out", __file__], "no session can be written there (Not a directory)"),
+        (["demo", "--out", "/proc/x"], "/proc/x: no session can be written there"),
+        (["demo", "--out", "."], "a demo needs a folder of its own name"),
+        (["plan", "two\nlines"], "two\\nlines: no such file"),
+        (["plan", "x" * 300], "cannot be looked up (File name too long)"),
         (["run", "demo", "--config", "laboratory", "--virtual-time"], "no `simulation` section"),
         (["simulate", "laboratory"], "no `simulation` section"),
     ],
@@ -87,6 +94,25 @@ def test_bad_input_ends_with_status_2_and_one_line(arguments: list[str], sentenc
     assert result.exit_code == 2
     assert sentence in result.output
     assert len(result.output.strip().splitlines()) == 1
+
+
+def test_a_target_that_is_none_is_refused_before_anything_moves(tmp_path: Path):
+    target = tmp_path / "target.yaml"
+    target.write_text("name: no grid\n")
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump({**data, "target": str(target)}))
+    result = runner.invoke(app, ["run", "demo", "--config", str(config), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert result.output.startswith(f"error: {target}: columns: Field required")
+    assert len(result.output.strip().splitlines()) == 1
+
+
+def test_a_usage_error_is_said_in_plain_lines():
+    result = runner.invoke(app, ["run", "demo", "--seed", "many"])
+    assert result.exit_code == 2
+    assert "'--seed'" in result.output.strip().splitlines()[-1]
+    assert result.output.isascii()
 
 
 def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_path: Path):
