@@ -23,7 +23,7 @@ from experiments.steps import kind_of, parameters_of
 from stand.config import StandConfig, load_config, packaged
 from stand.demo import run_demo
 from stand.estimate import PricedStep, price
-from stand.hub import Hub, Item, StepMark, StepState
+from stand.hub import Event, Hub, Item, StepMark, StepState
 from stand.progress import progress
 from stand.recipe import Recipe, load_recipe
 from stand.run import Interrupted, Order, run_real, run_virtual
@@ -179,7 +179,7 @@ def _order(config: tuple[StandConfig, str], recipe: tuple[Recipe, str]) -> Order
 
 @contextmanager
 def _run_progress(steps: tuple[PricedStep, ...]) -> Generator[Callable[[Hub], None]]:
-    """Progress in expected seconds of the plan, moved on by the steps' marks."""
+    """Progress in expected seconds of the plan, moved on by the steps' marks; warnings and errors as they come."""
     with progress("run", sum(step.duration_s for step in steps)) as report:
         done_s = 0.0
 
@@ -189,6 +189,9 @@ def _run_progress(steps: tuple[PricedStep, ...]) -> Generator[Callable[[Hub], No
                 done_s += steps[item.index].duration_s
             if isinstance(item, StepMark):
                 report(done_s, f"{item.index + 1}/{len(steps)} {item.kind} {_parameters(item.parameters)}")
+            if isinstance(item, Event) and item.level != "info":
+                at = datetime.fromtimestamp(item.time_ns / NS_PER_S, UTC)
+                typer.echo(f"{item.level}: {at:%H:%M:%S} UTC {item.text}", err=True)
 
         yield lambda hub: hub.subscribe(follow)
 
@@ -202,7 +205,7 @@ def _one_line_errors() -> Generator[None]:
         typer.echo(f"error: {_one_line(error)}", err=True)
         raise typer.Exit(2) from error
     except Interrupted as error:
-        typer.echo(f"{error}; the stand is safe", err=True)
+        typer.echo(_one_line(error), err=True)
         raise typer.Exit(130) from error
     except (StandError, OSError) as error:
         typer.echo(f"error: {_one_line(error)}", err=True)
