@@ -7,10 +7,9 @@ import sys
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from compensation.detections import DetectedImage, write_detections
 from compensation.drift import MAX_DEGREE, CompensationModel
@@ -25,36 +24,10 @@ from compensation.validation import evaluate, table
 from drivers.interface import ConfigError, StandError
 from stand.progress import progress
 from stand.session import Session
-
-# The base of what typer raises for wrong arguments; it exports only this descendant.
-_UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
-
-
-class _OneLineUsage(TyperGroup):
-    """Says what is wrong with the arguments in one line, as every other error is said; no arguments ask for help."""
-
-    def make_context(self, info_name: str | None, args: list[str], *rest: Any, **extra: Any) -> Any:
-        if not args:
-            return super().make_context(info_name, args, *rest, **extra)
-        with _one_line_usage():
-            return super().make_context(info_name, args, *rest, **extra)
-
-    def invoke(self, ctx: Any) -> Any:
-        with _one_line_usage():
-            return super().invoke(ctx)
-
-
-@contextmanager
-def _one_line_usage() -> Generator[None]:
-    try:
-        yield
-    except _UsageError as error:
-        _tell(error.format_message())
-        raise typer.Exit(2) from error
-
+from stand.usage import OneLineUsage, one_line, tell
 
 app = typer.Typer(
-    cls=_OneLineUsage,
+    cls=OneLineUsage,
     no_args_is_help=True,
     add_completion=False,
     help="Find markers, fit the thermal drift of a camera, report what compensation gains.\n\n"
@@ -96,7 +69,7 @@ def detect_images(
 
             write_detections(out, chosen, counted())
         for failure in failures:
-            typer.echo(f"not found in {_one_line(failure)}", err=True)
+            typer.echo(f"not found in {one_line(failure)}", err=True)
 
 
 @app.command()
@@ -206,9 +179,9 @@ def _detections(sources: Sequence[Session | Path], target: Target, failures: lis
 def _images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | None, Image]]:
     """Name (escaped), time and pixels of each image of a source."""
     if not isinstance(source, Session):
-        yield _one_line(source.name), None, read_image(source)
+        yield one_line(source.name), None, read_image(source)
         return
-    prefix = f"{_one_line(source.path.name)}/" if several else ""
+    prefix = f"{one_line(source.path.name)}/" if several else ""
     for index, frame in enumerate(read_frames(source)):
         yield f"{prefix}{index}", frame.time_ns, frame.image
 
@@ -219,25 +192,14 @@ def _one_line_errors() -> Generator[None]:
     try:
         yield
     except StandError as error:
-        _tell(str(error))
+        tell(error)
         raise typer.Exit(2) from error
     except OSError as error:
-        _tell(str(error))
+        tell(error)
         raise typer.Exit(1) from error
     except KeyboardInterrupt as error:
         typer.echo("interrupted; nothing was written", err=True)
         raise typer.Exit(130) from error
-
-
-def _tell(sentence: str) -> None:
-    typer.echo(f"error: {_one_line(sentence)}", err=True)
-
-
-def _one_line(text: str) -> str:
-    """The text with line ends, and what else cannot be printed, as escapes: a file's name may hold anything."""
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode() for character in text
-    )
 
 
 if __name__ == "__main__":

@@ -28,13 +28,14 @@ from stand.progress import progress
 from stand.recipe import Recipe, load_recipe
 from stand.run import Interrupted, Order, run_real, run_virtual
 from stand.simulator import Simulator, laboratory_of
+from stand.usage import OneLineUsage, one_line, tell
 
 app = typer.Typer(
+    cls=OneLineUsage,
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode=None,  # usage errors as plain lines, which survive a log file
-    pretty_exceptions_enable=False,
-    help="Drive the thermal test stand: plan, run, simulate.\n\nExample: stand run overnight --config my-stand.yaml",
+    help="Drive the thermal test stand: plan, run, simulate.\n\n"
+    "Example: stand run thermal-cycle --config my-stand.yaml",
 )
 
 ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
@@ -202,19 +203,14 @@ def _one_line_errors() -> Generator[None]:
     try:
         yield
     except ConfigError as error:
-        typer.echo(f"error: {_one_line(error)}", err=True)
+        tell(error)
         raise typer.Exit(2) from error
     except Interrupted as error:
-        typer.echo(_one_line(error), err=True)
+        typer.echo(one_line(error), err=True)
         raise typer.Exit(130) from error
     except (StandError, OSError) as error:
-        typer.echo(f"error: {_one_line(error)}", err=True)
+        tell(error)
         raise typer.Exit(1) from error
-
-
-def _one_line(error: Exception) -> str:
-    """The sentence with whatever a terminal would not print (a line feed in a file's name) escaped."""
-    return "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in str(error))
 
 
 def _line(step: PricedStep) -> str:
