@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import os
 import pickle
+import resource
 import signal
 import sys
 from collections.abc import Callable
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import seconds_ns
-from drivers.interface import ConfigError, StandTripped, Unreachable
+from drivers.interface import ConfigError, SessionError, StandTripped, Unreachable
 from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
 from stand.run import Interrupted, Order, run_virtual
 from stand.session import Session
@@ -244,6 +245,23 @@ async def test_a_compressor_that_dropped_by_itself_rests_before_it_starts_again(
     rests_s = [(min(on for on in ons if on > off) - off) / 1e9 for off in offs if any(on > off for on in ons)]
     assert rests_s
     assert min(rests_s) >= 270  # min_off_s 300, seen by a poll every 10 s after a drop during the silence
+
+
+async def test_frames_the_disk_refuses_are_counted_and_end_the_run_with_a_sentence(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    """The kernel refuses files beyond 1 MB from the first capture on, as a full disk would; telemetry still fits."""
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    watch = at_step("Capture", lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard)))
+    try:
+        with pytest.raises(SessionError, match="complete, but 5 frames were lost"):
+            await run_virtual(order(), tmp_path / "out", None, watch)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    assert session.frame_count == 0
+    assert [event.text for event in session.events() if event.kind == "run.end"] == ["complete"]
+    assert any("5 in all" in event.text for event in session.events() if event.kind == "frames_dropped")
 
 
 async def test_a_second_laboratory_at_the_same_addresses_is_refused_with_a_reason(
