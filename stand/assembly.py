@@ -52,9 +52,9 @@ class Assembly:
         ]
         return tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
 
-    def guard(self, abort: Callable[[Fault], None]) -> Guard:
-        """The guard with the configured limits. The camera's own temperature may be missing (it is switched off before
-        a warm-up), so it is limited but not required."""
+    def guard(self, stop: Callable[[Fault], None]) -> Guard:
+        """The guard with the configured limits; it calls `stop` on a fault. The camera's own temperature may be missing
+        (it is switched off before a warm-up), so it is limited but not required."""
         limits = self.config.guard
         rules = safety_rules(
             {
@@ -66,7 +66,7 @@ class Assembly:
             ("regulator.pv", "thermometers.air", "thermometers.granite_inside"),
             limits.stale_after_s,
         )
-        return Guard(self.stand, rules, self.hub, self.clock, limits.period_s, limits.heater_renew_s, abort)
+        return Guard(self.stand, rules, self.hub, self.clock, limits.period_s, limits.heater_renew_s, stop)
 
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:

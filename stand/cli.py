@@ -38,6 +38,8 @@ app = typer.Typer(
     "Example: stand run thermal-cycle --config my-stand.yaml",
 )
 
+_ENDING = {signal.SIGINT, signal.SIGTERM}
+
 ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
 RecipeArgument = Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")]
 
@@ -74,13 +76,11 @@ def simulate(
     with _one_line_errors():
         stand_config, _ = _config(config)
         simulator = Simulator(laboratory_of(stand_config, virtual=False, seed=None))
+        # Blocked only now, or the simulator would inherit it; unblocked, SIGTERM would end us and leave it behind.
+        signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
         typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
-        try:
-            signal.sigwait({signal.SIGINT, signal.SIGTERM})
-        except KeyboardInterrupt:
-            pass
-        finally:
-            simulator.stop()
+        signal.sigwait(_ENDING)
+        simulator.stop()
 
 
 @app.command()

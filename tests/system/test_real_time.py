@@ -3,15 +3,18 @@
 import asyncio
 import os
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from drivers.interface import Unreachable
 from stand.hub import Hub, Item, StepMark
 from stand.run import Interrupted, Order, run_real
 from stand.session import Session
+from stand.simulator import ControlSocket
 from tests.system.conftest import require_aravis
 
 BRIEF = """
@@ -72,3 +75,22 @@ async def test_an_interrupt_leaves_the_stand_safe_and_the_session_readable(
     assert session.readings("regulator.running")[1][-1] == 0
     assert session.readings("relays.heater_enable")[1][-1] == 0
     assert "stopped by the operator" in session.events()[-1].text
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+async def test_a_simulated_laboratory_that_is_ended_leaves_nothing_behind(
+    tmp_path: Path, order: Callable[..., Order], number: signal.Signals
+):
+    ordered = order(BRIEF)
+    command = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "stand.cli", "simulate", str(tmp_path / "config.yaml"), stderr=asyncio.subprocess.PIPE
+    )
+    assert command.stderr is not None
+    assert b"answers; Ctrl-C ends it" in await command.stderr.readline()
+    assert (tmp_path / "linear").is_symlink()
+    command.send_signal(number)
+    assert await command.wait() == 0
+    assert not (tmp_path / "linear").is_symlink()
+    assert ordered.config.simulation is not None
+    with pytest.raises(Unreachable, match="nobody listens"):
+        await ControlSocket(ordered.config.simulation.control).open()
