@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from drivers.bus import Bus
 from drivers.interface import ConfigError, DeviceError, DeviceFault, Reading
@@ -77,15 +77,23 @@ class Relays:
         await self._write(channel, pulse.address, counts, True)
 
     async def make_safe(self) -> None:
-        """Turn off every relay of safe_off, confirmed; all are tried, then DeviceFault names those still on."""
-        failures: list[str] = []
-        for channel in self._safe_off:
+        """Turn off every relay of safe_off, confirmed; all are tried, those not confirmed once more, then DeviceFault
+        names those that still are not."""
+        failures = await self._turn_off(self._safe_off)
+        if failures:
+            failures = await self._turn_off(failures)
+        if failures:
+            raise DeviceFault(self.name, f"not confirmed off: {'; '.join(failures.values())}")
+
+    async def _turn_off(self, channels: Iterable[str]) -> dict[str, str]:
+        """Channel -> why it is not confirmed off."""
+        failures: dict[str, str] = {}
+        for channel in channels:
             try:
                 await self.switch(channel, False)
             except DeviceError as error:
-                failures.append(f"{channel} ({error})")
-        if failures:
-            raise DeviceFault(self.name, f"not confirmed off: {'; '.join(failures)}")
+                failures[channel] = f"{channel} ({error})"
+        return failures
 
     async def _write(self, channel: str, address: int, raw_value: int, on: bool) -> None:
         async def send() -> None:

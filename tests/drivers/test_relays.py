@@ -32,6 +32,7 @@ class BoardWrite(ModbusPDU):
     rtu_frame_size = 8
     stuck: ClassVar[set[int]] = set()  # coils that do not move
     lost_replies: ClassVar[list[bool]] = []  # consumed one a write: True = the write acts, its reply is mangled
+    lost_writes: ClassVar[list[bool]] = []  # consumed one a write: True = it has no effect
     written: ClassVar[list[tuple[int, int]]] = []
 
     def encode(self) -> bytes:
@@ -45,7 +46,8 @@ class BoardWrite(ModbusPDU):
         value = self.registers[0]
         self.written.append((self.address, value))
         coil, on = (self.address, value == 0xFF00) if self.address < 8 else (self.address - 0x0200, True)
-        if coil not in self.stuck:
+        lost = bool(self.lost_writes) and self.lost_writes.pop(0)
+        if coil not in self.stuck and not lost:
             await context.async_setValues(device_id, 5, coil, [on])
         if self.lost_replies and self.lost_replies.pop(0):
             self.registers = [value ^ 1]
@@ -55,6 +57,7 @@ class BoardWrite(ModbusPDU):
 @pytest.fixture
 def board() -> type[BoardWrite]:
     BoardWrite.stuck, BoardWrite.lost_replies, BoardWrite.written = set(), [], []
+    BoardWrite.lost_writes = []
     return BoardWrite
 
 
@@ -146,6 +149,13 @@ async def test_make_safe_tries_every_relay_and_names_the_one_still_on(relays: Re
     with pytest.raises(DeviceFault, match="not confirmed off: heater_enable"):
         await relays.make_safe()
     assert await states(relays) == {"relays.heater_enable": 1, "relays.compressor": 0, "relays.camera_power": 0}
+
+
+async def test_make_safe_tries_once_more_what_was_not_confirmed(relays: Relays, board: type[BoardWrite]) -> None:
+    await relays.switch("heater_enable", True)
+    board.lost_replies, board.lost_writes = [True, True], [True, True]  # the first attempt and its repetition
+    await relays.make_safe()
+    assert await states(relays) == {"relays.heater_enable": 0, "relays.compressor": 0, "relays.camera_power": 0}
 
 
 async def test_a_board_that_is_not_there_fails_to_open(bus: Bus) -> None:
