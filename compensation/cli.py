@@ -23,7 +23,7 @@ from compensation.target import Target, load_target
 from compensation.validation import evaluate, table
 from drivers.interface import ConfigError, StandError
 from stand.progress import progress
-from stand.session import Session
+from stand.recording.session import Session
 from stand.usage import OneLineUsage, one_line, tell
 
 app = typer.Typer(

@@ -21,7 +21,7 @@ from compensation.target import Target
 from drivers.documents import parse_document
 from drivers.interface import Frame, SessionError
 from stand.progress import Report
-from stand.session import Session
+from stand.recording.session import Session
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]

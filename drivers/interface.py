@@ -115,7 +115,8 @@ class Frame:
     on the stand's clock. camera_degC: the camera's own temperature, NaN when it has none or could not be read.
     block_id: own 64-bit count of frames of this device since it was opened, gaps included. camera_ticks: the
     camera's own time stamp, ns. dropped: frames lost since the previous one. step_id: the plan's step that asked
-    for it, "" when none did.
+    for it, "" when none did. windows: x, y, width, height of the parts of the image that were recorded, px, shape
+    (n, 4), the rest is filled; None when the whole image is there.
     """
 
     channel: str
@@ -128,6 +129,7 @@ class Frame:
     camera_ticks: int
     dropped: int = 0
     step_id: str = ""
+    windows: NDArray[np.int32] | None = None
 
 
 class Device(Protocol):

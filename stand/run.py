@@ -19,7 +19,7 @@ from stand.config import StandConfig
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
 from stand.recipe import Recipe
-from stand.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.scheduler import Scheduler
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from stand.stand import Stand

@@ -22,8 +22,9 @@ from drivers.clock import NS_PER_S
 from drivers.interface import Frame
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.scene import Scene, SceneSpec
-from stand.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
-from stand.segment import Record, Series, SeriesForm, Topic
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
 from tests.bench.figures import Figure, in_turns, progress, side_by_side
 
 ROUNDS = 15

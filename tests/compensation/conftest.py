@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.interface import Frame, Reading
 from stand.hub import Batch, Hub, Item, StepMark, StepState
-from stand.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
 

@@ -15,7 +15,7 @@ from compensation.displacements import displacements, reference_centres
 from compensation.markers import Flag
 from compensation.observations import Observations, Role, concatenate, observe, session_target
 from drivers.interface import ConfigError, Frame, SessionError
-from stand.session import Session
+from stand.recording.session import Session
 
 from .conftest import DARK, GLARE, SEQUENCE, TARGET_YAML, Recorded, record
 from .synthetic import facts, observations, quadratic

@@ -7,11 +7,13 @@ from mcap.writer import CompressionType, Writer
 
 from drivers.clock import NS_PER_S
 from drivers.interface import Frame, Reading, SessionError
-from stand import messages
 from stand.hub import Batch, Event, StepMark, StepState
-from stand.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from stand.segment import FRAMES, TELEMETRY, Record, Series, SeriesForm, Topic
-from stand.session import Session
+from stand.recording import messages
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
+from stand.recording.session import Session
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"session_id": "night-1", "operator": "J. Krukowski"}

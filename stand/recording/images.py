@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from typing import Literal, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -12,12 +12,21 @@ from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from drivers.interface import Frame, SessionError
-from stand.messages import timestamp
+from stand.recording.messages import timestamp
 
 CAMERA_IMAGE = "/camera/image"
 
 ImageArray = NDArray[np.uint8] | NDArray[np.uint16]
 ImageEncoding = Literal["png", "raw"]
+
+
+class DecodedImage(NamedTuple):
+    """A recorded image: pixels of shape (height, width); windows as in drivers.interface.Frame."""
+
+    channel: str
+    pixels: ImageArray
+    windows: NDArray[np.int32] | None = None
+
 
 IMAGE_CLASS: dict[ImageEncoding, type[Message]] = {"png": CompressedImage, "raw": RawImage}
 GREY_TYPES = ("uint8", "uint16")
@@ -61,15 +70,15 @@ def encode_image(frame: Frame, encoding: ImageEncoding) -> bytes:
     ).SerializeToString()
 
 
-def decode_image(schema: str, data: bytes) -> tuple[str, ImageArray]:
-    """(channel, image) of a message of that schema, shape (height, width); SessionError when it is not an image."""
+def decode_image(schema: str, data: bytes) -> DecodedImage:
+    """The image in a message of that schema; SessionError when it is not an image."""
     try:
         if schema == CompressedImage.DESCRIPTOR.full_name:
             compressed = CompressedImage.FromString(data)
-            return compressed.frame_id, _from_png(compressed.data)
+            return DecodedImage(compressed.frame_id, _from_png(compressed.data))
         if schema == RawImage.DESCRIPTOR.full_name:
             raw = RawImage.FromString(data)
-            return raw.frame_id, _from_raw(raw)
+            return DecodedImage(raw.frame_id, _from_raw(raw))
     except DecodeError as error:
         raise SessionError(f"an image message cannot be read ({error})") from error
     raise SessionError(f"images of schema {schema} are not known")

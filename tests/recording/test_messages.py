@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.interface import Frame, Quality, Reading, SessionError, bad_reading
-from stand import messages
 from stand.hub import Batch, Event, StepMark, StepState
-from stand.images import decode_image, encode_image
+from stand.recording import messages
+from stand.recording.images import decode_image, encode_image
 
 TIME_NS = 1_767_290_400_123_456_789
 
@@ -160,7 +160,7 @@ def test_a_frame_description_survives_the_round_trip():
 def test_images_are_lossless(encoding, schema, dtype):
     image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (37, 53), dtype, endpoint=True)
     data = encode_image(frame(image), encoding)
-    channel, decoded = decode_image(schema.DESCRIPTOR.full_name, data)
+    channel, decoded, _ = decode_image(schema.DESCRIPTOR.full_name, data)
     assert channel == "camera.image"
     assert decoded.dtype == dtype
     np.testing.assert_array_equal(decoded, image)

@@ -20,10 +20,13 @@ from mcap.writer import CompressionType
 from drivers.clock import Clock, seconds_ns
 from drivers.interface import Frame, Quality, SessionError
 from drivers.lane import Lane
-from stand import messages
 from stand.hub import Batch, Event, Hub, Item, StepMark
-from stand.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
-from stand.segment import FRAMES, TELEMETRY, Record, Series, SeriesForm, Topic, sync_folder
+from stand.recording import messages
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
+from stand.recording.sink import sync_folder
 
 SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; FrameMeta has all 64
 

@@ -4,7 +4,7 @@ Own messages are in package `thermostand`, one file each, made here at run time 
 schema its name is used. Every batch message has one double per quantity, its unit in the field's name, and a quality
 beside it; a quantity the device did not give is NaN and ABSENT, so that no viewer draws it as 0. `remarks` repeats
 in full each reading the fixed fields cannot carry: it has a reason, an instant of its own, or no field. Images are in
-stand/images.py.
+stand/recording/images.py.
 
 Field numbers follow the order of the tables below. They are the file format: append, never reorder.
 """

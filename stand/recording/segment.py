@@ -1,4 +1,4 @@
-"""One series of a session on the disk: a folder of MCAP segments, each written so that what is acknowledged survives.
+"""One MCAP segment of a series (frames or telemetry) of a session, written so that what is acknowledged survives.
 
 `NNNN.mcap.part` grows by whole blocks of records: one pwrite, one fdatasync, then it is acknowledged. A finished
 segment gets its index, is synced and renamed to `NNNN.mcap`. Metadata (`session`, `segment`) and attachments are the
@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import io
 import os
-import re
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,13 +24,8 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-FRAMES = "frames"
-TELEMETRY = "telemetry"
-FINISHED = ".mcap"
-UNFINISHED = ".mcap.part"
-SESSION_METADATA = "session"
-SEGMENT_METADATA = "segment"
-DEVICES = "devices"  # key of a channel's metadata: the names of the devices on its topic, with commas between
+from stand.recording.layout import DEVICES, FINISHED, SEGMENT_METADATA, SESSION_METADATA, UNFINISHED
+from stand.recording.sink import CommitSink, sync_folder
 
 CHUNK_BYTES = 1024 * 1024
 
@@ -66,44 +59,6 @@ class SeriesForm:
     attachments: Mapping[str, str]
     segment_bytes: int
     segment_ns: int
-
-
-class CommitSink:
-    """A new file that grows by whole blocks; a block is on the disk when `append` returns."""
-
-    def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self.committed_bytes = 0
-
-    def append(self, block: bytes) -> None:
-        """Write and sync; on OSError the file is cut back to the blocks before and the error raised."""
-        try:
-            rest = memoryview(block)
-            while rest:  # a nearly full disk takes a part of the block before it refuses
-                rest = rest[os.pwrite(self._fd, rest, self.committed_bytes + len(block) - len(rest)) :]
-            os.fdatasync(self._fd)
-        except OSError:
-            with suppress(OSError):
-                os.ftruncate(self._fd, self.committed_bytes)
-            raise
-        self.committed_bytes += len(block)
-
-    def close(self) -> None:
-        """Sync size and times, too, and close; raises OSError, also when it is closed already."""
-        fd, self._fd = self._fd, -1  # the number may belong to another file by the next call
-        try:
-            os.fsync(fd)
-        finally:
-            os.close(fd)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the folder's names durable."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 class _Block(io.BytesIO):
@@ -192,66 +147,3 @@ class Segment:
         if self._sink.committed_bytes <= self._opening_bytes:
             with suppress(OSError):
                 self._part.unlink()
-
-
-class Series:
-    """The segments of one folder, one open at a time. Blocking; used from one thread."""
-
-    def __init__(self, folder: Path, form: SeriesForm) -> None:
-        self._folder = folder
-        self._form = form
-        self._segment: Segment | None = None
-        self.troubles: deque[str] = deque()  # errors that were overcome, as sentences; another thread may take them
-
-    def open(self, time_ns: int) -> Segment:
-        """The open segment, begun when there is none; raises OSError."""
-        if self._segment is None:
-            self._segment = Segment(self._folder, next_number(self._folder), self._form, time_ns)
-        return self._segment
-
-    def commit(self, records: Sequence[Record], time_ns: int) -> None:
-        """All of `records` on the disk when this returns, in a new segment when the present one is full or fails;
-        OSError when the new one fails, too. `time_ns` (now) decides whether a segment is old enough to be closed."""
-        if self._is_full(time_ns):
-            self.finish()
-        try:
-            self._commit(records, time_ns)
-        except OSError as error:
-            self.troubles.append(f"a segment of {self._form.name} was given up ({error}); the next one was begun")
-            self._commit(records, time_ns)
-
-    def _commit(self, records: Sequence[Record], time_ns: int) -> None:
-        segment = self.open(time_ns)
-        try:
-            segment.commit(records)
-        except OSError:
-            segment.abandon()
-            self._segment = None
-            raise
-
-    def _is_full(self, time_ns: int) -> bool:
-        segment = self._segment
-        return segment is not None and (
-            segment.committed_bytes >= self._form.segment_bytes or time_ns - segment.begun_ns >= self._form.segment_ns
-        )
-
-    def finish(self) -> bool:
-        """Close the open segment, if any; False when it cannot be finished: it stays `.part`, and that is a trouble."""
-        segment, self._segment = self._segment, None
-        if segment is None:
-            return True
-        try:
-            segment.finish()
-        except OSError as error:
-            segment.abandon()
-            self.troubles.append(f"a segment of {self._form.name} stays unfinished ({error})")
-            return False
-        return True
-
-
-def next_number(folder: Path) -> int:
-    """The number after the highest segment in `folder`, finished or not; 0 in an empty one."""
-    numbers = [
-        int(match[1]) for path in folder.iterdir() if (match := re.fullmatch(r"(\d{4,})\.mcap(\.part)?", path.name))
-    ]
-    return max(numbers, default=-1) + 1

@@ -15,9 +15,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.interface import Frame, Reading, SessionError, bad_reading
 from stand.hub import Batch, Event, Hub, StepMark, StepState
-from stand.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.segment import CommitSink
-from stand.session import Session
+from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.session import Session
+from stand.recording.sink import CommitSink
 
 START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "virtual")

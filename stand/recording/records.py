@@ -1,4 +1,4 @@
-"""A segment's bytes back to messages: what stand/segment.py wrote, read strictly.
+"""A segment's bytes back to messages: what stand/recording/segment.py wrote, read strictly.
 
 Telemetry is walked front to back by its record headers, each chunk's CRC checked (the mcap package's own walk costs
 several times as much); frames are found through the chunk index. Anything wrong is a SessionError that names the file.
@@ -25,9 +25,9 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from drivers.interface import SessionError
-from stand.images import CAMERA_IMAGE, IMAGE_CLASS
-from stand.messages import CLASSES
-from stand.segment import SESSION_METADATA
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
+from stand.recording.layout import SESSION_METADATA
+from stand.recording.messages import CLASSES
 
 # What reading damaged bytes raises; CRC and Unicode errors are ValueErrors.
 DAMAGE = (McapError, OSError, struct.error, zstandard.ZstdError, ValueError, LookupError, EOFError, MemoryError)

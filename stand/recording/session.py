@@ -17,11 +17,11 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from drivers.interface import Frame, SessionError
-from stand import messages
 from stand.hub import Event, StepMark
-from stand.images import decode_image
-from stand.records import FramePlace, Message, frame_places, read_frame, read_head, telemetry_messages
-from stand.segment import DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from stand.recording import messages
+from stand.recording.images import decode_image
+from stand.recording.layout import DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from stand.recording.records import FramePlace, Message, frame_places, read_frame, read_head, telemetry_messages
 
 Column = tuple[NDArray[np.int64], NDArray[np.float64]]
 
@@ -118,11 +118,11 @@ class Session:
         metas = self._frame_metas
         for place in self._places:
             message = read_frame(place)
-            channel, image = decode_image(place.schema, message.data)
-            meta = metas.get((message.time_ns, message.sequence), _unknown(channel, message.sequence))
+            image = decode_image(place.schema, message.data)
+            meta = metas.get((message.time_ns, message.sequence), _unknown(image.channel, message.sequence))
             yield Frame(
-                channel=channel,
-                image=image,
+                channel=image.channel,
+                image=image.pixels,
                 time_ns=message.time_ns,
                 exposure_s=meta.exposure_s,
                 gain_dB=meta.gain_dB,
@@ -131,6 +131,7 @@ class Session:
                 camera_ticks=meta.camera_ticks,
                 dropped=meta.dropped,
                 step_id=meta.step_id,
+                windows=image.windows,
             )
 
     @cached_property
