@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -210,16 +210,18 @@ class BatchEncoder:
     def encode(self, batch: Batch) -> bytes:
         """The batch as one message; nothing of a reading is lost, whatever its channel, unit or time."""
         fields = self._blank.copy()
-        time_ns = batch.readings[0].time_ns if batch.readings else batch.time_ns
+        readings = batch.readings
+        time_ns = (readings[0].time_ns if readings else 0) or batch.time_ns  # 0 in the message is the log time
         if time_ns != batch.time_ns:
             fields["time_ns"] = time_ns
+        is_repeated = len({(reading.channel, reading.unit) for reading in readings}) < len(readings)
         remarks: list[Message] = []
-        for reading in batch.readings:
+        for reading in readings:
             names = self._fields.get((reading.channel, reading.unit))
             if names is not None:
                 fields[names[0]] = _canonical(reading.value)
                 fields[names[1]] = QUALITY_NUMBER[reading.quality]
-            if names is None or reading.reason or reading.time_ns != time_ns:
+            if names is None or reading.reason or reading.time_ns != time_ns or is_repeated:
                 remarks.append(_remark(reading))
         if remarks:
             fields["remarks"] = remarks
@@ -242,18 +244,24 @@ def _remark(reading: Reading) -> Message:
     )
 
 
-def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Iterator[Reading]:
-    """The readings of a batch message; SessionError when it is not one."""
+def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Batch:
+    """The batch of a message; SessionError when it is not one.
+
+    Its readings are in order of the kind's quantities, behind them the remarks in the order they were published.
+    Encoding it again gives the same bytes: the order between the two sorts is all that a message does not keep.
+    """
     message = _parse(topic, data)
     device: str = _get(message, "device")
     time_ns: int = _get(message, "time_ns") or log_time_ns
-    remarks = {(remark.channel, remark.unit): _remarked(remark) for remark in _get(message, "remarks")}
+    remarks = [_remarked(remark) for remark in _get(message, "remarks")]
+    remarked = {(reading.channel, reading.unit) for reading in remarks}
+    readings: list[Reading] = []
     for quantity in KIND_OF_TOPIC[topic].quantities:
         quality: int = _get(message, f"{quantity.field}_quality")
         channel = f"{device}.{quantity.name}"
-        if quality != ABSENT and (channel, quantity.unit) not in remarks:
-            yield _reading(channel, _get(message, quantity.field), quantity.unit, time_ns, quality, "")
-    yield from remarks.values()
+        if quality != ABSENT and (channel, quantity.unit) not in remarked:
+            readings.append(_reading(channel, _get(message, quantity.field), quantity.unit, time_ns, quality, ""))
+    return Batch(device, log_time_ns, (*readings, *remarks))
 
 
 def _remarked(remark: Any) -> Reading:
