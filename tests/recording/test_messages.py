@@ -3,17 +3,14 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.interface import Frame, Quality, Reading, SessionError, bad_reading
 from stand.hub import Batch, Event, StepMark, StepState
 from stand.recording import messages
-from stand.recording.images import decode_image, encode_image
 
 TIME_NS = 1_767_290_400_123_456_789
 
@@ -153,56 +150,6 @@ def test_a_frame_description_survives_the_round_trip():
     meta = messages.decode_frame_meta(messages.encode_frame_meta(original))
     for name in ("channel", "step_id", "block_id", "camera_ticks", "exposure_s", "gain_dB", "camera_degC", "dropped"):
         assert getattr(meta, name) == getattr(original, name)
-
-
-@pytest.mark.parametrize(("encoding", "schema"), [("png", CompressedImage), ("raw", RawImage)])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_images_are_lossless(encoding, schema, dtype):
-    image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (37, 53), dtype, endpoint=True)
-    data = encode_image(frame(image), encoding)
-    channel, decoded, _ = decode_image(schema.DESCRIPTOR.full_name, data)
-    assert channel == "camera.image"
-    assert decoded.dtype == dtype
-    np.testing.assert_array_equal(decoded, image)
-
-
-def test_a_part_of_a_larger_image_is_recorded_as_it_looks():
-    whole = np.arange(100, dtype=np.uint8).reshape(10, 10)
-    part = whole[2:8, 1:9:2]
-    for encoding, schema in (("png", CompressedImage), ("raw", RawImage)):
-        np.testing.assert_array_equal(
-            decode_image(schema.DESCRIPTOR.full_name, encode_image(frame(part), encoding))[1], part
-        )
-
-
-def test_png_of_sensor_noise_comes_near_the_entropy():
-    rng = np.random.default_rng(7)
-    image = np.clip(np.round(rng.normal(120, 1.5, (512, 612))), 0, 255).astype(np.uint8)
-    png = CompressedImage.FromString(encode_image(frame(image), "png"))
-    assert png.format == "png"
-    assert image.size / len(png.data) > 2.3  # the noise allows 3.07
-
-
-@pytest.mark.parametrize("image", [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32)])
-def test_an_image_of_another_kind_is_a_programming_mistake(image):
-    with pytest.raises(ValueError, match="uint8 or uint16 of shape"):
-        encode_image(frame(image), "png")
-
-
-def bad_images():
-    good = RawImage.FromString(encode_image(frame(np.zeros((4, 6), np.uint8)), "raw"))
-    short = RawImage(width=6, height=4, step=6, encoding="mono8", data=good.data[:-1])
-    colour = RawImage(width=6, height=4, step=18, encoding="rgb8", data=bytes(72))
-    for message in (short, colour, CompressedImage(format="png", data=b"no png"), CompressedImage(format="png")):
-        yield type(message).DESCRIPTOR.full_name, message.SerializeToString()
-    yield "foxglove.RawImage", b"\xff\xff\xff"
-    yield "foxglove.Grid", good.SerializeToString()
-
-
-@pytest.mark.parametrize(("schema", "data"), list(bad_images()))
-def test_a_damaged_image_is_a_session_error(schema, data):
-    with pytest.raises(SessionError):
-        decode_image(schema, data)
 
 
 @given(st.binary(max_size=60))
