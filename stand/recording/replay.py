@@ -1,0 +1,145 @@
+"""Publishes a recorded session again: the same items in the same order, at their own instants of a clock.
+
+Subscribers cannot tell a replay from the run, except that there is no stand behind it. As fast as possible is a
+VirtualClock: whoever works in a lane holds it, so nothing is dropped. 1 x and N x is a ReplayClock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from drivers.clock import Clock, VirtualClock, WallClock
+from drivers.interface import Frame, SessionError
+from drivers.lane import Lane
+from stand.hub import Hub, Item
+from stand.recording.folder import new_folder
+from stand.recording.images import IMAGE_CLASS, ImageEncoding
+from stand.recording.layout import FRAMES
+from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.records import frame_places
+from stand.recording.session import Session
+from stand.recording.topics import recorded_devices
+
+# Items read at once, at most one frame among them: few enough to keep memory flat, enough to make the hand-over to the
+# reading thread cheap.
+PORTION_ITEMS = 256
+# In virtual time a commit each second would be a disk sync for every second of the night, and save nothing.
+VIRTUAL_COMMIT_S = 60.0
+
+
+class ReplayClock:
+    """A clock that stands at `start_ns` when it is made and runs `speed` times as fast as `wall`."""
+
+    def __init__(self, start_ns: int, speed: float, wall: Clock | None = None) -> None:
+        if not (math.isfinite(speed) and speed > 0):
+            raise ValueError(f"a speed is a positive number, not {speed}")
+        self._wall = wall if wall is not None else WallClock()
+        self._start_ns = start_ns
+        self._wall_start_ns = self._wall.now_ns()
+        self._speed = speed
+
+    def now_ns(self) -> int:
+        """The instant of the session, ns since the epoch."""
+        return self._start_ns + round((self._wall.now_ns() - self._wall_start_ns) * self._speed)
+
+    async def sleep_until(self, time_ns: int) -> None:
+        """Return at or after that instant of the session; at once when it has passed."""
+        await self._wall.sleep_until(self._wall_start_ns + math.ceil((time_ns - self._start_ns) / self._speed))
+
+    def hold(self) -> AbstractContextManager[None]:
+        """As far as the wall clock can be held."""
+        return self._wall.hold()
+
+
+async def replay(session: Session, hub: Hub, clock: Clock) -> None:
+    """Publish every item of the session on `hub`, each when `clock` has reached its time.
+
+    The order is that of the recording. A frame was published after the middle of its exposure, which is its time; such
+    an item comes at once, because the clock has passed it. Reading and decoding hold the clock, off the loop. Raises
+    SessionError at the first item that cannot be read.
+    """
+    items = session.items()
+    lane = Lane("replay", clock)
+    try:
+        while portion := await lane.call(_portion, items):
+            for item in portion:
+                await clock.sleep_until(item.time_ns)
+                hub.publish(item)
+    finally:
+        lane.close()
+
+
+def _portion(items: Iterator[Item]) -> list[Item]:
+    """The next items, up to and with a frame; none at the end."""
+    portion: list[Item] = []
+    for item in items:
+        portion.append(item)
+        if isinstance(item, Frame) or len(portion) >= PORTION_ITEMS:
+            break
+    return portion
+
+
+async def replay_and_record(
+    session: Session, out: Path, speed: float | None, watch: Callable[[Hub], None] = lambda hub: None
+) -> Path:
+    """Replay `session` and record it again as the session `out`, which must not exist; returns `out`.
+
+    speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
+    has the same metadata (the session's id, too), attachments, devices and items: nothing in it tells of the replay,
+    because it is the same session in other segments. SessionError when it has no items, cannot be read or written, or
+    when frames were lost because the disk is slower than `speed`: the copy is then complete but for them, and its
+    events say how many.
+    """
+    first = next(session.items(), None)
+    if first is None:
+        raise SessionError(f"{session.path}: holds nothing that could be replayed")
+    clock = VirtualClock(first.time_ns) if speed is None else ReplayClock(first.time_ns, speed)
+    hub = Hub()
+    watch(hub)
+    settings = RecordingSettings(_encoding(session), VIRTUAL_COMMIT_S if speed is None else speed)
+    with new_folder(out) as folder:
+        recorder = Recorder(
+            folder, _info(session.metadata), session.attachments, recorded_devices(session), hub, clock, settings
+        )
+        recorder.start()
+        background = [recorder.run()] + ([clock.run()] if isinstance(clock, VirtualClock) else [])
+        try:
+            await _beside(replay(session, hub, clock), background)
+        finally:
+            await recorder.finish()
+    if recorder.frames_lost:
+        raise SessionError(f"{out}: complete, but {recorder.frames_lost} frames were lost; its events say why")
+    return out
+
+
+async def _beside(work: Coroutine[Any, Any, None], background: Sequence[Coroutine[Any, Any, None]]) -> None:
+    """Await `work`, but raise at once what the background raises; nothing runs on when this returns."""
+    tasks = [asyncio.create_task(coroutine) for coroutine in (work, *background)]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _info(metadata: Mapping[str, str]) -> SessionInfo:
+    """The inverse of SessionInfo.metadata; a field the session does not tell is ""."""
+    known: dict[str, Any] = {field.name: metadata.get(field.name, "") for field in fields(SessionInfo)}
+    return SessionInfo(**{**known, "simulated": known["simulated"] == "true"})
+
+
+def _encoding(session: Session) -> ImageEncoding:
+    """Raw when all frames were; a PNG takes every other, also one of which only windows are real."""
+    raw = IMAGE_CLASS["raw"].DESCRIPTOR.full_name
+    frames = (path for path in session.segments if path.parent.name == FRAMES)
+    schemas = {place.schema for path in frames for place in frame_places(path)}
+    return "raw" if schemas == {raw} else "png"

@@ -1,0 +1,166 @@
+import asyncio
+
+import numpy as np
+import pytest
+
+from drivers.clock import NS_PER_S, VirtualClock
+from drivers.interface import Frame, SessionError
+from stand.hub import Batch, Hub
+from stand.recording.replay import ReplayClock, replay, replay_and_record
+from stand.recording.session import Session
+from tests.recording.recorded import (
+    ATTACHMENTS,
+    MS,
+    START_NS,
+    frame_key,
+    half_second,
+    images,
+    item_key,
+    record,
+    telemetry,
+)
+
+
+async def play(session, clock, driver=None):
+    """(instant of the clock, item) of everything published."""
+    hub, got = Hub(), []
+    hub.subscribe(lambda item: got.append((clock.now_ns(), item)))
+    running = [] if driver is None else [asyncio.create_task(driver.run())]
+    await replay(session, hub, clock)
+    for task in running:
+        task.cancel()
+    return got
+
+
+async def test_subscribers_see_the_items_as_they_were_published(tmp_path):
+    published = await record(tmp_path / "s")
+    clock = VirtualClock(START_NS)
+    got = await play(Session.open(tmp_path / "s"), clock, clock)
+    assert [item_key(item) for _, item in got] == [item_key(item) for item in published]
+    assert len(got) == 12 * 8
+    for now_ns, item in got:
+        assert now_ns - item.time_ns == (50 * MS if isinstance(item, Frame) else 0)
+
+
+def deep(time_ns, index):
+    yield from half_second(time_ns, index, np.uint16)
+
+
+@pytest.mark.parametrize(("items", "encoding"), [(half_second, "png"), (half_second, "raw"), (deep, "png")])
+async def test_a_recorded_replay_is_the_same_session(tmp_path, items, encoding):
+    await record(tmp_path / "s", items=items, encoding=encoding)
+    original = Session.open(tmp_path / "s")
+    assert len(original.segments) >= 6
+    assert await replay_and_record(original, tmp_path / "copies" / "r", None) == tmp_path / "copies" / "r"
+    copy = Session.open(tmp_path / "copies" / "r")
+    assert telemetry(copy) == telemetry(original)
+    assert images(copy) == images(original)
+    assert list(map(frame_key, copy.frames())) == list(map(frame_key, original.frames()))
+    assert copy.metadata == original.metadata
+    assert dict(copy.attachments) == ATTACHMENTS
+    assert copy.channels() == original.channels()
+    assert [path.name for path in (tmp_path / "copies").iterdir()] == ["r"]
+
+
+async def test_frames_of_which_only_windows_are_real_stay_so(tmp_path):
+    def items(time_ns, index):
+        for item in half_second(time_ns, index):
+            if isinstance(item, Frame) and index % 2:
+                windows = np.array([[3, 4, 10, 11]], np.int32)
+                image = np.full_like(item.image, 90)
+                image[4:15, 3:13] = item.image[4:15, 3:13]
+                fields = {name: getattr(item, name) for name in Frame.__dataclass_fields__}
+                yield Frame(**{**fields, "image": image, "windows": windows})
+            else:
+                yield item
+
+    await record(tmp_path / "s", items=items)
+    await replay_and_record(Session.open(tmp_path / "s"), tmp_path / "r", None)
+    copy = list(Session.open(tmp_path / "r").frames())
+    assert list(map(frame_key, copy)) == list(map(frame_key, Session.open(tmp_path / "s").frames()))
+    assert [frame.windows is None for frame in copy] == [True, False] * 6
+
+
+async def test_a_paced_replay_keeps_the_times(tmp_path):
+    await record(tmp_path / "s")
+    wall = VirtualClock(7 * NS_PER_S)
+    clock = ReplayClock(START_NS, 2.0, wall)
+    hub, got = Hub(), []
+    hub.subscribe(lambda item: got.append((wall.now_ns() - 7 * NS_PER_S, item)))
+    running = asyncio.create_task(wall.run())
+    await replay(Session.open(tmp_path / "s"), hub, clock)
+    running.cancel()
+    for at_ns, item in got:
+        if isinstance(item, Batch):
+            assert at_ns == (item.time_ns - START_NS) // 2
+    assert wall.now_ns() == 7 * NS_PER_S + 11 * NS_PER_S // 4
+
+
+async def test_on_the_hosts_clock_twice_as_fast_is_half_the_time(tmp_path):
+    await record(tmp_path / "s", 4, period_ns=100 * MS)
+    session, begun = Session.open(tmp_path / "s"), asyncio.get_running_loop().time()
+    clock = ReplayClock(START_NS, 2.0)
+    got = await play(session, clock)
+    took_s = asyncio.get_running_loop().time() - begun
+    assert 0.15 <= took_s < 1.0
+    assert all(0 <= now_ns - item.time_ns < NS_PER_S for now_ns, item in got if isinstance(item, Batch))
+
+
+async def test_a_paced_replay_is_recorded_whole(tmp_path):
+    published = await record(tmp_path / "s", 4, period_ns=100 * MS)
+    seen = []
+    await replay_and_record(
+        Session.open(tmp_path / "s"), tmp_path / "r", 2.0, watch=lambda hub: hub.subscribe(seen.append)
+    )
+    assert telemetry(Session.open(tmp_path / "r")) == telemetry(Session.open(tmp_path / "s"))
+    assert images(Session.open(tmp_path / "r")) == images(Session.open(tmp_path / "s"))
+    assert [item_key(item) for item in seen] == [item_key(item) for item in published]
+
+
+def test_a_clock_of_another_speed_reads_and_waits_in_session_time():
+    wall = VirtualClock(0)
+    fast, slow = ReplayClock(START_NS, 1000.0, wall), ReplayClock(START_NS, 0.3, wall)
+
+    async def wait():
+        running = asyncio.create_task(wall.run())
+        await slow.sleep_until(START_NS + NS_PER_S)
+        running.cancel()
+
+    asyncio.run(wait())
+    assert START_NS + NS_PER_S <= slow.now_ns() <= START_NS + NS_PER_S + 1
+    assert fast.now_ns() == START_NS + 1000 * wall.now_ns()
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_speed_that_is_none_is_a_programming_mistake(speed):
+    with pytest.raises(ValueError, match="a speed is a positive number"):
+        ReplayClock(START_NS, speed)
+
+
+async def test_a_session_that_breaks_off_leaves_no_copy(tmp_path):
+    await record(tmp_path / "s")
+    session = Session.open(tmp_path / "s")
+    damaged = session.segments[-1]
+    content = bytearray(damaged.read_bytes())
+    content[content.index(b"IDAT") + 20] ^= 1
+    damaged.write_bytes(content)
+    with pytest.raises(SessionError, match="damaged"):
+        await replay_and_record(session, tmp_path / "r", None)
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
+
+
+async def test_nothing_is_overwritten_by_a_replay(tmp_path):
+    await record(tmp_path / "s", 2)
+    session = Session.open(tmp_path / "s")
+    with pytest.raises(SessionError, match="exists already"):
+        await replay_and_record(session, tmp_path / "s", None)
+    (tmp_path / "r.part").mkdir()
+    with pytest.raises(SessionError, match=r"r\.part: is in the way, left by a command that was killed"):
+        await replay_and_record(session, tmp_path / "r", None)
+    assert (tmp_path / "r.part").is_dir()
+
+
+async def test_a_session_without_items_cannot_be_replayed(tmp_path):
+    await record(tmp_path / "s", 0)
+    with pytest.raises(SessionError, match="holds nothing that could be replayed"):
+        await replay_and_record(Session.open(tmp_path / "s"), tmp_path / "r", None)
