@@ -1,0 +1,349 @@
+"""Unfinished and damaged segments become finished ones: nothing valid is lost, nothing invalid is delivered.
+
+What proves itself (stand/recording/walk.py) is copied message by message into a segment of the usual form, with a
+metadata record `salvage` that says from what. The copy is written as `NNNN.mcap.tmp`, synced and renamed; only then
+the original goes. It goes when the copy holds all of it but a block that was being written and never acknowledged;
+else it stays, as `NNNN.mcap.damaged`. A salvage that is killed is repeated, and one of a recording that is still
+under way (its recorder holds a lock on the segment) leaves that alone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections import Counter
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from hashlib import blake2b
+from itertools import count
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.records import Channel
+from mcap.writer import CompressionType, Writer
+
+from drivers.interface import SessionError
+from stand.recording.layout import FINISHED, FRAMES, SEGMENT_METADATA, SESSION_METADATA, TELEMETRY, UNFINISHED
+from stand.recording.opening import Opening, opening_of
+from stand.recording.records import DAMAGE, frame_places, read_frame, read_head, telemetry_messages
+from stand.recording.sink import sync_folder
+from stand.recording.walk import Source, StoredMessage, Survey, stored_messages, survey
+
+SALVAGE_METADATA = "salvage"
+BEING_RECORDED = "is being recorded"
+COPY = FINISHED + ".tmp"
+DAMAGED = FINISHED + ".damaged"
+CHUNK_BYTES = 1 << 20
+COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}
+
+
+@dataclass(frozen=True, slots=True)
+class Salvaged:
+    """What became of one segment.
+
+    source: what was salvaged. path: the finished segment, None when nothing could be recovered. messages: how many of
+    `source` are in it. lost_bytes: in its damaged places; a block that was never acknowledged is not lost. reason:
+    what was wrong, BEING_RECORDED when it was left alone. kept: the original, when something of it is not in the copy.
+    """
+
+    source: Path
+    path: Path | None
+    messages: int
+    lost_bytes: int
+    reason: str
+    kept: Path | None
+
+
+def salvage_session(directory: Path) -> list[Salvaged]:
+    """Finish every unfinished segment and every finished one that is damaged. SessionError when there is no session,
+    or when the disk refuses: then the segment at hand is as it was and those before it are salvaged."""
+    folders = [directory / series for series in (TELEMETRY, FRAMES) if (directory / series).is_dir()]
+    if not folders:
+        raise SessionError(f"{directory}: not a session: it has neither {TELEMETRY} nor {FRAMES}")
+    return [done for folder in folders for done in _salvage_folder(folder, finished_too=True)]
+
+
+def salvage_unfinished(root: Path) -> list[Salvaged]:
+    """Finish the unfinished segments of every session below `root`, without a look at the finished ones. SessionError
+    as above."""
+    left = {path.parent for pattern in (UNFINISHED, COPY) for path in root.glob(f"*/*/*{pattern}")}
+    folders = [folder for folder in sorted(left, reverse=True) if folder.name in COMPRESSION]  # telemetry is first
+    return [done for folder in folders for done in _salvage_folder(folder, finished_too=False)]
+
+
+def _salvage_folder(folder: Path, finished_too: bool) -> Iterator[Salvaged]:
+    for copy in folder.glob(f"*{COPY}"):
+        _remove_left_over(copy)
+    for number in sorted({int(path.name.partition(".")[0]) for path in folder.glob(f"[0-9]*{FINISHED}*")}):
+        yield from _salvage_number(folder / f"{number:04d}{FINISHED}", finished_too)
+
+
+def _remove_left_over(copy: Path) -> None:
+    """Remove what a killed salvage has left; not what one that lives is writing."""
+    with _locked(copy) as fd:
+        if fd is not None:
+            copy.unlink()
+
+
+def _salvage_number(finished: Path, finished_too: bool) -> Iterator[Salvaged]:
+    """The finished segment of a number first: the unfinished one beside it is compared with what it holds."""
+    part = finished.with_name(finished.name.replace(FINISHED, UNFINISHED))
+    has_part = part.exists()
+    if finished.exists() and (finished_too or has_part) and not _is_sound(finished):
+        yield _salvage_segment(finished)
+    if has_part:
+        yield _salvage_segment(part)
+
+
+def _is_sound(path: Path) -> bool:
+    """Whether every message of a finished segment can be read."""
+    try:
+        read_head(path)
+        if path.parent.name == FRAMES:
+            for place in frame_places(path):
+                read_frame(place)
+        else:
+            for _ in telemetry_messages(path, lambda channel: True):
+                pass
+    except SessionError:
+        return False
+    return True
+
+
+@contextmanager
+def _locked(path: Path) -> Generator[int | None]:
+    """The file, opened and locked; None when somebody else has it, or has just removed it."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        yield None
+        return
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            is_ours = os.fstat(fd).st_nlink > 0
+        except BlockingIOError:
+            is_ours = False
+        yield fd if is_ours else None
+    finally:
+        os.close(fd)
+
+
+@dataclass(frozen=True, slots=True)
+class _Original:
+    """A segment under salvage: what proved itself of it, and the opening for its copy (None: not known)."""
+
+    path: Path
+    finished: Path
+    source: Source
+    found: Survey
+    opening: Opening | None
+
+    def messages(self) -> Iterator[tuple[Channel, StoredMessage]]:
+        """What can be delivered, in order."""
+        if self.opening is None:
+            return
+        for place in self.found.chunks:
+            for message in stored_messages(self.source, place):
+                if self.opening.knows(message.channel):
+                    yield self.opening.channels[message.channel], message
+
+    @property
+    def delivered(self) -> int:
+        """The number of `messages`."""
+        opening = self.opening
+        return sum(n for channel, n in self.found.messages.items() if opening is not None and opening.knows(channel))
+
+    @property
+    def unknown(self) -> int:
+        """Messages that cannot be delivered, because no segment tells of their channels."""
+        return self.found.messages.total() - self.delivered
+
+    @property
+    def is_all_there(self) -> bool:
+        """Whether a copy holds all that was ever acknowledged."""
+        is_rotten = self.path == self.finished and not self.found.has_index
+        return not (self.found.damages or self.unknown or is_rotten)
+
+
+def _salvage_segment(path: Path) -> Salvaged:
+    """One segment; SessionError when the disk refuses."""
+    finished = path.with_name(f"{path.name.partition('.')[0]}{FINISHED}")
+    try:
+        with _locked(path) as fd:
+            if fd is None:
+                return Salvaged(path, None, 0, 0, BEING_RECORDED, None)
+            source = Source(fd)
+            found = survey(source)
+            original = _Original(path, finished, source, found, opening_of(path, found))
+            if path != finished and finished.exists():
+                return _salvage_beside(original)
+            return _salvage_alone(original)
+    except DAMAGE as error:  # OSError; the rest only when the file changes under our hands
+        raise SessionError(f"{path}: cannot be salvaged and is left as it was ({error})") from error
+
+
+def _salvage_alone(original: _Original) -> Salvaged:
+    if original.delivered or _is_the_only_telemetry(original):
+        _write_copy(original)
+        return _settle(original, original.finished, replace=True)
+    return _settle(original, None)
+
+
+def _is_the_only_telemetry(original: _Original) -> bool:
+    """Without any telemetry, empty or not, the session's frames could not be opened."""
+    folder = original.path.parent
+    segments = [path for path in folder.glob("[0-9]*") if path.name.endswith((FINISHED, UNFINISHED))]
+    return folder.name == TELEMETRY and segments == [original.path] and original.opening is not None
+
+
+def _salvage_beside(part: _Original) -> Salvaged:
+    """An unfinished segment whose finished one is there, too, and sound: whichever holds all the messages of both."""
+    with part.finished.open("rb") as file:
+        source = Source(file.fileno())
+        found = survey(source)
+        finished = _Original(part.finished, part.finished, source, found, opening_of(part.finished, found))
+        ours, theirs = _digests(part), _digests(finished)
+    if ours <= theirs:
+        return _settle(part, part.finished)
+    if theirs < ours:
+        _write_copy(part)
+        return _settle(part, part.finished, replace=True)
+    missing = (ours - theirs).total()
+    kept = _keep(part)
+    reason = f"holds {missing} messages that {part.finished.name} does not hold, and lacks some of that"
+    part.path.unlink()
+    sync_folder(kept.parent)
+    return Salvaged(part.path, part.finished, ours.total() - missing, part.found.lost_bytes, reason, kept)
+
+
+def _digests(original: _Original) -> Counter[bytes]:
+    """The messages, small and comparable."""
+    digests: Counter[bytes] = Counter()
+    for channel, message in original.messages():
+        key = f"{channel.topic} {message.sequence} {message.log_time_ns} {message.publish_time_ns}"
+        digests[blake2b(message.data, digest_size=16, key=blake2b(key.encode()).digest()).digest()] += 1
+    return digests
+
+
+def _write_copy(original: _Original) -> None:
+    """All that can be delivered, finished and on the disk as NNNN.mcap.tmp; removed again when the disk refuses."""
+    copy = _copy_path(original)
+    with suppress(OSError):
+        os.truncate(original.path, original.source.size)  # gives back what a dead recorder had reserved behind its end
+    try:
+        with copy.open("xb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            _write(file, original)
+            file.flush()
+            os.fsync(file.fileno())
+    except FileExistsError:
+        raise
+    except BaseException:
+        with suppress(OSError):
+            copy.unlink()
+        raise
+
+
+def _copy_path(original: _Original) -> Path:
+    return original.finished.with_name(original.finished.name.replace(FINISHED, COPY))
+
+
+def _write(file: BinaryIO, original: _Original) -> None:
+    """The copy, in the form of stand/recording/segment.py: the opening first, one frame per chunk."""
+    series = original.path.parent.name
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=COMPRESSION[series])
+    writer.start()
+    channels = _write_opening(writer, original)
+    for channel, message in original.messages():
+        writer.add_message(
+            channels[channel.id], message.log_time_ns, message.data, message.publish_time_ns, message.sequence
+        )
+        if series == FRAMES:
+            writer.flush()
+    writer.finish()
+
+
+def _write_opening(writer: Writer, original: _Original) -> Mapping[int, int]:
+    """Attachments, metadata, schemas and channels; channel numbers of the original -> of the copy."""
+    opening = original.opening
+    if opening is None:
+        raise ValueError("a copy needs an opening")
+    for attachment in opening.attachments.values():
+        writer.add_attachment(
+            attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+        )
+    number = int(original.finished.name.partition(".")[0])
+    previous = f"{number - 1:04d}" if number else ""
+    writer.add_metadata(SESSION_METADATA, dict(opening.session))
+    writer.add_metadata(
+        SEGMENT_METADATA, {"series": original.path.parent.name, "number": f"{number:04d}", "previous": previous}
+    )
+    writer.add_metadata(SALVAGE_METADATA, _salvage_metadata(original))
+    schemas = {
+        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
+        for _, schema in sorted(opening.schemas.items())
+    }
+    return {
+        channel.id: writer.register_channel(
+            channel.topic, channel.message_encoding, schemas[channel.schema_id], channel.metadata
+        )
+        for _, channel in sorted(opening.channels.items())
+        if opening.knows(channel.id)
+    }
+
+
+def _salvage_metadata(original: _Original) -> dict[str, str]:
+    return {
+        "source": original.path.name,
+        "reason": _reason(original),
+        "messages": str(original.delivered),
+        "lost_bytes": str(original.found.lost_bytes),
+        "damaged_places": str(len(original.found.damages)),
+    }
+
+
+def _reason(original: _Original) -> str:
+    found = original.found
+    reasons: list[str] = []
+    if found.damages:
+        places = "1 damaged place" if len(found.damages) == 1 else f"{len(found.damages)} damaged places"
+        reasons.append(f"{places} of {found.lost_bytes} bytes, the first at byte {found.damages[0].begin}")
+    if found.torn_bytes:
+        reasons.append(f"a block of {found.torn_bytes} bytes was being written at its end")
+    if original.opening is None:
+        reasons.append("no segment tells which session it belongs to")
+    elif original.unknown:
+        reasons.append(f"{original.unknown} messages are of channels no segment tells of")
+    if not reasons:
+        reasons.append("its index is damaged" if original.path == original.finished else "it was not finished")
+    return "; ".join(reasons)
+
+
+def _settle(original: _Original, path: Path | None, replace: bool = False) -> Salvaged:
+    """Put the copy in its place (`replace`) and the original out of the way. Each step leaves a state from which a
+    salvage goes on."""
+    folder = original.path.parent
+    kept = None if original.is_all_there else _keep(original)
+    if replace:
+        os.replace(_copy_path(original), original.finished)
+        sync_folder(folder)
+    if original.path != path:
+        original.path.unlink()
+        sync_folder(folder)
+    return Salvaged(original.path, path, original.delivered, original.found.lost_bytes, _reason(original), kept)
+
+
+def _keep(original: _Original) -> Path:
+    """A second name for the original, on the disk: NNNN.mcap.damaged, or NNNN.2.mcap.damaged when that is taken."""
+    number = original.finished.name.removesuffix(FINISHED)
+    names = (f"{number}{DAMAGED}" if n == 1 else f"{number}.{n}{DAMAGED}" for n in count(1))
+    for path in (original.path.with_name(name) for name in names):
+        if path.exists() and path.samefile(original.path):
+            return path
+        if not path.exists():
+            os.link(original.path, path)
+            sync_folder(path.parent)
+            return path
+    raise ValueError("counting ends")

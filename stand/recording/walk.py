@@ -1,0 +1,404 @@
+"""A segment's bytes, whatever happened to them: what in them proves itself, and where nothing does.
+
+Read by place from the front. A chunk and an attachment prove themselves by their CRC (our writer always makes one,
+so a CRC of 0 is a CRC), the records without one by being, byte for byte, what the writer makes of what they say.
+Behind a damaged place the walk goes on: at the end the damaged record claims if a record stands there, else at the
+next place that looks like the head of a chunk and proves to be one. Inside sound records nothing is searched, so an
+MCAP file that is attached is an attachment.
+
+Memory is flat: one record at a time. Only OSError is raised, when the disk does not give a byte.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecord, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
+
+from stand.recording.layout import SESSION_METADATA
+from stand.recording.records import CHUNK_LIMIT_BYTES, DAMAGE
+
+RECORD_LIMIT_BYTES = CHUNK_LIMIT_BYTES + 1024
+WINDOW_BYTES = 4 << 20
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_CHUNK = struct.Struct("<QQQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
+_LENGTH = struct.Struct("<Q")
+_CRC = struct.Struct("<I")
+_MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
+_INDEX = struct.Struct("<HI")  # channel id, length of the entries of 16 bytes
+_FOOTER_BYTES = _RECORD.size + 20
+
+# Heads of records, little endian: lengths below 2**29, compression "" or "zstd".
+_CHUNK_HEAD = (
+    rb"\x06(?=.{3}[\x00-\x1f]\x00{4}"  # length
+    rb".{16}.{3}[\x00-\x10]\x00{4}.{4}"  # times, uncompressed size, CRC
+    rb"(?:\x00{4}|\x04\x00{3}zstd))"
+)
+_ATTACHMENT_HEAD = rb"\x09(?=.{3}[\x00-\x1f]\x00{4}.{16}[\x01-\xff]\x00{3})"
+_SESSION_HEAD = rb"\x0c(?=.{8}\x07\x00{3}session)"
+_IN_OPENING = re.compile(_CHUNK_HEAD + b"|" + _ATTACHMENT_HEAD + b"|" + _SESSION_HEAD, re.DOTALL)
+_AFTER_OPENING = re.compile(_CHUNK_HEAD, re.DOTALL)
+_HEAD_BYTES = 64  # more than any of the patterns looks at
+
+
+class Source:
+    """An open file, read by place."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self.size = os.fstat(fd).st_size
+
+    def read(self, offset: int, length: int) -> bytes:
+        """The bytes there, fewer at the end of the file; raises OSError."""
+        return os.pread(self._fd, length, offset)
+
+
+class ChunkPlace(NamedTuple):
+    """Where the content of a sound chunk is."""
+
+    offset: int
+    length: int
+
+
+class Gap(NamedTuple):
+    """Bytes [begin, end) that prove nothing."""
+
+    begin: int
+    end: int
+
+
+class StoredMessage(NamedTuple):
+    """A message as it is in a chunk; `data` is still encoded."""
+
+    channel: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+@dataclass
+class Survey:
+    """What of a segment proves itself.
+
+    `session`: the metadata record of that name, None when it is gone. `is_opening_whole`: nothing is damaged before
+    the first chunk. `messages`: how many there are, by channel number. `damages`: the places that are damaged; neither
+    `torn_bytes` at the end of the file, where a block was being written, nor a damaged index is among them.
+    `has_index`: the file is whole to its last byte.
+    """
+
+    session: dict[str, str] | None = None
+    attachments: dict[str, Attachment] = field(default_factory=dict[str, Attachment])
+    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
+    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
+    chunks: list[ChunkPlace] = field(default_factory=list[ChunkPlace])
+    messages: Counter[int] = field(default_factory=Counter[int])
+    damages: list[Gap] = field(default_factory=list[Gap])
+    torn_bytes: int = 0
+    is_opening_whole: bool = False
+    has_index: bool = False
+
+    @property
+    def lost_bytes(self) -> int:
+        """The size of all damaged places."""
+        return sum(gap.end - gap.begin for gap in self.damages)
+
+
+def survey(source: Source, to_first_chunk: bool = False) -> Survey:
+    """Walk through the file, or only until its first sound chunk."""
+    walk = _Walk(source)
+    walk.run(to_first_chunk)
+    return walk.found
+
+
+def stored_messages(source: Source, place: ChunkPlace) -> Iterator[StoredMessage]:
+    """The messages of a sound chunk in their order; one of DAMAGE when it is not sound any more."""
+    for opcode, record in _records(_uncompressed(memoryview(source.read(*place)))):
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(record)
+            yield StoredMessage(channel, sequence, log_time_ns, publish_time_ns, bytes(record[_MESSAGE.size :]))
+
+
+class _Contents(NamedTuple):
+    """What a chunk holds."""
+
+    schemas: list[Schema]
+    channels: list[Channel]
+    messages: Counter[int]
+
+
+class _Proven(NamedTuple):
+    """A record that proved itself; `content` where it matters to the survey."""
+
+    begin: int
+    end: int
+    content: _Contents | Metadata | Attachment | DataEnd | None
+
+
+class _Walk:
+    """The walk through one file."""
+
+    def __init__(self, source: Source) -> None:
+        self.found = Survey()
+        self._source = source
+        self._index_begin: int | None = None
+
+    def run(self, to_first_chunk: bool) -> None:
+        offset = 0
+        while offset < self._source.size and not (to_first_chunk and self.found.chunks):
+            record = self._record_at(offset)
+            if record is None:
+                record = self._next_record(offset)
+                self._note_gap(Gap(offset, record.begin if record else self._source.size))
+                if record is None:
+                    break
+            self._take(record)
+            offset = record.end
+            if self._index_begin == offset and self._take_index(offset):
+                break
+        if not self.found.chunks:
+            self.found.is_opening_whole = self.found.session is not None and not self.found.damages
+
+    def _record_at(self, offset: int) -> _Proven | None:
+        """The record that begins there, None when nothing there proves itself."""
+        if offset == 0:
+            is_magic = self._source.read(0, len(MCAP0_MAGIC)) == MCAP0_MAGIC
+            return _Proven(0, len(MCAP0_MAGIC), None) if is_magic else None
+        head = self._source.read(offset, _HEAD_BYTES)
+        claim = _claim(head)
+        if claim is None or offset + _RECORD.size + claim.length > self._source.size:
+            return None
+        try:
+            if claim.opcode == Opcode.CHUNK:  # before its bytes are read: a false one may claim very many
+                _check_chunk_lengths(head[_RECORD.size :], claim.length)
+            content = _proof(claim.opcode, self._source.read(offset + _RECORD.size, claim.length))
+        except DAMAGE as error:
+            if isinstance(error, OSError):
+                raise
+            return None
+        return _Proven(offset, offset + _RECORD.size + claim.length, content)
+
+    def _next_record(self, offset: int) -> _Proven | None:
+        """The first sound record behind the damaged one at `offset`."""
+        claim = _claim(self._source.read(offset, _RECORD.size))
+        if offset == 0:
+            claimed = len(MCAP0_MAGIC)
+        else:
+            claimed = offset + _RECORD.size + claim.length if claim else self._source.size
+        if claimed < self._source.size and (record := self._record_at(claimed)):
+            return record
+        pattern = _AFTER_OPENING if self.found.chunks else _IN_OPENING
+        candidates = self._candidates(offset + 1, pattern)
+        return next((record for place in candidates if (record := self._record_at(place))), None)
+
+    def _candidates(self, begin: int, pattern: re.Pattern[bytes]) -> Iterator[int]:
+        """Places from `begin` on that look like the head of a record."""
+        for window in range(begin, self._source.size, WINDOW_BYTES):
+            data = self._source.read(window, WINDOW_BYTES + _HEAD_BYTES)
+            for match in pattern.finditer(data):
+                if match.start() < WINDOW_BYTES:
+                    yield window + match.start()
+
+    def _note_gap(self, gap: Gap) -> None:
+        if gap.begin == self._index_begin and gap.end == self._source.size:
+            return
+        if gap.end == self._source.size and _is_torn(self._source, gap):
+            self.found.torn_bytes = gap.end - gap.begin
+        else:
+            self.found.damages.append(gap)
+
+    def _take(self, record: _Proven) -> None:
+        found = self.found
+        match record.content:
+            case _Contents(schemas, channels, messages):
+                if not found.chunks:
+                    found.is_opening_whole = found.session is not None and not found.damages
+                found.schemas.update({schema.id: schema for schema in schemas})
+                found.channels.update({channel.id: channel for channel in channels})
+                found.messages.update(messages)
+                found.chunks.append(ChunkPlace(record.begin + _RECORD.size, record.end - record.begin - _RECORD.size))
+            case Metadata(name=name, metadata=entries) if name == SESSION_METADATA:
+                if found.chunks and not found.is_opening_whole:  # these chunks lay in a damaged attachment before it
+                    found.schemas, found.channels, found.chunks, found.messages = {}, {}, [], Counter()
+                found.session = entries
+            case Attachment() as attachment:
+                found.attachments[attachment.name] = attachment
+            case DataEnd():
+                self._index_begin = record.end
+            case _:
+                pass
+
+    def _take_index(self, begin: int) -> bool:
+        """Learn from the index at `begin` when all of it is sound, to the end of the file."""
+        data = self._source.read(begin, min(self._source.size - begin, RECORD_LIMIT_BYTES))
+        footer_begin = len(data) - len(MCAP0_MAGIC) - _FOOTER_BYTES
+        try:
+            if footer_begin < 0 or not data.endswith(MCAP0_MAGIC):
+                raise ValueError("the file ends in its index")
+            footer = Footer.read(_stream(data[footer_begin + _RECORD.size :]))
+            _check_crc(data[: footer_begin + _FOOTER_BYTES - _CRC.size], footer.summary_crc)
+            if footer.summary_start != begin:
+                raise ValueError("the index does not begin behind the data")
+            for opcode, record in _records(memoryview(data)[:footer_begin]):
+                if opcode == Opcode.SCHEMA:
+                    schema = Schema.read(_stream(record))
+                    self.found.schemas[schema.id] = schema
+                elif opcode == Opcode.CHANNEL:
+                    channel = Channel.read(_stream(record))
+                    self.found.channels[channel.id] = channel
+        except DAMAGE:
+            return False
+        self.found.has_index = True
+        return True
+
+
+class _Claim(NamedTuple):
+    opcode: int
+    length: int
+
+
+def _claim(head: bytes) -> _Claim | None:
+    """What a record's head says it is; None when that is no record of the data section."""
+    if len(head) < _RECORD.size:
+        return None
+    opcode, length = _RECORD.unpack_from(head)
+    return _Claim(opcode, length) if opcode in _OPCODES and length <= RECORD_LIMIT_BYTES else None
+
+
+_EXACT: dict[int, type[Header | Metadata | DataEnd]] = {
+    Opcode.HEADER: Header,
+    Opcode.METADATA: Metadata,
+    Opcode.DATA_END: DataEnd,
+}
+_OPCODES = {*_EXACT, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT}
+
+
+def _proof(opcode: int, content: bytes) -> _Contents | Metadata | Attachment | DataEnd | None:
+    """What the record says; one of DAMAGE when it does not prove itself."""
+    if opcode == Opcode.CHUNK:
+        return _contents(_uncompressed(memoryview(content)))
+    if opcode == Opcode.ATTACHMENT:
+        _check_crc(content[: -_CRC.size], *_CRC.unpack(content[-_CRC.size :]))
+        return Attachment.read(_stream(content))
+    if opcode == Opcode.MESSAGE_INDEX:
+        _, entries_bytes = _INDEX.unpack_from(content)
+        if len(content) != _INDEX.size + entries_bytes or entries_bytes % 16:
+            raise ValueError("a message index is damaged")
+        return None
+    record = _EXACT[opcode].read(_stream(content))
+    if _bytes_of(record)[_RECORD.size :] != content or not _is_text(record):
+        raise ValueError("a record is damaged")
+    return None if isinstance(record, Header) else record
+
+
+def _is_text(record: Header | Metadata | DataEnd) -> bool:
+    """Nobody writes NUL into a text; a lost block of the disk reads as zeros."""
+    if isinstance(record, Metadata):
+        texts = [record.name, *record.metadata.keys(), *record.metadata.values()]
+        return not any("\0" in text for text in texts)
+    return True
+
+
+def _contents(data: memoryview) -> _Contents:
+    contents = _Contents([], [], Counter())
+    for opcode, record in _records(data):
+        if opcode == Opcode.MESSAGE:
+            channel, *_ = _MESSAGE.unpack_from(record)
+            contents.messages[channel] += 1
+        elif opcode == Opcode.SCHEMA:
+            contents.schemas.append(Schema.read(_stream(record)))
+        elif opcode == Opcode.CHANNEL:
+            contents.channels.append(Channel.read(_stream(record)))
+        else:
+            raise ValueError(f"a chunk holds a record of kind {opcode}")
+    return contents
+
+
+def _check_chunk_lengths(head: bytes, length: int) -> None:
+    """ValueError when the lengths in a chunk's head contradict each other; struct.error when it is cut."""
+    *_, size, _, name_bytes = _CHUNK.unpack_from(head)
+    name_end = _CHUNK.size + name_bytes
+    (data_bytes,) = _LENGTH.unpack_from(head, name_end)
+    name = head[_CHUNK.size : name_end]
+    if name not in (b"", b"zstd") or size > CHUNK_LIMIT_BYTES or (not name and size != data_bytes):
+        raise ValueError("no chunk of ours")
+    if length != name_end + _LENGTH.size + data_bytes:
+        raise ValueError("a chunk's lengths contradict each other")
+
+
+def _uncompressed(content: memoryview) -> memoryview:
+    """The records of a chunk, its CRC checked."""
+    _, _, size, crc, name_bytes = _CHUNK.unpack_from(content)
+    data = content[_CHUNK.size + name_bytes + _LENGTH.size :]
+    if name_bytes:
+        if zstandard.frame_content_size(data) != size:  # else a damaged size would be allocated as told
+            raise ValueError("a chunk's size is wrong")
+        data = memoryview(zstandard.decompress(data))
+    if len(data) != size:
+        raise ValueError("a chunk's size is wrong")
+    _check_crc(data, crc)
+    return data
+
+
+def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """(opcode, content) of each record; struct.error when the last one is cut."""
+    offset = 0
+    while offset < len(data):
+        opcode, length = _RECORD.unpack_from(data, offset)
+        offset += _RECORD.size
+        if length > len(data) - offset:
+            raise struct.error("a record is cut short")
+        yield opcode, data[offset : offset + length]
+        offset += length
+
+
+def _is_torn(source: Source, gap: Gap) -> bool:
+    """Whether the end of the file is what an interrupted write leaves: the beginning of one record, then zeros or
+    nothing. What a whole block held was acknowledged; a block that is cut or zero at its end never was."""
+    written_end = _last_written(source, gap)
+    head = source.read(gap.begin, min(_RECORD.size, written_end - gap.begin))
+    if gap.begin == 0:
+        return MCAP0_MAGIC.startswith(head)
+    if len(head) < _RECORD.size:
+        return not head or head[0] in _OPCODES
+    claim = _claim(head)
+    return claim is not None and written_end < gap.begin + _RECORD.size + claim.length
+
+
+def _last_written(source: Source, gap: Gap) -> int:
+    """Where the zeros begin that fill the end of the file."""
+    end = gap.end
+    while end > gap.begin:
+        begin = max(gap.begin, end - WINDOW_BYTES)
+        if data := source.read(begin, end - begin).rstrip(b"\0"):
+            return begin + len(data)
+        end = begin
+    return gap.begin
+
+
+def _bytes_of(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def _check_crc(data: bytes | memoryview, crc: int) -> None:
+    if zlib.crc32(data) != crc:
+        raise ValueError("a CRC is wrong")
+
+
+def _stream(data: bytes | memoryview) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(data))

@@ -1,0 +1,156 @@
+"""Segments of which is known which bytes hold which messages, and ways to damage them."""
+
+import shutil
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType
+
+from drivers.clock import NS_PER_S
+from drivers.interface import Frame, Reading
+from stand.hub import Batch, Event
+from stand.recording import messages
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.records import frame_places, read_frame, telemetry_messages
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
+
+START_NS = 1_767_290_400 * NS_PER_S
+METADATA = {"session_id": "night-1", "operator": "Zoë"}
+ATTACHMENTS = {"config.yaml": "camera: {gain_dB: 0.0}\n" * 20, "recipe.yaml": "name: night\n"}
+ENCODER = messages.BatchEncoder("thermometers", messages.KINDS["thermometers"])
+TOPICS = {
+    TELEMETRY: (
+        Topic(ENCODER.topic, messages.CLASSES[ENCODER.topic], ("thermometers",)),
+        Topic(messages.CAMERA_META, messages.CLASSES[messages.CAMERA_META]),
+        Topic(messages.EVENT, messages.CLASSES[messages.EVENT]),
+    ),
+    FRAMES: (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),),
+}
+COMPRESSION = {TELEMETRY: CompressionType.ZSTD, FRAMES: CompressionType.NONE}
+
+
+def form(series, metadata=METADATA, attachments=ATTACHMENTS, segment_bytes=1 << 40):
+    return SeriesForm(series, TOPICS[series], COMPRESSION[series], metadata, attachments, segment_bytes, 1 << 60)
+
+
+def frame(index):
+    image = np.random.default_rng(index).integers(0, 255, (40, 60), np.uint8)
+    return Frame("camera.image", image, START_NS + index * NS_PER_S, 0.1, 0.0, 41.0, index, 7 * index)
+
+
+def telemetry_of(index):
+    time_ns = START_NS + index * NS_PER_S
+    air = Reading("thermometers.air", 20 + index / 2, "degC", time_ns)
+    yield Record(ENCODER.topic, time_ns, ENCODER.encode(Batch("thermometers", time_ns, (air,))))
+    yield Record(messages.CAMERA_META, time_ns, messages.encode_frame_meta(frame(index)), index)
+    for event in range(index % 3):  # alike, so that they compress
+        yield Record(messages.EVENT, time_ns, messages.encode_event(Event(time_ns, "info", "note", f"{event} " * 40)))
+
+
+def frame_of(index):
+    yield Record(CAMERA_IMAGE, frame(index).time_ns, encode_image(frame(index), "png"), index)
+
+
+RECORDS_OF = {TELEMETRY: telemetry_of, FRAMES: frame_of}
+
+
+@dataclass(frozen=True)
+class Block:
+    """Bytes [begin, end) of a file are the chunk with these messages."""
+
+    begin: int
+    end: int
+    messages: tuple[Record, ...]
+
+
+@dataclass(frozen=True)
+class Written:
+    """A segment as it was written: `data` up to the end of the last commit, or finished."""
+
+    series: str
+    data: bytes
+    blocks: tuple[Block, ...]
+
+    @property
+    def opening_bytes(self):
+        return self.blocks[0].begin
+
+    @property
+    def messages(self):
+        return [message for block in self.blocks for message in block.messages]
+
+    def untouched(self, damaged):
+        """The messages of the chunks that are in `damaged` as they were."""
+        whole = (
+            block for block in self.blocks if damaged[block.begin : block.end] == self.data[block.begin : block.end]
+        )
+        return [message for block in whole for message in block.messages]
+
+
+def write_segment(folder, series, indices, finish=False, **changes):
+    """A segment with a commit per index, as a killed recorder leaves it, or finished."""
+    folder.mkdir(parents=True, exist_ok=True)
+    recording = Series(folder, form(series, **changes))
+    recording.open(0)
+    (part,) = folder.glob("*.mcap.part")
+    blocks = []
+    for index in indices:
+        begin = part.stat().st_size
+        records = tuple(RECORDS_OF[series](index))
+        recording.commit(records, 0)
+        with part.open("rb") as file:
+            file.seek(begin)
+            (length,) = struct.unpack("<xQ", file.read(9))
+        blocks.append(Block(begin, begin + 9 + length, records))
+    data = part.read_bytes()
+    recording.finish()
+    finished = folder / part.name.removesuffix(".part")
+    if finish:
+        return Written(series, finished.read_bytes(), tuple(blocks))
+    finished.unlink()
+    part.write_bytes(data)
+    return Written(series, data, tuple(blocks))
+
+
+def read_segment(path):
+    """The messages of a finished segment, read strictly."""
+    if path.parent.name == FRAMES:
+        read = [read_frame(place) for place in frame_places(path)]
+    else:
+        read = list(telemetry_messages(path, lambda channel: True))
+    return [Record(message.topic, message.time_ns, message.data, message.sequence) for message in read]
+
+
+def names(directory: Path):
+    """Every file below `directory`."""
+    return sorted(str(path.relative_to(directory)) for path in directory.rglob("*") if path.is_file())
+
+
+def truncated(data, offset, _rng):
+    return data[:offset]
+
+
+def zeroed_tail(data, offset, _rng):
+    return data[:offset] + bytes(len(data) - offset)
+
+
+def garbage_tail(data, offset, rng):
+    return data[:offset] + rng.randbytes(len(data) - offset)
+
+
+def zeroed_hole(data, offset, _rng):
+    end = min(len(data), offset + 4096)
+    return data[:offset] + bytes(end - offset) + data[end:]
+
+
+DAMAGES = (truncated, zeroed_tail, garbage_tail, zeroed_hole)
+
+
+def fresh(source, target):
+    """A copy of the session `source` in place of whatever is at `target`."""
+    shutil.rmtree(target, ignore_errors=True)
+    return shutil.copytree(source, target)
