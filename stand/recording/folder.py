@@ -16,14 +16,14 @@ from stand.recording.sink import sync_folder
 def new_folder(out: Path) -> Generator[Path]:
     """A folder beside `out` (`NAME.part`) to write into. When the block ends well it is on the disk and becomes `out`;
     when it does not, it is removed. SessionError when `out` exists or the disk refuses."""
-    if out.exists():
-        raise SessionError(f"{out}: exists already; choose another name or move it away")
-    part = out.with_name(f"{out.name}.part")
+    part = out.parent / f"{out.name}.part"
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
+        if out.exists():
+            raise SessionError(f"{out}: exists already; choose another name or move it away")
+        if part.exists():
+            raise SessionError(f"{part}: is in the way, left by a command that was killed; remove it")
         part.mkdir()
-    except FileExistsError as error:
-        raise SessionError(f"{part}: is in the way, left by a command that was killed; remove it") from error
     except OSError as error:
         raise SessionError(f"{out}: cannot be made ({error})") from error
     try:

@@ -1,0 +1,289 @@
+import csv
+import json
+import math
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from drivers.clock import NS_PER_S
+from drivers.interface import Reading, SessionError, bad_reading
+from stand.hub import Batch
+from stand.recording.export import export
+from stand.recording.images import decode_image
+from stand.recording.layout import FRAMES
+from stand.recording.session import Session
+from stand.recording.utc import utc_text
+from tests.recording.recorded import ATTACHMENTS, INFO, MS, START_NS, half_second, record
+
+# channel of the session -> table and column of the export
+CHANNELS = {
+    "thermometers.air": ("sensors_temperature", "air_degC"),
+    "thermometers.artifact": ("sensors_temperature", "artifact_degC"),
+    "regulator.pv": ("chamber_state", "actual_degC"),
+    "linear.position": ("table_state", "position_mm"),
+    "rotary.position": ("table_state", "position_deg"),
+}
+
+
+def silent(done, text):
+    pass
+
+
+def csv_rows(path):
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def parquet_rows(path):
+    table = pyarrow.parquet.read_table(path)
+    return table.drop_columns("time_utc").to_pylist()  # datetime has no ns
+
+
+async def exported(tmp_path, *, count=12, items=half_second, encoding="png", **choices):
+    """The recorded session, and the folder it was exported to."""
+    await record(tmp_path / "s", count, items, encoding)
+    session = Session.open(tmp_path / "s")
+    export(session, tmp_path / "out", report=silent, **choices)
+    return session, tmp_path / "out"
+
+
+def assert_readings_equal(session, channel, rows, column):
+    mine = [row for row in rows if row["device"] == channel.partition(".")[0] and row[f"{column}_quality"]]
+    times_ns, values = session.readings(channel)
+    assert [int(row["time_ns"]) for row in mine] == times_ns.tolist()
+    np.testing.assert_array_equal([float(row[column]) for row in mine], values)
+    assert [row[f"{column}_quality"] == "bad" for row in mine] == np.isnan(values).tolist()
+
+
+async def test_csv_reads_back_every_value_exactly(tmp_path):
+    session, out = await exported(tmp_path)
+    assert sorted(CHANNELS) == session.channels()
+    for channel, (table, column) in CHANNELS.items():
+        assert_readings_equal(session, channel, csv_rows(out / "telemetry" / f"{table}.csv"), column)
+    raw = (out / "telemetry" / "sensors_temperature.csv").read_bytes()
+    header, first = raw.split(b"\r\n")[:2]
+    assert header.startswith(b"time_ns,time_utc,device,granite_inside_degC,granite_inside_degC_quality,")
+    assert b"0.30000000000000004" in raw
+    assert f"{START_NS - 3 * MS},2026-01-01T18:00:00.120456789Z,thermometers,,," in first.decode()
+
+
+async def test_parquet_reads_back_every_value_exactly_and_typed(tmp_path):
+    session, out = await exported(tmp_path, telemetry="parquet")
+    for channel, (table, column) in CHANNELS.items():
+        assert_readings_equal(session, channel, parquet_rows(out / "telemetry" / f"{table}.parquet"), column)
+    schema = pyarrow.parquet.read_schema(out / "telemetry" / "sensors_temperature.parquet")
+    types = {name: str(schema.field(name).type) for name in ("time_ns", "time_utc", "air_degC", "remarks")}
+    assert types == {"time_ns": "int64", "time_utc": "timestamp[ns, tz=UTC]", "air_degC": "double", "remarks": "string"}
+    assert str(schema.field("device").type).startswith("dictionary<values=string")
+    table = pyarrow.parquet.read_table(out / "telemetry" / "sensors_temperature.parquet")
+    assert table["time_utc"].cast("int64").to_pylist() == table["time_ns"].to_pylist()
+    assert table["laboratory_degC"].null_count == len(table), "what was not measured is empty, not NaN"
+
+
+@pytest.mark.parametrize("table_format", ["csv", "parquet"])
+async def test_reasons_and_qualities_are_told(tmp_path, table_format):
+    _, out = await exported(tmp_path, telemetry=table_format)
+    rows = (csv_rows if table_format == "csv" else parquet_rows)(
+        out / "telemetry" / f"sensors_temperature.{table_format}"
+    )
+    assert len(rows) == 24, "the readings of a batch that have two instants are two rows"
+    bad, stale = rows[8], rows[9]
+    assert bad["air_degC_quality"] == "bad"
+    assert math.isnan(float(bad["air_degC"]))
+    assert bad["remarks"] == 'thermometers.air: sensor break; "open", line\n2'
+    assert (stale["artifact_degC_quality"], stale["air_degC_quality"] or None) == ("stale", None)
+    assert stale["remarks"] == "thermometers.artifact: not confirmed"
+
+
+async def test_what_no_column_is_for_is_in_the_remarks(tmp_path):
+    def items(time_ns, index):
+        readings = (
+            Reading("thermometers.humidity", 45.25, "%", time_ns),
+            bad_reading("thermometers.dew", "degC", time_ns, "no answer"),
+            Reading("thermometers.air", 20.5, "degC", time_ns),
+            Reading("thermometers.air", 20.75, "degC", time_ns),
+        )
+        yield Batch("thermometers", time_ns, readings)
+
+    session, out = await exported(tmp_path, count=1, items=items)
+    rows = csv_rows(out / "telemetry" / "sensors_temperature.csv")
+    assert rows[0]["remarks"] == "thermometers.humidity 45.25 % good; thermometers.dew nan degC bad (no answer)"
+    assert_readings_equal(session, "thermometers.air", rows, "air_degC")
+
+
+@pytest.mark.parametrize("encoding", ["png", "raw"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+async def test_every_frame_is_a_png_of_its_pixels(tmp_path, encoding, dtype):
+    session, out = await exported(
+        tmp_path, items=lambda time_ns, index: half_second(time_ns, index, dtype), encoding=encoding
+    )
+    names = sorted(path.name for path in (out / "frames").iterdir())
+    assert names[:3] == ["000001.png", "000001.txt", "000002.png"]
+    assert names[-1] == "index.csv"
+    assert len(names) == 2 * 12 + 1
+    for number, frame in enumerate(session.frames(), 1):
+        image = cv2.imread(str(out / "frames" / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == dtype
+        np.testing.assert_array_equal(image, frame.image)
+
+
+async def test_a_recorded_png_is_not_coded_again(tmp_path):
+    session, out = await exported(tmp_path, count=3)
+    for number, image in enumerate(session.images(), 1):
+        png = (out / "frames" / f"{number:06d}.png").read_bytes()
+        assert png in image.data
+        np.testing.assert_array_equal(
+            cv2.imdecode(np.frombuffer(png, np.uint8), -1), decode_image(image.schema, image.data).pixels
+        )
+
+
+def sidecar(path):
+    """A sidecar as anything can read it: name -> text."""
+    return dict(line.split(":", 1) for line in path.read_text(encoding="utf-8").splitlines())
+
+
+async def test_the_sidecar_tells_the_temperatures_of_its_frame(tmp_path):
+    session, out = await exported(tmp_path)
+    times_ns, air_degC = session.readings("thermometers.air")
+    for number, frame in enumerate(session.frames(), 1):
+        told = sidecar(out / "frames" / f"{number:06d}.txt")
+        assert told["file"].strip() == f"{number:06d}.png"
+        assert told["time_utc"].strip() == utc_text(frame.time_ns)
+        assert int(told["time_ns"]) == frame.time_ns
+        np.testing.assert_array_equal(float(told["camera_temperature_degC"]), frame.camera_degC)
+        assert (float(told["exposure_s"]), float(told["gain_dB"])) == (frame.exposure_s, frame.gain_dB)
+        assert (int(told["block_id"]), int(told["dropped"])) == (frame.block_id, frame.dropped)
+        assert told["step_id"].strip() == frame.step_id
+        before = times_ns <= frame.time_ns
+        assert before.sum() == number - 1
+        np.testing.assert_array_equal(
+            float(told["thermometers.air_degC"]), air_degC[before][-1] if before.any() else np.nan
+        )
+        age_s = (frame.time_ns - times_ns[before][-1]) / NS_PER_S if before.any() else np.nan
+        np.testing.assert_array_equal(float(told["thermometers.air_age_s"]), age_s)
+    assert sidecar(out / "frames" / "000004.txt")["camera_temperature_degC"] == " nan"
+    assert sidecar(out / "frames" / "000006.txt")["thermometers.air_degC"] == " nan", "a BAD reading is not passed over"
+
+
+async def test_the_index_says_what_the_sidecars_say(tmp_path):
+    _, out = await exported(tmp_path, telemetry=None)
+    rows = csv_rows(out / "frames" / "index.csv")
+    assert len(rows) == 12
+    for number, row in enumerate(rows, 1):
+        assert {name: text.strip() for name, text in sidecar(out / "frames" / f"{number:06d}.txt").items()} == row
+
+
+async def test_a_frame_without_its_description_is_exported_with_what_is_known(tmp_path):
+    await record(tmp_path / "s", 1)
+    await record(tmp_path / "other", 1, items=lambda time_ns, index: half_second(time_ns + NS_PER_S, index + 1))
+    (tmp_path / "other" / FRAMES / "0000.mcap").rename(tmp_path / "s" / FRAMES / "0001.mcap")
+    export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
+    told = sidecar(tmp_path / "out" / "frames" / "000002.txt")
+    assert told["camera_temperature_degC"] == told["exposure_s"] == " nan"
+    assert (told["block_id"], told["step_id"]) == (" 1", "")
+
+
+async def test_steps_events_metadata_and_attachments_are_there(tmp_path):
+    session, out = await exported(tmp_path, count=2, frames=False, telemetry=None)
+    assert sorted(path.name for path in out.iterdir()) == ["attachments", "events.csv", "session.json", "steps.csv"]
+    steps = csv_rows(out / "steps.csv")
+    assert [(row["step_id"], row["state"]) for row in steps] == [
+        (mark.step_id, mark.state.value) for mark in session.steps()
+    ]
+    assert json.loads(steps[0]["parameters_json"]) == {"frames": 1, "interval_s": 0.5}
+    events = csv_rows(out / "events.csv")
+    assert [(int(row["time_ns"]), row["level"], row["kind"], row["text"]) for row in events] == [
+        (event.time_ns, event.level, event.kind, event.text) for event in session.events()
+    ]
+    assert json.loads((out / "session.json").read_text(encoding="utf-8")) == INFO.metadata()
+    for name, text in ATTACHMENTS.items():
+        assert (out / "attachments" / name).read_bytes() == text.encode()
+
+
+async def test_the_descriptions_of_frames_are_a_table_of_their_own(tmp_path):
+    session, out = await exported(tmp_path, frames=False)
+    assert not (out / "frames").exists()
+    rows = csv_rows(out / "telemetry" / "camera_meta.csv")
+    assert [int(row["block_id"]) for row in rows] == [meta.block_id for _, meta in session.frame_metas]
+    np.testing.assert_array_equal(
+        [float(row["camera_temperature_degC"]) for row in rows], [meta.camera_degC for _, meta in session.frame_metas]
+    )
+
+
+async def test_progress_rises_to_the_end(tmp_path):
+    await record(tmp_path / "s")
+    told = []
+    export(Session.open(tmp_path / "s"), tmp_path / "out", report=lambda done, text: told.append((done, text)))
+    shares = [done for done, _ in told]
+    assert shares == sorted(shares)
+    assert 0.5 < shares[-1] <= 1.0
+    assert told[-1][1] == "frame 12 of 12"
+
+
+async def test_a_session_that_breaks_off_leaves_nothing(tmp_path):
+    await record(tmp_path / "s")
+    session = Session.open(tmp_path / "s")
+    damaged = sorted((tmp_path / "s" / FRAMES).iterdir())[1]
+    content = bytearray(damaged.read_bytes())
+    content[content.index(b"IDAT") + 20] ^= 1
+    damaged.write_bytes(content)
+    told = []
+    with pytest.raises(SessionError, match="damaged"):
+        export(session, tmp_path / "out", report=lambda done, text: told.append(text))
+    assert any(text.startswith("frame") for text in told), "it was on its way"
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
+
+
+async def test_an_interrupted_export_leaves_nothing(tmp_path):
+    await record(tmp_path / "s")
+
+    def interrupt(done, text):
+        if text.startswith("frame 5"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export(Session.open(tmp_path / "s"), tmp_path / "out", report=interrupt)
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
+
+
+async def test_nothing_is_overwritten_by_an_export(tmp_path):
+    session, out = await exported(tmp_path, count=1)
+    before = sorted(out.rglob("*"))
+    with pytest.raises(SessionError, match="exists already; choose another name"):
+        export(session, out, report=silent)
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(SessionError, match="cannot be made"):
+        export(session, tmp_path / "file" / "out", report=silent)
+    (tmp_path / "next.part").mkdir()
+    with pytest.raises(SessionError, match=r"next\.part: is in the way, left by a command that was killed"):
+        export(session, tmp_path / "next", report=silent)
+    assert sorted(out.rglob("*")) == before
+    assert (tmp_path / "next.part").is_dir()
+
+
+PARQUET_WITHOUT_PYARROW = """
+import sys
+sys.modules["pyarrow"] = None  # as an interpreter that has none
+from pathlib import Path
+from stand.recording.export import export
+from stand.recording.session import Session
+export(Session.open(Path(sys.argv[1])), Path(sys.argv[2]), telemetry="parquet", report=print)
+"""
+
+
+async def test_without_pyarrow_parquet_is_refused_with_a_sentence(tmp_path):
+    await record(tmp_path / "s", 1)
+    ended = subprocess.run(
+        [sys.executable, "-c", PARQUET_WITHOUT_PYARROW, tmp_path / "s", tmp_path / "out"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.stderr.splitlines()[-1].endswith(
+        "Parquet needs pyarrow, which is not installed: pip install 'thermostand[parquet]', or choose CSV"
+    )
+    assert not (tmp_path / "out").exists()
