@@ -1,0 +1,372 @@
+"""One finished segment, every byte of it: what a CRC covers is checked by it, the rest by what is told twice.
+
+Only the index, the content of chunks and the attachments have CRCs. The rest stands in the file a second time: where
+each record is and how long, a chunk's own fields and each metadata's name in the index, the message indexes in the
+messages, the counts in the walk. Only text has no second telling: the name of the writer's library in the header,
+which nothing reads, and what metadata says, which stand/recording/verify.py compares between segments.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, pairwise
+from math import inf
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Footer,
+    Header,
+    McapRecord,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from stand.recording.records import CHUNK_LIMIT_BYTES, DAMAGE, Message
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_CHUNK = struct.Struct("<QQQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
+_LENGTH = struct.Struct("<Q")
+_MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
+_CRC = struct.Struct("<I")
+_FOOTER_BYTES = _RECORD.size + 20  # places of the summary and of its offsets, CRC
+_DATA_END_BYTES = _RECORD.size + _CRC.size
+
+
+class Damage(NamedTuple):
+    """What is wrong, and the log times between which messages may be lost by it, ns; none are when begin > end."""
+
+    text: str
+    begin_ns: float = inf
+    end_ns: float = -inf
+
+
+@dataclass
+class SegmentCheck:
+    """What the walk through a segment found. `last_ns`: log time of its latest sound message."""
+
+    path: Path
+    damages: list[Damage] = field(default_factory=list[Damage])
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    messages: int = 0
+    first_ns: float = inf
+    last_ns: float = -inf
+
+
+def check_segment(path: Path, receive: Callable[[Message], None], report: Callable[[int], None]) -> SegmentCheck:
+    """Read the whole segment and hand each sound message to `receive`; `report` gets the number of bytes read so far.
+    Damage is not raised: it is listed, and the walk goes on at the next place the index tells of."""
+    check = SegmentCheck(path)
+    try:
+        with path.open("rb") as file:
+            walk = _Walk(check, file, _read_index(file, path.stat().st_size), receive)
+            walk.run(report)
+    except DAMAGE as error:
+        check.damages.append(Damage(_sentence(error), -inf, inf))
+    return check
+
+
+def _sentence(error: Exception) -> str:
+    """Our own sentences are ValueErrors; of the others the type says more than the text."""
+    return str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Index:
+    """The summary at `begin` near the end of the file: what stands before it, records by their place."""
+
+    begin: int
+    statistics: Statistics
+    chunks: Mapping[int, ChunkIndex]
+    attachments: Mapping[int, AttachmentIndex]
+    metadata: Mapping[int, MetadataIndex]
+    schemas: Mapping[int, Schema]
+    channels: Mapping[int, Channel]
+
+
+def _read_index(file: BinaryIO, size: int) -> _Index:
+    """The index, by the footer and its CRC; raises one of DAMAGE."""
+    tail_bytes = _FOOTER_BYTES + len(MCAP0_MAGIC)
+    file.seek(max(0, size - tail_bytes))
+    tail = file.read()
+    if tail[_FOOTER_BYTES:] != MCAP0_MAGIC:
+        raise ValueError("it ends in the middle")
+    begin = Footer.read(_stream(tail[_RECORD.size :])).summary_start
+    if not len(MCAP0_MAGIC) <= begin <= size - tail_bytes:
+        raise ValueError("its index is not in the file")
+    file.seek(begin)
+    summary = file.read(size - tail_bytes - begin)
+    covered = _FOOTER_BYTES - _CRC.size
+    _check_crc(summary + tail[:covered], _crc_at(tail, covered), "its index")
+    return _parsed(memoryview(summary), begin)
+
+
+def _parsed(summary: memoryview, begin: int) -> _Index:
+    contents: dict[int, list[ReadDataStream]] = {}
+    for _, opcode, content in _records(summary):
+        contents.setdefault(opcode, []).append(_stream(content))
+    schemas = [Schema.read(stream) for stream in contents.get(Opcode.SCHEMA, ())]
+    channels = [Channel.read(stream) for stream in contents.get(Opcode.CHANNEL, ())]
+    chunks = [ChunkIndex.read(stream) for stream in contents.get(Opcode.CHUNK_INDEX, ())]
+    attachments = [AttachmentIndex.read(stream) for stream in contents.get(Opcode.ATTACHMENT_INDEX, ())]
+    metadata = [MetadataIndex.read(stream) for stream in contents.get(Opcode.METADATA_INDEX, ())]
+    (statistics,) = [Statistics.read(stream) for stream in contents.get(Opcode.STATISTICS, ())]
+    return _Index(
+        begin,
+        statistics,
+        {chunk.chunk_start_offset: chunk for chunk in chunks},
+        {attachment.offset: attachment for attachment in attachments},
+        {entry.offset: entry for entry in metadata},
+        {schema.id: schema for schema in schemas},
+        {channel.id: channel for channel in channels},
+    )
+
+
+def _records(data: memoryview) -> Iterator[tuple[int, int, memoryview]]:
+    """(place, opcode, content) of each record; struct.error when the last one is cut."""
+    offset = 0
+    while offset < len(data):
+        opcode, length = _RECORD.unpack_from(data, offset)
+        begin = offset + _RECORD.size
+        if length > len(data) - begin:
+            raise struct.error("a record is cut short")
+        yield offset, opcode, data[begin : begin + length]
+        offset = begin + length
+
+
+class _Walk:
+    """The walk from the header to the index, place by place."""
+
+    def __init__(self, check: SegmentCheck, file: BinaryIO, index: _Index, receive: Callable[[Message], None]) -> None:
+        self._check = check
+        self._file = file
+        self._index = index
+        self._receive = receive
+        self._counts: Counter[int] = Counter()  # of messages, by channel
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+
+    def run(self, report: Callable[[int], None]) -> None:
+        """Read everything; raises one of DAMAGE when the index does not tell of the whole file."""
+        places = self._places()
+        self._file.seek(0)
+        self._part(0, places[0], self._header)
+        for place, end in pairwise(places):
+            self._part(place, end, self._record)
+            report(end)
+        self._part(places[-1], self._index.begin, self._data_end)
+        if not self._check.damages:
+            self._compare()
+
+    def _places(self) -> list[int]:
+        """Where each indexed record begins, in order, and where the last one ends."""
+        index = self._index
+        ends = {place: place + told.chunk_length + told.message_index_length for place, told in index.chunks.items()}
+        ends.update(
+            {place: place + told.length for place, told in chain(index.attachments.items(), index.metadata.items())}
+        )
+        places = sorted(ends)
+        last = index.begin - _DATA_END_BYTES
+        if [ends[place] for place in places] != [*places[1:], last]:
+            raise ValueError("the records its index tells of do not follow each other")
+        return [*places, last]
+
+    def _part(self, place: int, end: int, read: Callable[[int, bytes], None]) -> None:
+        """Read the bytes of one record; damage in it is noted."""
+        try:
+            read(place, self._file.read(end - place))
+        except DAMAGE as error:
+            told = self._index.chunks.get(place)
+            times_ns = (told.message_start_time, told.message_end_time) if told else (inf, -inf)
+            self._check.damages.append(Damage(f"{_sentence(error)} (at byte {place})", *times_ns))
+
+    def _header(self, place: int, data: bytes) -> None:
+        content = data[len(MCAP0_MAGIC) + _RECORD.size :]
+        header = Header.read(_stream(content))
+        if data != MCAP0_MAGIC + _bytes_of(header) or header.profile:
+            raise ValueError("its first bytes are not the header of one of our files")
+
+    def _record(self, place: int, data: bytes) -> None:
+        index = self._index
+        content = data[_RECORD.size :]
+        if place in index.chunks:
+            self._chunk(index.chunks[place], data)
+        elif place in index.attachments:
+            attachment = Attachment.read(_stream(content))
+            _check_same(_bytes_of(attachment), data, "an attachment")
+        else:
+            metadata = Metadata.read(_stream(content))
+            _check_same(_bytes_of(metadata), data, "a metadata record")
+            if metadata.name != index.metadata[place].name:
+                raise ValueError("a metadata record has another name than in the index")
+            self._check.metadata[metadata.name] = metadata.metadata
+
+    def _chunk(self, told: ChunkIndex, data: bytes) -> None:
+        """A chunk and the message indexes behind it."""
+        chunk = Chunk.read(_stream(data[_RECORD.size : told.chunk_length]))
+        head = _head_of(chunk, told)
+        _check_same(head, data[: len(head)], "the head of a chunk")
+        messages = self._contents(_uncompressed(chunk))
+        offsets, indexes = _message_indexes(messages, told.chunk_start_offset + told.chunk_length)
+        _check_same(indexes, data[told.chunk_length :], "the index of a chunk's messages")
+        times_ns = [message.time_ns for message in messages]
+        rebuilt = ChunkIndex(
+            chunk_length=told.chunk_length,
+            chunk_start_offset=told.chunk_start_offset,
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+            message_end_time=max(times_ns),
+            message_index_length=len(indexes),
+            message_index_offsets=offsets,
+            message_start_time=min(times_ns),
+            uncompressed_size=chunk.uncompressed_size,
+        )
+        if rebuilt != told:
+            raise ValueError("a chunk's size or times are not those in the index")
+        for message in messages:
+            self._count(message)
+
+    def _contents(self, data: memoryview) -> list[_Placed]:
+        """The messages of a chunk; its schemas and channels are learnt."""
+        placed: list[_Placed] = []
+        for offset, opcode, content in _records(data):
+            if opcode == Opcode.MESSAGE:
+                channel, sequence, time_ns, _ = _MESSAGE.unpack_from(content)
+                topic = self._index.channels[channel].topic  # the first chunk, which tells it too, may be damaged
+                message = Message(topic, sequence, time_ns, bytes(content[_MESSAGE.size :]))
+                placed.append(_Placed(channel, offset, time_ns, message))
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(_stream(content))
+                self._schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                known = Channel.read(_stream(content))
+                self._channels[known.id] = known
+            else:
+                raise ValueError(f"a chunk holds a record of kind {opcode}")
+        return placed
+
+    def _count(self, placed: _Placed) -> None:
+        check = self._check
+        check.messages += 1
+        check.first_ns = min(check.first_ns, placed.time_ns)
+        check.last_ns = max(check.last_ns, placed.time_ns)
+        self._counts[placed.channel] += 1
+        self._receive(placed.message)
+
+    def _data_end(self, place: int, data: bytes) -> None:
+        """Our writer makes no CRC of the whole data section (0): chunks and attachments have their own."""
+        _check_same(_RECORD.pack(Opcode.DATA_END, _CRC.size) + _CRC.pack(0), data, "the end of the data")
+
+    def _compare(self) -> None:
+        """What the whole walk found against the index; ValueError when they differ."""
+        check, index = self._check, self._index
+        # Schemas and channels go into the first chunk; a segment without a message has none.
+        if index.chunks and (self._schemas, self._channels) != (index.schemas, index.channels):
+            raise ValueError("its schemas or channels are not those in its index")
+        found = Statistics(
+            attachment_count=len(index.attachments),
+            channel_count=len(index.channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(index.chunks),
+            message_count=check.messages,
+            message_end_time=int(check.last_ns) if check.messages else 0,
+            message_start_time=int(check.first_ns) if check.messages else 0,
+            metadata_count=len(index.metadata),
+            schema_count=len(index.schemas),
+        )
+        if found != index.statistics:
+            raise ValueError("it does not hold the messages its index tells of")
+
+
+class _Placed(NamedTuple):
+    """A message, its channel's number and where it begins in its chunk."""
+
+    channel: int
+    offset: int
+    time_ns: int
+    message: Message
+
+
+def _head_of(chunk: Chunk, told: ChunkIndex) -> bytes:
+    """What stands before the data of a chunk, by the index where that tells it."""
+    name = told.compression.encode()
+    times_ns = told.message_start_time, told.message_end_time
+    return (
+        _RECORD.pack(Opcode.CHUNK, told.chunk_length - _RECORD.size)
+        + _CHUNK.pack(*times_ns, told.uncompressed_size, chunk.uncompressed_crc, len(name))
+        + name
+        + _LENGTH.pack(told.compressed_size)
+    )
+
+
+def _message_indexes(messages: list[_Placed], place: int) -> tuple[dict[int, int], bytes]:
+    """The message indexes that belong behind a chunk, from `place` on: where each channel's is, and their bytes."""
+    entries: dict[int, list[tuple[int, int]]] = {}
+    for message in messages:
+        entries.setdefault(message.channel, []).append((message.time_ns, message.offset))
+    offsets: dict[int, int] = {}
+    data = b""
+    for channel, records in entries.items():
+        offsets[channel] = place + len(data)
+        data += _bytes_of(MessageIndex(channel, records))
+    return offsets, data
+
+
+def _uncompressed(chunk: Chunk) -> memoryview:
+    """The records of a chunk, its CRC checked."""
+    data, size = chunk.data, chunk.uncompressed_size
+    if size > CHUNK_LIMIT_BYTES:
+        raise ValueError(f"a chunk claims {size} bytes")
+    if chunk.compression == "zstd":
+        if zstandard.frame_content_size(data) != size:  # else a damaged size would be allocated as told
+            raise ValueError("a chunk's size is wrong")
+        data = zstandard.decompress(data)
+    elif chunk.compression:
+        raise ValueError(f"a chunk is compressed with {chunk.compression!r}")
+    if len(data) != size:
+        raise ValueError("a chunk's size is wrong")
+    _check_crc(data, chunk.uncompressed_crc, "a chunk")
+    return memoryview(data)
+
+
+def _bytes_of(record: McapRecord) -> bytes:
+    """The record as the writer would write it."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def _check_same(expected: bytes, found: bytes, what: str) -> None:
+    if expected != found:
+        raise ValueError(f"{what} is damaged")
+
+
+def _crc_at(data: bytes, place: int) -> int:
+    (crc,) = _CRC.unpack_from(data, place)
+    return crc
+
+
+def _check_crc(data: bytes, crc: int, what: str) -> None:
+    if zlib.crc32(data) != crc:
+        raise ValueError(f"the CRC of {what} is wrong")
+
+
+def _stream(data: bytes | memoryview) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(data))

@@ -1,0 +1,234 @@
+"""Is a recorded session whole? Reads every byte of it and says what is damaged or missing, a sentence each.
+
+An error is something that was recorded and cannot be trusted or is not there; a note is a hole in what was measured
+that the recording itself tells of: silence of a device, frames the camera or a slow disk lost, a salvaged segment.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+from drivers.interface import SessionError
+from stand.recording.contents import Contents, FrameKey
+from stand.recording.gaps import silences, told_blocks
+from stand.recording.images import CAMERA_IMAGE
+from stand.recording.instants import date_time
+from stand.recording.inventory import SegmentFile, State, inventory
+from stand.recording.layout import FRAMES, SEGMENT_METADATA, SESSION_METADATA, TELEMETRY
+from stand.recording.records import Message
+from stand.recording.segment_check import Damage, SegmentCheck, check_segment
+
+SALVAGE_METADATA = "salvage"
+
+
+class Severity(StrEnum):
+    """error: damaged or missing. note: a hole in the data that is recorded as such."""
+
+    ERROR = "error"
+    NOTE = "note"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One sentence; `where` is the file it is about, as in `telemetry/0003.mcap`, or "" for the whole session."""
+
+    severity: Severity
+    where: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.where}{': ' if self.where else ''}{self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What was read (finished segments) and what was found."""
+
+    findings: tuple[Finding, ...]
+    segments: int
+    messages: int
+    frames: int
+    bytes: int
+
+    @property
+    def is_sound(self) -> bool:
+        """Nothing is damaged or missing."""
+        return not any(finding.severity is Severity.ERROR for finding in self.findings)
+
+
+@dataclass
+class _Read:
+    """What the finished segments hold, by their names."""
+
+    contents: Contents = field(default_factory=Contents)
+    images: Counter[FrameKey] = field(default_factory=Counter[FrameKey])
+    checks: dict[str, SegmentCheck] = field(default_factory=dict[str, SegmentCheck])
+
+    def receive(self, message: Message) -> None:
+        """Keep what is compared later; SessionError when the message cannot be read."""
+        if message.topic == CAMERA_IMAGE:
+            self.images[message.time_ns, message.sequence] += 1
+        else:
+            self.contents.receive(message)
+
+    def is_damaged_at(self, series: str, time_ns: int) -> bool:
+        """What the series held of that instant may be in damage that is a finding already."""
+        return any(
+            damage.begin_ns <= time_ns <= damage.end_ns
+            for name, check in self.checks.items()
+            if name.startswith(f"{series}/")
+            for damage in check.damages
+        )
+
+
+def _no_report(done_bytes: float, text: str) -> None:
+    """Nobody watches."""
+
+
+def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Verification:
+    """Read the whole session in `path`; `report` gets the bytes read so far and the segment.
+
+    SessionError when `path` is no session. Damage is not raised, it is found.
+    """
+    files = inventory(path)
+    if not files:
+        raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
+    finished = [file for file in files if file.state is State.FINISHED]
+    read = _Read()
+    done_bytes = 0
+    for file in finished:
+        read.checks[file.name] = _checked(file, read, report, done_bytes)
+        done_bytes += file.size_bytes
+    findings = (
+        *_not_finished(files),
+        *_missing(files),
+        *_damaged(read),
+        *_metadata(finished, read),
+        *_frames_against_descriptions(read),
+        *_frames_lost(read.contents),
+        *_silences(read.contents),
+    )
+    total = sum(check.messages for check in read.checks.values())
+    return Verification(findings, len(finished), total, read.images.total(), done_bytes)
+
+
+def _checked(file: SegmentFile, read: _Read, report: Callable[[float, str], None], before_bytes: int) -> SegmentCheck:
+    unreadable: list[Damage] = []
+
+    def receive(message: Message) -> None:
+        try:
+            read.receive(message)
+        except SessionError as error:
+            unreadable.append(Damage(str(error), message.time_ns, message.time_ns))
+
+    check = check_segment(file.path, receive, lambda done_bytes: report(before_bytes + done_bytes, file.name))
+    check.damages.extend(unreadable)
+    return check
+
+
+def _not_finished(files: Iterable[SegmentFile]) -> Iterator[Finding]:
+    for file in files:
+        match file.state:
+            case State.UNFINISHED:
+                yield _error("is not finished; `stand session salvage` recovers what is in it", file.name)
+            case State.DAMAGED:
+                yield _error("is what a salvage kept of a segment because it could not recover all of it", file.name)
+            case State.RECORDING:
+                yield _note("is being recorded now and was not read", file.name)
+            case State.FINISHED:
+                pass
+
+
+def _error(text: str, where: str = "") -> Finding:
+    return Finding(Severity.ERROR, where, text)
+
+
+def _note(text: str, where: str = "") -> Finding:
+    return Finding(Severity.NOTE, where, text)
+
+
+def _missing(files: Iterable[SegmentFile]) -> Iterator[Finding]:
+    """Segments are numbered from 0 without a hole."""
+    numbers: dict[str, set[int]] = {}
+    for file in files:
+        numbers.setdefault(file.series, set()).add(file.number)
+    for series, present in numbers.items():
+        for number in sorted(set(range(max(present))) - present):
+            yield _error("is missing", f"{series}/{number:04d}.mcap")
+    if TELEMETRY not in numbers:
+        yield _error("is missing", TELEMETRY)
+
+
+def _damaged(read: _Read) -> Iterator[Finding]:
+    for name, check in read.checks.items():
+        for damage in check.damages:
+            yield _error(f"is damaged: {damage.text}", name)
+
+
+def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
+    """Every segment tells of the same session, and of its own place in it."""
+    told = {file.name: check.metadata for file, check in zip(finished, read.checks.values(), strict=True)}
+    sessions = Counter(_entries(metadata.get(SESSION_METADATA)) for metadata in told.values())
+    for file in finished:
+        metadata = told[file.name]
+        is_whole = SESSION_METADATA in metadata and SEGMENT_METADATA in metadata
+        if not is_whole and read.checks[file.name].damages:
+            continue  # a finding already
+        if _entries(metadata.get(SESSION_METADATA)) != sessions.most_common(1)[0][0]:
+            yield _error("tells of another session than the other segments", file.name)
+        previous = f"{file.number - 1:04d}" if file.number else ""
+        place = {"series": file.series, "number": f"{file.number:04d}", "previous": previous}
+        if metadata.get(SEGMENT_METADATA) != place:
+            yield _error("tells of another place in the session than its name does", file.name)
+        if (salvage := metadata.get(SALVAGE_METADATA)) is not None:
+            yield _note(f"was salvaged ({', '.join(f'{key}: {text}' for key, text in salvage.items())})", file.name)
+
+
+def _entries(metadata: dict[str, str] | None) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((metadata or {}).items()))
+
+
+def _frames_against_descriptions(read: _Read) -> Iterator[Finding]:
+    """Every image has its description in the telemetry and the other way round."""
+    described = Counter(key for key, _ in read.contents.metas)
+    block_ids = {key: meta.block_id for key, meta in read.contents.metas}
+    told = told_blocks(read.contents.events)
+    bare = [key for key in (read.images - described) if not read.is_damaged_at(TELEMETRY, key[0])]
+    gone = [key for key in (described - read.images) if not read.is_damaged_at(FRAMES, key[0])]
+    lost = [key for key in gone if any(block_ids[key] in blocks for blocks in told)]
+    yield from _frames(_error, bare, "without a description in the telemetry")
+    yield from _frames(_error, sorted(set(gone) - set(lost)), "missing, though the telemetry describes them")
+    yield from _frames(_note, lost, "described but lost by the recorder, as its events say")
+
+
+def _frames(kind: Callable[[str], Finding], keys: list[FrameKey], what: str) -> Iterator[Finding]:
+    """One finding for all frames of a kind."""
+    if keys:
+        times_ns, blocks = sorted(time_ns for time_ns, _ in keys), sorted(block for _, block in keys)
+        yield kind(
+            f"{len(keys)} frames are {what}: blocks {blocks[0]} to {blocks[-1]}, "
+            f"{date_time(times_ns[0])} to {date_time(times_ns[-1])} UTC"
+        )
+
+
+def _frames_lost(contents: Contents) -> Iterator[Finding]:
+    """What the recorder, and what camera and wire lost, as recorded."""
+    for event in contents.events:
+        if event.kind == "frames_dropped":
+            yield _note(f"{date_time(event.time_ns)} UTC: {event.text}")
+    dropped: Counter[str] = Counter()
+    for _, meta in contents.metas:
+        dropped[meta.step_id] += meta.dropped
+    steps = {mark.step_id: f"step {mark.index} ({mark.kind})" for mark in contents.marks}
+    for step_id, count in dropped.items():
+        if count:
+            yield _note(f"{count} frames of {steps.get(step_id, 'no step')} were lost by the camera or its wire")
+
+
+def _silences(contents: Contents) -> Iterator[Finding]:
+    for silence in silences({name: channel.sorted_times_ns() for name, channel in contents.channels.items()}):
+        yield _note(str(silence))

@@ -1,0 +1,254 @@
+import fcntl
+import random
+import shutil
+
+import numpy as np
+import pytest
+
+from drivers.clock import NS_PER_S
+from drivers.interface import Frame, Reading, SessionError
+from stand.hub import Batch, Event, StepMark, StepState
+from stand.recording.gaps import silences
+from stand.recording.inventory import inventory
+from stand.recording.session import Session
+from stand.recording.verify import Severity, verify
+
+from .recorded import item_key, record
+
+SECONDS = 12
+
+
+def frame(time_ns, index, dropped=0):
+    image = np.random.default_rng(index).integers(0, 255, (12, 16), np.uint8)
+    return Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, 100 + index, 7 * index, dropped, "capture")
+
+
+def second(time_ns, index):
+    yield Batch("thermometers", time_ns, (Reading("thermometers.air", 20.0 + index, "degC", time_ns),))
+    yield Batch("regulator", time_ns, (Reading("regulator.pv", 20.0 + index, "degC", time_ns),))
+    state = {0: StepState.STARTED, SECONDS - 1: StepState.DONE}.get(index)
+    if state is not None:
+        yield StepMark(time_ns, "capture", 4, "Capture", state, {"frames": SECONDS})
+    yield frame(time_ns, index)
+    yield Event(time_ns, "info", "note", f"second {index}")
+
+
+async def recorded(directory, items=second, seconds=SECONDS, segment_s=4.0):
+    await record(directory, seconds, items=items, segment_s=segment_s, period_ns=NS_PER_S)
+    return directory
+
+
+@pytest.fixture
+async def session(tmp_path):
+    """Twelve seconds in three or four segments per series."""
+    return await recorded(tmp_path / "s")
+
+
+def errors(directory):
+    return [str(f) for f in verify(directory).findings if f.severity is Severity.ERROR]
+
+
+def notes(directory):
+    return [str(f) for f in verify(directory).findings if f.severity is Severity.NOTE]
+
+
+async def test_a_whole_session_is_sound_and_counted(session):
+    done = []
+    found = verify(session, lambda done_bytes, text: done.append((done_bytes, text)))
+    files = [path for path in session.rglob("*") if path.is_file()]
+    assert found.findings == ()
+    assert found.is_sound
+    assert (found.segments, found.frames) == (len(files), SECONDS)
+    assert found.bytes == sum(path.stat().st_size for path in files)
+    # two batches, description, event and log each second, two marks, and the images
+    assert found.messages == SECONDS * 6 + 2
+    assert [bytes_ for bytes_, _ in done] == sorted(bytes_ for bytes_, _ in done)
+    assert {text for _, text in done} == {str(path.relative_to(session)) for path in files}
+    assert done[-1][0] == pytest.approx(found.bytes, rel=0.2)
+
+
+def everything(directory):
+    """What a reader gets of the session; None when it says that it cannot be read."""
+    try:
+        session = Session.open(directory)
+        return session.metadata, dict(session.attachments), [item_key(item) for item in session.items()]
+    except SessionError:
+        return None
+
+
+async def test_one_flipped_bit_anywhere_is_found_or_changes_nothing(session):
+    whole = everything(session)
+    randomly = random.Random(5)
+    files = [path for path in sorted(session.rglob("*")) if path.is_file()]
+    harmless = 0
+    for _ in range(200):
+        path = randomly.choice(files)
+        data = path.read_bytes()
+        place = randomly.randrange(len(data))
+        path.write_bytes(data[:place] + bytes([data[place] ^ 1 << randomly.randrange(8)]) + data[place + 1 :])
+        try:
+            if not errors(session):
+                harmless += 1
+                assert everything(session) == whole, f"byte {place} of {path} was not found"
+        finally:
+            path.write_bytes(data)
+    assert harmless < 10  # the text of the header, and bits that zstd ignores
+    assert errors(session) == []
+
+
+async def test_every_byte_is_guarded_but_the_name_of_the_writers_library(tmp_path):
+    directory = await recorded(tmp_path / "s", seconds=1)
+    path = directory / "frames" / "0000.mcap"  # not compressed: zstd has bits that mean nothing
+    data = path.read_bytes()
+    unguarded = []
+    for place in range(len(data)):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        if not errors(directory):
+            unguarded.append(place)
+    begin = data.index(b"mcap-python/")
+    assert set(unguarded) <= set(range(begin, begin + len("mcap-python/1.6.0 ")))
+
+
+@pytest.mark.parametrize("series", ["telemetry", "frames"])
+async def test_a_missing_segment_is_named(session, series):
+    (session / series / "0001.mcap").unlink()
+    assert f"error: {series}/0001.mcap: is missing" in errors(session)
+
+
+async def test_frames_that_went_with_a_segment_are_counted_with_their_blocks(session):
+    (session / "frames" / "0001.mcap").unlink()
+    assert errors(session)[1] == (
+        "error: 4 frames are missing, though the telemetry describes them: blocks 104 to 107, "
+        "2026-01-01 18:00:04 to 2026-01-01 18:00:07 UTC"
+    )
+
+
+async def test_images_whose_description_went_are_counted(session):
+    (session / "telemetry" / "0001.mcap").unlink()
+    assert any("frames are without a description in the telemetry: blocks 10" in text for text in errors(session))
+
+
+async def test_frames_in_a_damaged_chunk_are_not_called_missing_as_well(session):
+    path = session / "frames" / "0001.mcap"
+    data = bytearray(path.read_bytes())
+    data[data.index(b"\x89PNG") + 40] ^= 1
+    path.write_bytes(data)
+    (text,) = errors(session)
+    assert text.startswith("error: frames/0001.mcap: is damaged: the CRC of a chunk is wrong (at byte ")
+
+
+async def test_a_cut_segment_is_damaged(session):
+    path = session / "telemetry" / "0001.mcap"
+    path.write_bytes(path.read_bytes()[:-30])
+    assert errors(session) == ["error: telemetry/0001.mcap: is damaged: it ends in the middle"]
+
+
+async def test_what_a_recorder_or_a_salvage_left_is_told(session):
+    shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0007.mcap.part")
+    shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.mcap.damaged")
+    found = errors(session)
+    assert "error: frames/0007.mcap.part: is not finished; `stand session salvage` recovers what is in it" in found
+    assert any(text.startswith("error: frames/0000.mcap.damaged: is what a salvage kept") for text in found)
+
+
+async def test_a_segment_that_is_being_recorded_is_no_error(session):
+    part = session / "frames" / f"{len(list((session / 'frames').iterdir())):04d}.mcap.part"
+    part.write_bytes(b"")
+    with part.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert errors(session) == []
+        assert notes(session) == [f"note: frames/{part.name}: is being recorded now and was not read"]
+        assert [str(entry.state) for entry in inventory(session)].count("recording") == 1
+
+
+async def test_a_segment_of_another_place_is_told(session):
+    shutil.copy(session / "frames" / "0001.mcap", session / "frames" / "0002.mcap")
+    assert "error: frames/0002.mcap: tells of another place in the session than its name does" in errors(session)
+
+
+async def test_losses_the_recording_tells_of_are_notes(tmp_path):
+    def items(time_ns, index):
+        yield from (item for item in second(time_ns, index) if not isinstance(item, Frame))
+        yield frame(time_ns, index, dropped=2 if index == 3 else 0)
+
+    directory = await recorded(tmp_path / "s", items)
+    assert errors(directory) == []
+    assert notes(directory) == ["note: 2 frames of step 4 (Capture) were lost by the camera or its wire"]
+
+
+async def test_frames_the_recorder_says_it_lost_are_notes(tmp_path):
+    def items(time_ns, index):
+        yield from second(time_ns, index)
+        if index == SECONDS - 1:
+            text = "frames lost: 4 (blocks 104 to 107), 4 in all; [Errno 28] No space left on device"
+            yield Event(time_ns, "error", "frames_dropped", text)
+
+    directory = await recorded(tmp_path / "s", items)
+    (directory / "frames" / "0001.mcap").unlink()
+    assert errors(directory) == ["error: frames/0001.mcap: is missing"]
+    assert notes(directory)[0].startswith("note: 4 frames are described but lost by the recorder, as its events say")
+    assert notes(directory)[1].startswith("note: 2026-01-01 18:00:11 UTC: frames lost: 4 (blocks 104 to 107)")
+
+
+async def test_silence_of_everything_and_of_one_device_are_notes(tmp_path):
+    def items(time_ns, index):
+        if index < 4 or 15 <= index < 20 or index >= 30:
+            yield from second(time_ns, index)
+        elif index >= 20:
+            yield from (item for item in second(time_ns, index) if not isinstance(item, Batch) or "reg" in item.device)
+
+    directory = await recorded(tmp_path / "s", items, seconds=40, segment_s=60.0)
+    assert errors(directory) == []
+    assert notes(directory) == [
+        "note: everything was silent from 2026-01-01 18:00:03 to 2026-01-01 18:00:15 UTC (12.0 s)",
+        "note: thermometers was silent from 2026-01-01 18:00:19 to 2026-01-01 18:00:30 UTC (11.0 s)",
+    ]
+
+
+def every(period_s, *stretches):
+    """Instants each `period_s` within the stretches [begin, end), s."""
+    return np.concatenate([np.arange(b, e, period_s) for b, e in stretches]).astype(np.int64) * NS_PER_S
+
+
+def test_devices_with_different_periods_fall_silent_together():
+    found = silences(
+        {
+            "thermometers.air": every(5, (0, 600), (900, 1500)),
+            "thermometers.artifact": every(5, (0, 600), (900, 1500)),
+            "linear.position": every(30, (0, 600), (910, 1500)),
+        }
+    )
+    assert [(gap.names, gap.begin_ns, gap.end_ns) for gap in found] == [
+        (("everything",), 595 * NS_PER_S, 900 * NS_PER_S)
+    ]
+
+
+def test_a_channel_of_a_device_that_stops_early_or_begins_late_is_named_alone():
+    found = silences(
+        {
+            "thermometers.air": every(1, (0, 100)),
+            "thermometers.artifact": every(1, (0, 40)),
+            "camera.temperature": every(1, (20, 100)),
+        }
+    )
+    assert [(gap.names, gap.begin_ns, gap.end_ns) for gap in found] == [
+        (("camera",), 0, 20 * NS_PER_S),
+        (("thermometers.artifact",), 39 * NS_PER_S, 99 * NS_PER_S),
+    ]
+
+
+def test_slow_but_even_channels_and_single_readings_are_no_gaps():
+    assert silences({"linear.position": every(30, (0, 600)), "flap.position": np.array([5], np.int64)}) == []
+    assert silences({}) == []
+
+
+def test_a_folder_without_segments_is_no_session(tmp_path):
+    with pytest.raises(SessionError, match="not a session"):
+        verify(tmp_path)
+
+
+async def test_a_segment_of_another_session_is_told(session, tmp_path):
+    other = await recorded(tmp_path / "other")
+    data = (other / "frames" / "0001.mcap").read_bytes().replace(b"night-1", b"night-2")
+    (session / "frames" / "0001.mcap").write_bytes(data)
+    assert "error: frames/0001.mcap: tells of another session than the other segments" in errors(session)
