@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from drivers.interface import Frame, SessionError
 from stand.recording.messages import timestamp
-from stand.recording.png import PNG_PARAMETERS as PNG_PARAMETERS
 from stand.recording.png import ImageArray, decode_png, encode_png
 
 CAMERA_IMAGE = "/camera/image"

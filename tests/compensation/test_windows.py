@@ -88,7 +88,7 @@ def test_centres_from_a_partial_frame_are_those_of_the_whole_one(view, dtype, ga
     images = [photograph(one, render(one) * gain, seed, dtype) for seed, one in enumerate((scene, moved))]
     kept = partial(images)
     before = detect(images[0], PAPER)
-    # Tracked, only pixels of the windows are read. A search also looks at the surroundings, so the fit starts elsewhere.
+    # Tracked, only pixels of the windows are read. A search looks at the surroundings, too: the fit starts elsewhere.
     for previous, tolerance_px in ((before, 1e-6), (None, 1e-3)):
         found, expected = detect(kept, PAPER, previous), detect(images[1], PAPER, previous)
         assert not (expected.flags & Flag.MISSING).any()
