@@ -1,9 +1,11 @@
 """One MCAP segment of a series (frames or telemetry) of a session, written so that what is acknowledged survives.
 
-`NNNN.mcap.part` grows by whole blocks of records: one pwrite, one fdatasync, then it is acknowledged. A finished
-segment gets its index, is synced and renamed to `NNNN.mcap`. Metadata (`session`, `segment`) and attachments are the
-first records of every segment, so each is readable alone. Chunks have a CRC; a commit ends the chunk, so the frames
-series has one frame per chunk and the chunk index is its frame index.
+`NNNN.mcap.part` grows by whole blocks of records: one write, one fdatasync, then it is acknowledged. Its share of the
+disk is reserved when it is opened, so that a full disk refuses a new segment and not a frame. A finished segment gets
+its index, is synced and renamed to `NNNN.mcap`; one of many small chunks is written anew with large ones first.
+Metadata (`session`, `segment`) and attachments are the first records of every segment, so each is readable alone.
+Chunks have a CRC; a commit ends the chunk, so the frames series has one frame per chunk and the chunk index is its
+frame index.
 
 After any OSError the file is cut back to its last whole block and left as `.part`; its Writer is never used again,
 because its index would name chunks that were not written.
@@ -11,7 +13,6 @@ because its index would name chunks that were not written.
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -21,13 +22,18 @@ from typing import NamedTuple
 
 from google.protobuf.message import Message
 from mcap.well_known import MessageEncoding
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from mcap_protobuf.schema import register_schema
 
+from stand.recording.block import Block, chunk_writer
+from stand.recording.compaction import merge_chunks
 from stand.recording.layout import DEVICES, FINISHED, SEGMENT_METADATA, SESSION_METADATA, UNFINISHED
+from stand.recording.records import DAMAGE
 from stand.recording.sink import CommitSink, sync_folder
+from stand.recording.space import disk_space
 
-CHUNK_BYTES = 1024 * 1024
+MANY_CHUNKS = 32  # opening a chunk takes a reader as long as a dozen messages
+FILE_SYSTEM_BYTES = 1_000_000  # never reserved: the file system needs blocks of its own to hold a reserve
 
 
 class Record(NamedTuple):
@@ -50,7 +56,12 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class SeriesForm:
-    """What every segment of a series has in common."""
+    """What every segment of a series has in common.
+
+    A segment is full at `segment_bytes` or `segment_ns`. `reserve_bytes` of the disk are allocated when it is opened,
+    less where that would leave less than `keep_free_bytes`. `merge_chunks`: a finished segment of many small chunks
+    is written anew with large ones.
+    """
 
     name: str
     topics: tuple[Topic, ...]
@@ -59,25 +70,9 @@ class SeriesForm:
     attachments: Mapping[str, str]
     segment_bytes: int
     segment_ns: int
-
-
-class _Block(io.BytesIO):
-    """What the Writer has written since the last commit; `tell` is the place in the file."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._taken_bytes = 0
-
-    def tell(self) -> int:
-        return self._taken_bytes + super().tell()
-
-    def take(self) -> bytes:
-        """The bytes so far; the next ones begin a new block."""
-        block = self.getvalue()
-        self._taken_bytes += len(block)
-        self.seek(0)
-        self.truncate()
-        return block
+    reserve_bytes: int = 0
+    keep_free_bytes: int = 0
+    merge_chunks: bool = False
 
 
 class Segment:
@@ -85,33 +80,34 @@ class Segment:
 
     def __init__(self, folder: Path, number: int, form: SeriesForm, time_ns: int) -> None:
         self.begun_ns = time_ns
+        self._form = form
         self._part = folder / f"{number:04d}{UNFINISHED}"
         self._finished = folder / f"{number:04d}{FINISHED}"
-        self._block = _Block()
-        self._writer = Writer(self._block, chunk_size=CHUNK_BYTES, compression=form.compression)
-        self._sink = CommitSink(self._part)
-        self._opening_bytes = 0  # what stands before the first message
+        self._block = Block()
+        self._writer = chunk_writer(self._block, form.compression)
+        self._chunk_count = 0
+        self._sink = CommitSink(self._part, _affordable_bytes(folder, form))
         try:
             sync_folder(folder)
-            self._channels = self._begin(form, number)
+            self._channels = self._begin(number)
             self._sink.append(self._block.take())
         except OSError:
-            self.abandon()
+            self._remove()
             raise
-        self._opening_bytes = self._sink.committed_bytes
+        self._opening_bytes = self._sink.committed_bytes  # what stands before the first message
 
-    def _begin(self, form: SeriesForm, number: int) -> dict[str, int]:
+    def _begin(self, number: int) -> dict[str, int]:
         """Header, attachments, metadata; schemas and channels go into the first chunk. Returns topic -> channel id."""
         self._writer.start()
-        for name, text in form.attachments.items():
+        for name, text in self._form.attachments.items():
             media_type = "application/yaml" if name.endswith(".yaml") else "text/plain"
             self._writer.add_attachment(0, self.begun_ns, name, media_type, text.encode())
         previous = f"{number - 1:04d}" if number else ""
-        self._writer.add_metadata(SESSION_METADATA, dict(form.session))
+        self._writer.add_metadata(SESSION_METADATA, dict(self._form.session))
         self._writer.add_metadata(
-            SEGMENT_METADATA, {"series": form.name, "number": f"{number:04d}", "previous": previous}
+            SEGMENT_METADATA, {"series": self._form.name, "number": f"{number:04d}", "previous": previous}
         )
-        return {topic.name: self._register(topic) for topic in form.topics}
+        return {topic.name: self._register(topic) for topic in self._form.topics}
 
     def _register(self, topic: Topic) -> int:
         schema = register_schema(self._writer, topic.message)
@@ -126,24 +122,61 @@ class Segment:
             )
         self._writer.flush()
         self._sink.append(self._block.take())
+        self._chunk_count += 1
 
     @property
     def committed_bytes(self) -> int:
         """Size of the file."""
         return self._sink.committed_bytes
 
+    @property
+    def reserved_bytes(self) -> int:
+        """What of the reserve is not used yet."""
+        return self._sink.reserved_bytes
+
     def finish(self) -> None:
-        """Index, sync, rename: the segment is complete and stays so."""
+        """Index, sync, rename: the segment is complete and stays so. It is locked until it has its final name."""
         self._writer.finish()
         self._sink.append(self._block.take())
+        self._sink.settle()
+        if not (self._form.merge_chunks and self._chunk_count >= MANY_CHUNKS and self._merged()):
+            os.replace(self._part, self._finished)
+            sync_folder(self._part.parent)
         self._sink.close()
-        os.replace(self._part, self._finished)
-        sync_folder(self._part.parent)
+
+    def _merged(self) -> bool:
+        """Whether the finished segment is now the copy with large chunks; when the disk has no room for it, or gives
+        back other bytes than it took, the file stays as it was committed."""
+        try:
+            merge_chunks(self._part, self._finished, self._form.compression)
+        except DAMAGE:
+            return False
+        with suppress(OSError):  # the finished one counts where both are
+            self._part.unlink()
+        return True
 
     def abandon(self) -> None:
-        """Let go after an error: what was committed stays as `.part`; a file without a message is removed."""
+        """Let go after an error: what was committed stays as `.part`; a file without a message is removed. OSError
+        when the file cannot be cut back: as long as that lasts the block that failed may be in it."""
+        self._sink.settle()
+        if self._sink.committed_bytes > self._opening_bytes:
+            self.close()
+        else:
+            self._remove()
+
+    def close(self) -> None:
+        """Let go of the file as it is; may be called twice."""
+        self._sink.close()
+
+    def _remove(self) -> None:
         with suppress(OSError):
-            self._sink.close()
-        if self._sink.committed_bytes <= self._opening_bytes:
-            with suppress(OSError):
-                self._part.unlink()
+            self._part.unlink()
+        self.close()
+
+
+def _affordable_bytes(folder: Path, form: SeriesForm) -> int:
+    """What a segment may reserve here and now."""
+    if not form.reserve_bytes:
+        return 0
+    spare_bytes = disk_space(folder).free_bytes - max(form.keep_free_bytes, FILE_SYSTEM_BYTES)
+    return min(form.reserve_bytes, max(0, spare_bytes))

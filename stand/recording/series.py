@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from stand.recording.segment import Record, Segment, SeriesForm
+from stand.recording.sink import sync_folder
 
 
 class Series:
@@ -17,57 +19,96 @@ class Series:
         self._folder = folder
         self._form = form
         self._segment: Segment | None = None
+        self._failed: Segment | None = None  # given up, but not yet cut back to what was acknowledged
         self.troubles: deque[str] = deque()  # errors that were overcome, as sentences; another thread may take them
 
+    @property
+    def is_open(self) -> bool:
+        """Whether there is an open segment."""
+        return self._segment is not None
+
+    @property
+    def reserved_bytes(self) -> int:
+        """What the open segment has reserved and not yet used; any thread may ask."""
+        segment = self._segment
+        return 0 if segment is None else segment.reserved_bytes
+
     def open(self, time_ns: int) -> Segment:
-        """The open segment, begun when there is none; raises OSError."""
+        """The open segment, begun when there is none; raises OSError.
+
+        None is begun while the one before still holds a block that was refused: it would be in both.
+        """
         if self._segment is None:
+            self._let_go()
+            self._folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
+            sync_folder(self._folder.parent)
             self._segment = Segment(self._folder, next_number(self._folder), self._form, time_ns)
         return self._segment
 
     def commit(self, records: Sequence[Record], time_ns: int) -> None:
         """All of `records` on the disk when this returns, in a new segment when the present one is full or fails;
         OSError when the new one fails, too. `time_ns` (now) decides whether a segment is old enough to be closed."""
-        if self._is_full(time_ns):
-            self.finish()
+        self.finish_full(time_ns)
         try:
-            self._commit(records, time_ns)
+            self.open(time_ns).commit(records)
         except OSError as error:
-            self.troubles.append(f"a segment of {self._form.name} was given up ({error}); the next one was begun")
-            self._commit(records, time_ns)
+            if self._segment is None:  # there is no next one to go on with
+                raise
+            self._give_up(error)
+            self._commit_anew(records, time_ns)
 
-    def _commit(self, records: Sequence[Record], time_ns: int) -> None:
+    def _commit_anew(self, records: Sequence[Record], time_ns: int) -> None:
         segment = self.open(time_ns)
         try:
             segment.commit(records)
-        except OSError:
-            segment.abandon()
-            self._segment = None
+        except OSError as error:
+            self._give_up(error)
             raise
 
-    def _is_full(self, time_ns: int) -> bool:
-        segment = self._segment
-        return segment is not None and (
-            segment.committed_bytes >= self._form.segment_bytes or time_ns - segment.begun_ns >= self._form.segment_ns
-        )
+    def _give_up(self, error: OSError) -> None:
+        self.troubles.append(f"a segment of {self._form.name} was given up ({error})")
+        self._failed, self._segment = self._segment, None
+        with suppress(OSError):  # tried again before the next segment
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Cut the segment that failed back and close it; OSError while the disk does not allow it."""
+        if self._failed is not None:
+            self._failed.abandon()
+            self._failed = None
+
+    def finish_full(self, time_ns: int) -> None:
+        """Close the open segment when it has its size or age."""
+        segment, form = self._segment, self._form
+        if segment is None:
+            return
+        if segment.committed_bytes >= form.segment_bytes or time_ns - segment.begun_ns >= form.segment_ns:
+            self.finish()
 
     def finish(self) -> bool:
         """Close the open segment, if any; False when it cannot be finished: it stays `.part`, and that is a trouble."""
         segment, self._segment = self._segment, None
-        if segment is None:
-            return True
         try:
-            segment.finish()
+            self._let_go()
+            if segment is not None:
+                segment.finish()
         except OSError as error:
-            segment.abandon()
             self.troubles.append(f"a segment of {self._form.name} stays unfinished ({error})")
+            self._close(segment)
             return False
         return True
 
+    def _close(self, unfinished: Segment | None) -> None:
+        """The last try to cut back what failed, then close it as it is: nothing of it is written elsewhere later."""
+        failed, self._failed = self._failed, None
+        for segment in (failed, unfinished):
+            if segment is not None:
+                with suppress(OSError):
+                    segment.abandon()
+                segment.close()
+
 
 def next_number(folder: Path) -> int:
-    """The number after the highest segment in `folder`, finished or not; 0 in an empty one."""
-    numbers = [
-        int(match[1]) for path in folder.iterdir() if (match := re.fullmatch(r"(\d{4,})\.mcap(\.part)?", path.name))
-    ]
+    """The number after the highest segment in `folder`, finished or not, damaged or half copied; 0 in an empty one."""
+    numbers = [int(match[1]) for path in folder.iterdir() if (match := re.match(r"(\d{4,})\.mcap", path.name))]
     return max(numbers, default=-1) + 1

@@ -203,19 +203,19 @@ async def test_frames_beyond_the_queue_are_dropped_counted_and_told(tmp_path):
     assert session.frame_count == 20
     (event,) = session.events()
     assert (event.level, event.kind) == ("error", "frames_dropped")
-    assert event.text == "frames lost: 10 (blocks 20 to 29), 10 in all; the disk is too slow"
+    assert event.text == "frames lost: 10 (blocks 20 to 29 of step capture-1), 10 in all; the disk is too slow"
 
 
 def test_a_block_the_disk_refuses_is_cut_off_again(tmp_path, files_limited):
     at = files_limited(1500, {1})
     sink = CommitSink(tmp_path / "file")
-    sink.append(b"a" * 1000)
+    sink.append([b"a" * 1000])
     at(1)
     with pytest.raises(OSError, match="too large"):
-        sink.append(b"b" * 1000)
+        sink.append([b"b" * 1000])
     at(2)
     assert (tmp_path / "file").read_bytes() == b"a" * 1000
-    sink.append(b"c" * 10)
+    sink.append([b"c" * 10])
     sink.close()
     assert (tmp_path / "file").read_bytes() == b"a" * 1000 + b"c" * 10
 
@@ -265,7 +265,7 @@ async def test_a_frame_the_disk_refuses_is_told_and_telemetry_goes_on(tmp_path, 
 
     events = await record(tmp_path / "s", 4, items=items, between=files_limited(30_000, range(4)))
     (told,) = [event.text for event in events if event.kind == "frames_dropped"]
-    assert told.startswith("frames lost: 1 (blocks 1 to 1), 1 in all; [Errno 27]")
+    assert told.startswith("frames lost: 1 (block 1 of step capture-1), 1 in all; [Errno 27]")
     session = Session.open(tmp_path / "s")
     assert len([event for event in session.events() if event.kind == "note"]) == 4
     assert [got.block_id for got in session.frames()] == [2, 3]  # block 0 waits in the part that was given up
