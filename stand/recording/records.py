@@ -1,33 +1,30 @@
 """A segment's bytes back to messages: what stand/recording/segment.py wrote, read strictly.
 
-Telemetry is walked front to back by its record headers, each chunk's CRC checked (the mcap package's own walk costs
-several times as much); frames are found through the chunk index. Anything wrong is a SessionError that names the file.
+Nothing is taken from where no CRC covers it, unless the file tells it twice: the index has a CRC and says where each
+chunk is, how long, between which instants and how many messages of each channel there are; each chunk's content has
+one, too. Anything wrong is a SessionError that names the file.
 """
 
 from __future__ import annotations
 
-import io
 import struct
-import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Container, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, ChunkIndex, Metadata, Schema, Statistics
-from mcap.summary import Summary
+from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from drivers.interface import SessionError
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
 from stand.recording.layout import SESSION_METADATA
 from stand.recording.messages import CLASSES
+from stand.recording.summary import CRC, RECORD, ChunkPlace, Summary, check_crc, read_summary, records, stream
 
 # What reading damaged bytes raises; CRC and Unicode errors are ValueErrors.
 DAMAGE = (McapError, OSError, struct.error, zstandard.ZstdError, ValueError, LookupError, EOFError, MemoryError)
@@ -37,12 +34,13 @@ SCHEMAS = {
     **{topic: {message.DESCRIPTOR.full_name} for topic, message in CLASSES.items()},
 }
 
-_RECORD = struct.Struct("<BQ")  # opcode, length
-_CHUNK = struct.Struct("<QQQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
+_CHUNK = struct.Struct("<qqQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
 _DATA_LENGTH = struct.Struct("<Q")
-_MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
-_FOOTER = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, begin of its offsets; a CRC follows
-_CRC = struct.Struct("<I")
+_MESSAGE_START = struct.Struct("<BQH")  # opcode, length, channel id
+_MESSAGE_REST = struct.Struct("<Iqq")  # sequence, log time, publish time; signed, as every instant of ours
+_HEADER_BYTES = RECORD.size
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)
+_MESSAGE_BYTES = _MESSAGE_START.size + _MESSAGE_REST.size  # with the record's header
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,140 +63,138 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class FramePlace:
-    """Where a frame is: its segment, its chunk there, and the schema of its message."""
+    """Where a frame is: its segment, its chunk there, and number and schema of its channel."""
 
-    time_ns: int
     path: Path
-    offset: int
-    length: int
+    chunk: ChunkPlace
+    channel: int
     schema: str
+
+    @property
+    def time_ns(self) -> int:
+        """Middle of the frame's exposure."""
+        return self.chunk.first_ns
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSpan:
+    """How many frames a segment has, and the times of the first and the last."""
+
+    count: int
+    first_ns: int
+    last_ns: int
 
 
 @contextmanager
-def _reading(path: Path) -> Generator[None]:
+def reading(path: Path) -> Generator[None]:
     """Whatever damage raises inside becomes a SessionError that names the file."""
     try:
         yield
     except DAMAGE as error:
-        raise SessionError(f"{path}: damaged or not readable ({type(error).__name__}: {error})") from error
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        raise SessionError(f"{path}: damaged or not readable ({text})") from error
+
+
+@contextmanager
+def naming(path: Path) -> Generator[None]:
+    """A SessionError from inside gets the file's name in front."""
+    try:
+        yield
+    except SessionError as error:
+        raise SessionError(f"{path}: {error}") from error
 
 
 def read_head(path: Path) -> Head:
     """Metadata `session` and the attachments of a finished segment."""
-    with _reading(path), path.open("rb") as file:
-        size = path.stat().st_size
-        _check_ends(path, file, size)
-        return _head(path, file, size)
+    with reading(path), path.open("rb") as file:
+        summary = _open(path, file)
+        head = _head(path, file)
+        if len(head.attachments) != summary.statistics.attachment_count:
+            raise ValueError("its attachments are not those its index tells of")
+        return head
 
 
-def _check_ends(path: Path, file: BinaryIO, size: int) -> None:
-    """Magic bytes at both ends; the file is left behind the first."""
+def _open(path: Path, file: BinaryIO) -> Summary:
+    """The summary of a finished segment; the file is left behind the magic bytes at its begin."""
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise SessionError(f"{path}: not an MCAP file")
+    size = path.stat().st_size
     file.seek(max(len(MCAP0_MAGIC), size - len(MCAP0_MAGIC)))
     if file.read() != MCAP0_MAGIC:
         raise SessionError(f"{path}: ends in the middle")
+    summary = read_summary(file, size)
     file.seek(len(MCAP0_MAGIC))
+    return summary
 
 
-def _head(path: Path, file: BinaryIO, size: int) -> Head:
+def _head(path: Path, file: BinaryIO) -> Head:
+    size = path.stat().st_size
     session: dict[str, str] | None = None
     attachments: dict[str, str] = {}
     while True:
-        opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+        opcode, length = RECORD.unpack(file.read(RECORD.size))
         if opcode not in (Opcode.HEADER, Opcode.ATTACHMENT, Opcode.METADATA):
             break
         content = file.read(min(length, size))
         if opcode == Opcode.ATTACHMENT:
-            _check_crc(content[: -_CRC.size], *_CRC.unpack(content[-_CRC.size :]))
-            attachment = Attachment.read(_stream(content))
+            check_crc(content[: -CRC.size], *CRC.unpack(content[-CRC.size :]))
+            attachment = Attachment.read(stream(content))
             attachments[attachment.name] = attachment.data.decode()
         elif opcode == Opcode.METADATA:
-            metadata = Metadata.read(_stream(content))
+            metadata = Metadata.read(stream(content))
             session = metadata.metadata if metadata.name == SESSION_METADATA else session
     if session is None:
         raise SessionError(f"{path}: not a segment of a thermostand session")
     return Head(session, attachments)
 
 
-def _check_crc(data: bytes | memoryview, crc: int) -> None:
-    if zlib.crc32(data) != crc:
-        raise ValueError("a CRC is wrong")
-
-
-def _stream(data: bytes | memoryview) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(data))
-
-
-class _Walk:
-    """The walk through one telemetry segment, which learns its schemas and channels on the way."""
-
-    def __init__(self, wanted: Callable[[Channel], bool]) -> None:
-        self._wanted = wanted
-        self._schemas: dict[int, str] = {}
-        self._topics: dict[int, str] = {}  # of the wanted channels
-        self.message_count = 0  # wanted or not
-
-    def messages(self, chunk: memoryview) -> Iterator[Message]:
-        """The wanted messages of a chunk."""
-        for opcode, record in _records(_uncompressed(chunk)):
-            if opcode == Opcode.MESSAGE:
-                self.message_count += 1
-                number, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
-                if number in self._topics:
-                    yield Message(self._topics[number], sequence, time_ns, bytes(record[_MESSAGE.size :]))
-            elif opcode == Opcode.SCHEMA:
-                schema = Schema.read(_stream(record))
-                self._schemas[schema.id] = schema.name
-            elif opcode == Opcode.CHANNEL:
-                self._learn(Channel.read(_stream(record)))
-
-    def _learn(self, channel: Channel) -> None:
-        _check_schema(channel.topic, self._schemas[channel.schema_id])
-        if self._wanted(channel):
-            self._topics[channel.id] = channel.topic
-
-
 def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
     """The messages of the wanted channels of a telemetry segment, in the order of the file."""
-    with _reading(path):
-        walk = _Walk(wanted)
-        for opcode, content in _records(memoryview(path.read_bytes())[len(MCAP0_MAGIC) : -len(MCAP0_MAGIC)]):
-            if opcode == Opcode.CHUNK:
-                yield from walk.messages(content)
-            elif opcode == Opcode.STATISTICS:
-                if Statistics.read(_stream(content)).message_count != walk.message_count:
-                    break
-                return
-        raise SessionError(f"{path}: does not hold the messages its index tells of")
+    with reading(path), path.open("rb") as file:
+        summary = _open(path, file)
+        topics = {number: channel.topic for number, channel in _channels(summary) if wanted(channel)}
+        counts = dict.fromkeys(topics, 0)
+        for place in summary.chunks():
+            if topics.keys().isdisjoint(place.channels):
+                continue
+            chunk = _chunk(file, place)
+            for number, offset, end in _message_places(chunk, topics):
+                counts[number] += 1
+                yield _message(topics[number], chunk, offset, end)
+        if counts != {number: summary.message_counts.get(number, 0) for number in topics}:
+            raise ValueError("it does not hold the messages its index tells of")
 
 
-def _check_schema(topic: str, schema: str) -> None:
-    """ValueError when a topic of ours holds messages that are not."""
-    if topic in SCHEMAS and schema not in SCHEMAS[topic]:
-        raise ValueError(f"{topic} holds {schema}, not {' or '.join(sorted(SCHEMAS[topic]))}")
+def _channels(summary: Summary) -> Iterator[tuple[int, Channel]]:
+    """The channels and their numbers; ValueError when a topic of ours holds messages that are not."""
+    for number, channel in summary.channels.items():
+        known, schema = SCHEMAS.get(channel.topic), summary.schemas[channel.schema_id]
+        if known is not None and schema not in known:
+            raise ValueError(f"{channel.topic} holds {schema}, not {' or '.join(sorted(known))}")
+        yield number, channel
 
 
-def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, content) of each record; struct.error when the last one is cut."""
-    offset = 0
-    while offset < len(data):
-        opcode, length = _RECORD.unpack_from(data, offset)
-        offset += _RECORD.size
-        if length > len(data) - offset:
-            raise struct.error("a record is cut short")
-        yield opcode, data[offset : offset + length]
-        offset += length
+def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
+    """The records of the chunk at that place, their CRC checked."""
+    if place.length > CHUNK_LIMIT_BYTES:
+        raise ValueError(f"a chunk of {place.length} bytes")
+    file.seek(place.offset)
+    ((opcode, chunk),) = records(memoryview(file.read(place.length)))
+    if opcode != Opcode.CHUNK:
+        raise ValueError("the index does not point to a chunk")
+    first_ns, last_ns, size, crc, name_bytes = _CHUNK.unpack_from(chunk)
+    if (first_ns, last_ns) != (place.first_ns, place.last_ns):
+        raise ValueError("the index points to another chunk")
+    name_end = _CHUNK.size + name_bytes
+    data = _uncompressed(bytes(chunk[_CHUNK.size : name_end]), chunk[name_end + _DATA_LENGTH.size :], size)
+    check_crc(data, crc)
+    return data
 
 
-def _uncompressed(chunk: memoryview) -> memoryview:
-    """The records of a chunk, its CRC checked."""
-    _, _, size, crc, name_length = _CHUNK.unpack_from(chunk)
+def _uncompressed(compression: bytes, data: memoryview, size: int) -> memoryview:
+    """The content of a chunk that says it has that size."""
     if size > CHUNK_LIMIT_BYTES:
         raise ValueError(f"a chunk of {size} bytes")
-    name_end = _CHUNK.size + name_length
-    compression = bytes(chunk[_CHUNK.size : name_end])
-    data = chunk[name_end + _DATA_LENGTH.size :]
     if compression == b"zstd":
         if zstandard.frame_content_size(data) != size:  # else a damaged size would be allocated as told
             raise ValueError("a chunk's size is wrong")
@@ -207,52 +203,52 @@ def _uncompressed(chunk: memoryview) -> memoryview:
         raise ValueError(f"a chunk compressed with {compression!r}")
     if len(data) != size:
         raise ValueError("a chunk's size is wrong")
-    _check_crc(data, crc)
     return data
 
 
+def _message_places(chunk: memoryview, wanted: Container[int]) -> list[tuple[int, int, int]]:
+    """(channel id, offset, end) of each message record of the wanted channels in a chunk."""
+    # Every record of a night passes here, so the loop has no call but one.
+    unpack = _MESSAGE_START.unpack_from
+    found: list[tuple[int, int, int]] = []
+    offset, size = 0, len(chunk)
+    while offset < size:
+        opcode, length, number = unpack(chunk, offset)
+        end = offset + _HEADER_BYTES + length
+        if number in wanted and opcode == _MESSAGE_OPCODE:
+            found.append((number, offset, end))
+        offset = end
+    if offset != size:
+        raise struct.error("a record is cut short")
+    return found
+
+
+def _message(topic: str, chunk: memoryview, offset: int, end: int) -> Message:
+    sequence, time_ns, _ = _MESSAGE_REST.unpack_from(chunk, offset + _MESSAGE_START.size)
+    return Message(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]))
+
+
+def frame_span(path: Path) -> FrameSpan:
+    """How many frames a segment has and when, from its statistics alone."""
+    with reading(path), path.open("rb") as file:
+        statistics = _open(path, file).statistics
+        return FrameSpan(statistics.message_count, statistics.message_start_time, statistics.message_end_time)
+
+
 def frame_places(path: Path) -> list[FramePlace]:
-    """The frames of a segment, from its chunk index alone."""
-    with _reading(path), path.open("rb") as file:
-        _check_summary(file, path.stat().st_size)
-        file.seek(0)
-        summary = SeekingReader(file, record_size_limit=path.stat().st_size).get_summary()
-        if summary is None or summary.statistics is None:
-            raise SessionError(f"{path}: has no index")
-        if summary.statistics.message_count != len(summary.chunk_indexes):
-            raise SessionError(f"{path}: its chunks are not one frame each")
-        return [_place(path, summary, index) for index in summary.chunk_indexes]
-
-
-def _check_summary(file: BinaryIO, size: int) -> None:
-    """ValueError when the index at the end of the file is damaged: its CRC covers it and the footer before the CRC."""
-    footer_bytes = _FOOTER.size + _CRC.size + len(MCAP0_MAGIC)
-    file.seek(max(0, size - footer_bytes))
-    _, _, begin, _ = _FOOTER.unpack(file.read(_FOOTER.size))
-    (crc,) = _CRC.unpack(file.read(_CRC.size))
-    if not len(MCAP0_MAGIC) <= begin <= size - footer_bytes:
-        raise ValueError("the index is not in the file")
-    file.seek(begin)
-    _check_crc(file.read(size - footer_bytes + _FOOTER.size - begin), crc)
-
-
-def _place(path: Path, summary: Summary, index: ChunkIndex) -> FramePlace:
-    (number,) = index.message_index_offsets
-    channel = summary.channels[number]
-    schema = summary.schemas[channel.schema_id].name
-    _check_schema(CAMERA_IMAGE, schema)
-    return FramePlace(index.message_start_time, path, index.chunk_start_offset, index.chunk_length, schema)
+    """The frames of a segment, from its index alone."""
+    with reading(path), path.open("rb") as file:
+        summary = _open(path, file)
+        schemas = {number: summary.schemas[channel.schema_id] for number, channel in _channels(summary)}
+        places = [FramePlace(path, chunk, chunk.channels[0], schemas[chunk.channels[0]]) for chunk in summary.chunks()]
+        if summary.statistics.message_count != len(places):
+            raise ValueError("its chunks are not one frame each")
+        return places
 
 
 def read_frame(place: FramePlace) -> Message:
     """The image message at its place."""
-    with _reading(place.path), place.path.open("rb") as file:
-        if place.length > CHUNK_LIMIT_BYTES:
-            raise ValueError(f"a chunk of {place.length} bytes")
-        file.seek(place.offset)
-        ((opcode, chunk),) = _records(memoryview(file.read(place.length)))
-        if opcode != Opcode.CHUNK:
-            raise ValueError("the index does not point to a chunk")
-        (record,) = (record for opcode, record in _records(_uncompressed(chunk)) if opcode == Opcode.MESSAGE)
-        _, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
-        return Message(CAMERA_IMAGE, sequence, time_ns, bytes(record[_MESSAGE.size :]))
+    with reading(place.path), place.path.open("rb") as file:
+        chunk = _chunk(file, place.chunk)
+        ((_, offset, end),) = _message_places(chunk, (place.channel,))
+        return _message(CAMERA_IMAGE, chunk, offset, end)

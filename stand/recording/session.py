@@ -6,14 +6,16 @@ wrong with a session is a SessionError with a sentence.
 
 from __future__ import annotations
 
-from array import array
+from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate, chain, pairwise
 from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
+from typing import TypeVar
 
 import numpy as np
 from mcap.records import Channel
@@ -22,11 +24,22 @@ from numpy.typing import NDArray
 from drivers.interface import Frame, SessionError
 from stand.hub import Batch, Event, Item, StepMark
 from stand.recording import messages
+from stand.recording.columns import Column, TopicColumns
 from stand.recording.images import decode_image
 from stand.recording.layout import DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED
-from stand.recording.records import FramePlace, Message, frame_places, read_frame, read_head, telemetry_messages
+from stand.recording.records import (
+    FramePlace,
+    FrameSpan,
+    Message,
+    frame_places,
+    frame_span,
+    naming,
+    read_frame,
+    read_head,
+    telemetry_messages,
+)
 
-Column = tuple[NDArray[np.int64], NDArray[np.float64]]
+T = TypeVar("T")
 
 DAMAGED = FINISHED + ".damaged"  # the original of a segment from which a salvage could not take everything
 
@@ -34,13 +47,15 @@ DAMAGED = FINISHED + ".damaged"  # the original of a segment from which a salvag
 @dataclass(frozen=True, slots=True)
 class RecordedImage:
     """An image as it was recorded: `data` is a message of `schema`, for decode_image; `meta` is the frame's
-    description, None when it did not reach the disk. `sequence` is the low 32 bits of the frame's block id."""
+    description, None when it did not reach the disk. `sequence` is the low 32 bits of the frame's block id, `path` the
+    segment it was read from."""
 
     schema: str
     data: bytes
     sequence: int
     time_ns: int
     meta: messages.FrameMeta | None
+    path: Path
 
 
 class Session:
@@ -53,13 +68,15 @@ class Session:
         self.damaged = _files_of(path, DAMAGED)
         self._telemetry = telemetry
         self._frames = frames
-        heads = [read_head(segment) for segment in telemetry + frames]
-        self.metadata = heads[0].session
-        self._attachments = heads[0].attachments
-        for segment, head in zip(telemetry + frames, heads, strict=True):
-            if head.session != self.metadata:
-                raise SessionError(f"{segment}: belongs to another session than {telemetry[0]}")
-        self._readings: dict[str, dict[str, Column]] = {}  # topic -> channel -> column
+        head = read_head(telemetry[0])
+        self.metadata = head.session
+        self._attachments = head.attachments
+        self._checked = {telemetry[0]}  # the segments known to belong to this session
+        for segment in frames[:1]:
+            self._check(segment)  # metadata has no CRC, but a second copy there
+        self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
+        self._all_columns_read = False
+        self._places_of: dict[Path, list[FramePlace]] = {}
 
     @classmethod
     def open(cls, path: Path) -> Session:
@@ -72,11 +89,6 @@ class Session:
         return cls(path, telemetry, frames)
 
     @property
-    def segments(self) -> tuple[Path, ...]:
-        """The finished segments, those of the telemetry first."""
-        return (*self._telemetry, *self._frames)
-
-    @property
     def attachments(self) -> Mapping[str, str]:
         """The attached files: name -> text."""
         return MappingProxyType(self._attachments)
@@ -85,67 +97,85 @@ class Session:
         """The text of an attached file (`config.yaml`), None when there is none of that name."""
         return self._attachments.get(name)
 
+    @property
+    def segments(self) -> tuple[Path, ...]:
+        """The finished segments, those of the telemetry first."""
+        return (*self._telemetry, *self._frames)
+
     def channels(self) -> list[str]:
         """The channels that have readings, sorted."""
-        self._load(lambda channel: channel.topic in messages.KIND_OF_TOPIC)
-        return sorted({name for topic in self._readings.values() for name in topic})
+        return sorted(self._all_columns())
 
     def readings(self, channel: str) -> Column:
         """(time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD. SessionError when the
         session has no such channel."""
-        if (found := self._read_before(channel)) is not None:
-            return found
         device = channel.partition(".")[0]
-        self._load(lambda known: device in known.metadata.get(DEVICES, "").split(","))
-        if (found := self._read_before(channel)) is not None:
-            return found
-        raise SessionError(f"{self.path}: has no channel {channel}; there are {', '.join(self.channels())}")
+        if device not in self._columns and not self._all_columns_read:
+            self._columns[device] = self._read_columns(device).get(device, {})
+        found = self._columns.get(device, {}).get(channel) or self._all_columns().get(channel)
+        if found is None:
+            raise SessionError(f"{self.path}: has no channel {channel}; there are {', '.join(self.channels())}")
+        return found
 
-    def _read_before(self, channel: str) -> Column | None:
-        return next((topic[channel] for topic in self._readings.values() if channel in topic), None)
+    def _all_columns(self) -> dict[str, Column]:
+        if not self._all_columns_read:
+            self._columns = self._read_columns(None)
+            self._all_columns_read = True
+        return {channel: column for columns in self._columns.values() for channel, column in columns.items()}
 
-    def _load(self, wanted: Callable[[Channel], bool]) -> None:
-        """Read the wanted topics that have not been read yet."""
-        columns: dict[str, dict[str, tuple[array[int], array[float]]]] = {}
-        known = set(self._readings)
+    def _read_columns(self, device: str | None) -> dict[str, dict[str, Column]]:
+        """Device -> channel -> column of the topics that `device` publishes on (None: of all); whoever shares them is
+        among the devices, but only where it shares them."""
+        topics: dict[str, TopicColumns] = {}
 
-        def is_new(channel: Channel) -> bool:
-            return channel.topic in messages.KIND_OF_TOPIC and channel.topic not in known and wanted(channel)
+        def is_wanted(channel: Channel) -> bool:
+            devices = channel.metadata.get(DEVICES, "").split(",")
+            return channel.topic in messages.KIND_OF_TOPIC and (device is None or device in devices)
 
-        for message in self._messages(is_new):
-            topic = columns.setdefault(message.topic, {})
-            for reading in messages.decode_batch(message.topic, message.data, message.time_ns).readings:
-                times_ns, values = topic.setdefault(reading.channel, (array("q"), array("d")))
-                times_ns.append(reading.time_ns)
-                values.append(reading.value)
-        for name, topic in columns.items():
-            self._readings[name] = {channel: _sorted(*column) for channel, column in topic.items()}
+        def add(message: Message) -> None:
+            if message.topic not in topics:
+                topics[message.topic] = TopicColumns(message.topic)
+            topics[message.topic].add(message.data, message.time_ns)
+
+        for _ in self._decoded(is_wanted, add):
+            pass
+        columns: dict[str, dict[str, Column]] = {}
+        for topic in topics.values():
+            with naming(self.path / TELEMETRY):
+                for name, of_device in topic.columns().items():
+                    columns.setdefault(name, {}).update(of_device)
+        return columns
 
     def steps(self) -> list[StepMark]:
         """Every step mark, in order of time."""
-        found = self._messages(lambda channel: channel.topic == messages.STEP)
-        return sorted(map(_step, found), key=attrgetter("time_ns"))
+        found = self._decoded(lambda channel: channel.topic == messages.STEP, _step)
+        return sorted(found, key=attrgetter("time_ns"))
 
     def events(self) -> list[Event]:
         """Every event, in order of time."""
-        found = self._messages(lambda channel: channel.topic == messages.EVENT)
-        return sorted(map(_event, found), key=attrgetter("time_ns"))
+        found = self._decoded(lambda channel: channel.topic == messages.EVENT, _event)
+        return sorted(found, key=attrgetter("time_ns"))
 
     @property
     def frame_count(self) -> int:
         """How many frames were recorded."""
-        return len(self._places)
+        return sum(span.count for span in self._spans)
 
     @property
     def frame_times_ns(self) -> NDArray[np.int64]:
         """Middle of the exposure of each frame, shape (frame_count,), ascending."""
-        return np.array([place.time_ns for place in self._places], np.int64)
+        return np.array([place.time_ns for place in self._places()], np.int64)
 
     def frame(self, index: int) -> Frame:
         """The frame of that index, counted from 0 in order of time; SessionError when there is none."""
         if not 0 <= index < self.frame_count:
             raise SessionError(f"{self.path}: has no frame {index}; it has {self.frame_count}, counted from 0")
-        return _frame(self._image(self._places[index]))
+        if not self._is_in_order:
+            return _frame(self._image(self._sorted_places[index]))
+        ends = list(accumulate(span.count for span in self._spans))
+        number = bisect_right(ends, index)
+        places = self._places_in(self._frames[number])
+        return _frame(self._image(places[index - ends[number]]))  # counted from the segment's end
 
     def frames(self) -> Iterator[Frame]:
         """The frames in order of time, each read and decoded when asked for. A frame whose description did not reach
@@ -154,7 +184,7 @@ class Session:
 
     def images(self) -> Iterator[RecordedImage]:
         """The images in order of time as they were recorded, each read when asked for and not decoded."""
-        return map(self._image, self._places)
+        return map(self._image, self._places())
 
     def items(self) -> Iterator[Item]:
         """Every batch, frame, step mark and event in the order of their publication, each read when asked for.
@@ -162,24 +192,46 @@ class Session:
         A frame's place in that order is that of its description; a frame whose description is lost comes in order of
         time. Publishing the items to a recorder gives the same messages again.
         """
-        images = _ImagesToCome(self._places, self._descriptions, self._image)
-        for message in self._messages(_stands_for_item):
+        images = _ImagesToCome(self._places(), self._descriptions, self._image)
+        for message, item in self._decoded(_stands_for_item, lambda message: (message, _item(message))):
             yield from map(_frame, images.undescribed_before(message.time_ns))
-            if message.topic == messages.CAMERA_META:
+            if item is None:
                 yield from map(_frame, images.described_by(message))
             else:
-                yield ITEM_OF_TOPIC[message.topic](message)
+                yield item
         yield from map(_frame, images.undescribed_before(None))
 
     def _image(self, place: FramePlace) -> RecordedImage:
         message = read_frame(place)
         meta = self._metas.get((message.time_ns, message.sequence))
-        return RecordedImage(place.schema, message.data, message.sequence, message.time_ns, meta)
+        return RecordedImage(place.schema, message.data, message.sequence, message.time_ns, meta, place.path)
 
     @cached_property
-    def _places(self) -> list[FramePlace]:
-        places = [place for path in self._frames for place in frame_places(path)]
-        return sorted(places, key=attrgetter("time_ns"))
+    def _spans(self) -> list[FrameSpan]:
+        return [frame_span(path) for path in self._frames]
+
+    @cached_property
+    def _is_in_order(self) -> bool:
+        """Whether each segment's frames are all later than those before: then one frame needs one segment's index."""
+        spans = [span for span in self._spans if span.count]
+        return all(earlier.last_ns <= later.first_ns for earlier, later in pairwise(spans))
+
+    def _places(self) -> Iterator[FramePlace]:
+        """The frames in order of time."""
+        if self._is_in_order:
+            return chain.from_iterable(map(self._places_in, self._frames))
+        return iter(self._sorted_places)
+
+    @cached_property
+    def _sorted_places(self) -> list[FramePlace]:
+        return sorted(chain.from_iterable(map(self._places_in, self._frames)), key=attrgetter("time_ns"))
+
+    def _places_in(self, segment: Path) -> list[FramePlace]:
+        """The frames of one segment in order of time."""
+        if segment not in self._places_of:
+            self._check(segment)
+            self._places_of[segment] = sorted(frame_places(segment), key=attrgetter("time_ns"))
+        return self._places_of[segment]
 
     @property
     def frame_metas(self) -> list[tuple[int, messages.FrameMeta]]:
@@ -188,17 +240,29 @@ class Session:
 
     @cached_property
     def _descriptions(self) -> list[_Description]:
-        found = self._messages(lambda channel: channel.topic == messages.CAMERA_META)
-        return [_Description(m.time_ns, m.sequence, messages.decode_frame_meta(m.data)) for m in found]
+        return list(self._decoded(lambda channel: channel.topic == messages.CAMERA_META, _description))
 
     @cached_property
     def _metas(self) -> dict[tuple[int, int], messages.FrameMeta]:
         return {(known.time_ns, known.sequence): known.meta for known in self._descriptions}
 
-    def _messages(self, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
-        """The telemetry of the wanted channels in the order of the files."""
+    def _decoded(self, wanted: Callable[[Channel], bool], decode: Callable[[Message], T]) -> Iterator[T]:
+        """The telemetry of the wanted channels in the order of the files, each message decoded."""
         for path in self._telemetry:
-            yield from telemetry_messages(path, wanted)
+            self._check(path)
+            for message in telemetry_messages(path, wanted):
+                try:
+                    item = decode(message)
+                except SessionError as error:
+                    raise SessionError(f"{path}: {error}") from error
+                yield item
+
+    def _check(self, segment: Path) -> None:
+        """SessionError when the segment is not of this session."""
+        if segment not in self._checked:
+            if read_head(segment).session != self.metadata:
+                raise SessionError(f"{segment}: belongs to another session than {self._telemetry[0]}")
+            self._checked.add(segment)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,10 +310,6 @@ class _ImagesToCome:
             yield from map(self._read, self._places.pop(message.time_ns, []))
 
 
-def _batch(message: Message) -> Batch:
-    return messages.decode_batch(message.topic, message.data, message.time_ns)
-
-
 def _step(message: Message) -> StepMark:
     return messages.decode_step(message.data, message.time_ns)
 
@@ -258,20 +318,31 @@ def _event(message: Message) -> Event:
     return messages.decode_event(message.data, message.time_ns)
 
 
-# The topics that stand for items of their own; the recorder derives the log and the table's pose from these.
-ITEM_OF_TOPIC: Mapping[str, Callable[[Message], Item]] = {
-    **dict.fromkeys(messages.KIND_OF_TOPIC, _batch),
-    messages.STEP: _step,
-    messages.EVENT: _event,
-}
+def _description(message: Message) -> _Description:
+    return _Description(message.time_ns, message.sequence, messages.decode_frame_meta(message.data))
 
 
 def _stands_for_item(channel: Channel) -> bool:
-    return channel.topic in ITEM_OF_TOPIC or channel.topic == messages.CAMERA_META
+    """The log and the table's pose do not: the recorder derives them from events and batches."""
+    return channel.topic in {*messages.KIND_OF_TOPIC, messages.STEP, messages.EVENT, messages.CAMERA_META}
+
+
+def _item(message: Message) -> Batch | StepMark | Event | None:
+    """The item that a message stands for; None when that is a frame."""
+    match message.topic:
+        case messages.STEP:
+            return _step(message)
+        case messages.EVENT:
+            return _event(message)
+        case messages.CAMERA_META:
+            return None
+        case topic:
+            return messages.decode_batch(topic, message.data, message.time_ns)
 
 
 def _frame(recorded: RecordedImage) -> Frame:
-    image = decode_image(recorded.schema, recorded.data)
+    with naming(recorded.path):
+        image = decode_image(recorded.schema, recorded.data)
     meta = recorded.meta or _unknown(image.channel, recorded.sequence)
     return Frame(
         channel=image.channel,
@@ -290,12 +361,6 @@ def _frame(recorded: RecordedImage) -> Frame:
 
 def _unknown(channel: str, block_id: int) -> messages.FrameMeta:
     return messages.FrameMeta(channel, "", block_id, 0, np.nan, np.nan, np.nan, 0)
-
-
-def _sorted(times_ns: array[int], values: array[float]) -> Column:
-    times = np.array(times_ns, np.int64)
-    order = np.argsort(times, kind="stable")
-    return times[order], np.array(values, np.float64)[order]
 
 
 def _files_of(path: Path, suffix: str) -> tuple[Path, ...]:
