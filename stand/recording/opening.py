@@ -63,22 +63,22 @@ def opening_of(path: Path, own: Survey) -> Opening | None:
     return Opening(session, attachments, schemas, channels)
 
 
-def _siblings(path: Path) -> Iterator[_Sibling]:
-    """The nearest other segments of the session, each read to its first chunk."""
-    number = _number(path)
-    for series in (path.parent.parent / TELEMETRY, path.parent.parent / FRAMES):
-        segments = [other for other in _segments(series) if other != path]
-        segments.sort(key=lambda other: (abs(_number(other) - number), other.name))
-        for other in segments[:SIBLINGS_PER_SERIES]:
-            with suppress(OSError):  # what cannot be read does not help
-                yield _Sibling(other, _read_opening(other))
-
-
-def _segments(series: Path) -> list[Path]:
+def segments_of(series: Path) -> list[Path]:
     """The finished and unfinished segments in a folder; none when there is no such folder."""
     with suppress(OSError):
         return [path for path in series.iterdir() if re.fullmatch(r"\d{4,}\.mcap(\.part)?", path.name)]
     return []
+
+
+def _siblings(path: Path) -> Iterator[_Sibling]:
+    """The nearest other segments of the session, each read to its first chunk."""
+    number = _number(path)
+    for series in (path.parent.parent / TELEMETRY, path.parent.parent / FRAMES):
+        segments = [other for other in segments_of(series) if other != path]
+        segments.sort(key=lambda other: (abs(_number(other) - number), other.name))
+        for other in segments[:SIBLINGS_PER_SERIES]:
+            with suppress(OSError):  # what cannot be read does not help
+                yield _Sibling(other, _read_opening(other))
 
 
 def _number(path: Path) -> int:

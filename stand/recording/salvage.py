@@ -25,7 +25,7 @@ from mcap.writer import CompressionType, Writer
 
 from drivers.interface import SessionError
 from stand.recording.layout import FINISHED, FRAMES, SEGMENT_METADATA, SESSION_METADATA, TELEMETRY, UNFINISHED
-from stand.recording.opening import Opening, opening_of
+from stand.recording.opening import Opening, opening_of, segments_of
 from stand.recording.records import DAMAGE, frame_places, read_frame, read_head, telemetry_messages
 from stand.recording.sink import sync_folder
 from stand.recording.walk import Source, StoredMessage, Survey, stored_messages, survey
@@ -185,7 +185,7 @@ def _salvage_segment(path: Path) -> Salvaged:
 
 
 def _salvage_alone(original: _Original) -> Salvaged:
-    if original.delivered or _is_the_only_telemetry(original):
+    if original.delivered or (original.opening is not None and _is_the_only_telemetry(original)):
         _write_copy(original)
         return _settle(original, original.finished, replace=True)
     return _settle(original, None)
@@ -194,8 +194,8 @@ def _salvage_alone(original: _Original) -> Salvaged:
 def _is_the_only_telemetry(original: _Original) -> bool:
     """Without any telemetry, empty or not, the session's frames could not be opened."""
     folder = original.path.parent
-    segments = [path for path in folder.glob("[0-9]*") if path.name.endswith((FINISHED, UNFINISHED))]
-    return folder.name == TELEMETRY and segments == [original.path] and original.opening is not None
+    frames = segments_of(folder.parent / FRAMES)
+    return folder.name == TELEMETRY and bool(frames) and segments_of(folder) == [original.path]
 
 
 def _salvage_beside(part: _Original) -> Salvaged:

@@ -155,6 +155,7 @@ class _Walk:
         self.found = Survey()
         self._source = source
         self._index_begin: int | None = None
+        self._sound_attachments: dict[str, Attachment] = {}  # those before the first damage
 
     def run(self, to_first_chunk: bool) -> None:
         offset = 0
@@ -200,7 +201,7 @@ class _Walk:
             claimed = offset + _RECORD.size + claim.length if claim else self._source.size
         if claimed < self._source.size and (record := self._record_at(claimed)):
             return record
-        pattern = _AFTER_OPENING if self.found.chunks else _IN_OPENING
+        pattern = _AFTER_OPENING if self.found.is_opening_whole else _IN_OPENING
         candidates = self._candidates(offset + 1, pattern)
         return next((record for place in candidates if (record := self._record_at(place))), None)
 
@@ -218,6 +219,8 @@ class _Walk:
         if gap.end == self._source.size and _is_torn(self._source, gap):
             self.found.torn_bytes = gap.end - gap.begin
         else:
+            if not self.found.damages:
+                self._sound_attachments = dict(self.found.attachments)
             self.found.damages.append(gap)
 
     def _take(self, record: _Proven) -> None:
@@ -231,8 +234,8 @@ class _Walk:
                 found.messages.update(messages)
                 found.chunks.append(ChunkPlace(record.begin + _RECORD.size, record.end - record.begin - _RECORD.size))
             case Metadata(name=name, metadata=entries) if name == SESSION_METADATA:
-                if found.chunks and not found.is_opening_whole:  # these chunks lay in a damaged attachment before it
-                    found.schemas, found.channels, found.chunks, found.messages = {}, {}, [], Counter()
+                if found.chunks and not found.is_opening_whole:
+                    self._forget_attached()
                 found.session = entries
             case Attachment() as attachment:
                 found.attachments[attachment.name] = attachment
@@ -240,6 +243,12 @@ class _Walk:
                 self._index_begin = record.end
             case _:
                 pass
+
+    def _forget_attached(self) -> None:
+        """The session's metadata stands before the first chunk: the chunks so far lay in a damaged attachment."""
+        self.found.attachments = dict(self._sound_attachments)
+        self.found.schemas, self.found.channels = {}, {}
+        self.found.chunks, self.found.messages = [], Counter()
 
     def _take_index(self, begin: int) -> bool:
         """Learn from the index at `begin` when all of it is sound, to the end of the file."""

@@ -33,8 +33,9 @@ TOPICS = {
 COMPRESSION = {TELEMETRY: CompressionType.ZSTD, FRAMES: CompressionType.NONE}
 
 
-def form(series, metadata=METADATA, attachments=ATTACHMENTS, segment_bytes=1 << 40):
-    return SeriesForm(series, TOPICS[series], COMPRESSION[series], metadata, attachments, segment_bytes, 1 << 60)
+def form(series, metadata=METADATA, attachments=ATTACHMENTS, topics=None, segment_bytes=1 << 40):
+    topics = TOPICS[series] if topics is None else topics
+    return SeriesForm(series, topics, COMPRESSION[series], metadata, attachments, segment_bytes, 1 << 60)
 
 
 def frame(index):

@@ -1,15 +1,31 @@
+import fcntl
+import os
 import random
+import subprocess
 import tempfile
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
+from drivers.interface import SessionError
 from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.salvage import salvage_session
+from stand.recording.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
 from stand.recording.session import Session
-from tests.recording.damage import DAMAGES, fresh, names, read_segment, write_segment
+from tests.recording.damage import (
+    ATTACHMENTS,
+    DAMAGES,
+    METADATA,
+    TOPICS,
+    fresh,
+    names,
+    read_segment,
+    write_segment,
+)
 
 TRIALS = 200
+SERIES = [TELEMETRY, FRAMES]
 
 
 @pytest.fixture(scope="module")
@@ -27,24 +43,350 @@ def night(memory):
     written = {}
     for series, seconds in ((TELEMETRY, 60), (FRAMES, 24)):
         folder = directory / series
-        written[f"{series}/0000.mcap"] = write_segment(folder, series, range(seconds), finish=True)
-        written[f"{series}/0001.mcap.part"] = write_segment(folder, series, range(seconds, 2 * seconds))
+        written[series, "finished"] = write_segment(folder, series, range(seconds), finish=True)
+        written[series, "part"] = write_segment(folder, series, range(seconds, 2 * seconds))
     return directory, written
 
 
+@pytest.fixture
+def damaged(memory, night):
+    """`damaged(series, change, of)`: a copy of the night in which `change(data)` has been done to the part, or to the
+    finished segment, and all others are finished; gives its folder, its path and what was written."""
+
+    def make(series, change, of="part"):
+        directory, written = night
+        folder = fresh(directory, memory / "copy") / series
+        path = folder / ("0001.mcap.part" if of == "part" else "0000.mcap")
+        for part in folder.parent.glob("*/*.part"):
+            part.unlink()
+        path.write_bytes(change(written[series, of].data))
+        return folder, path, written[series, of]
+
+    return make
+
+
+def hole(begin, end):
+    return lambda data: data[:begin] + bytes(end - begin) + data[end:]
+
+
+def metadata_of(path, name):
+    with path.open("rb") as file:
+        return next(record.metadata for record in make_reader(file).iter_metadata() if record.name == name)
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("series", [TELEMETRY, FRAMES])
-def test_what_is_not_damaged_is_delivered_and_nothing_else(memory, night, series, damage):
-    directory, written = night
-    original = written[f"{series}/0001.mcap.part"]
+@pytest.mark.parametrize("series", SERIES)
+def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, series, damage):
     rng = random.Random(f"{series} {damage.__name__}")
-    for offset in rng.sample(range(len(original.data)), TRIALS):
-        copy = fresh(directory, memory / "copy")
-        data = damage(original.data, offset, rng)
-        (copy / series / "0001.mcap.part").write_bytes(data)
-        salvage_session(copy)
-        finished = copy / series / "0001.mcap"
-        delivered = read_segment(finished) if finished.exists() else []
-        assert delivered == original.untouched(data), f"{damage.__name__} at {offset}"
-        assert Session.open(copy).incomplete == ()
-        assert names(copy / series)[0] == "0000.mcap"
+    for offset in rng.sample(range(len(night[1][series, "part"].data)), TRIALS):
+        folder, path, written = damaged(series, lambda data, at=offset: damage(data, at, rng))
+        data = path.read_bytes()
+        (done,) = salvage_session(folder.parent)
+        delivered = read_segment(done.path) if done.path else []
+        assert delivered == written.untouched(data), f"{damage.__name__} at {offset}"
+        assert done.messages == len(delivered)
+        assert Session.open(folder.parent).incomplete == ()
+        assert (done.kept is None) == (done.lost_bytes == 0)
+        assert done.kept is None or done.kept.read_bytes() == data
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("series", SERIES)
+def test_a_finished_segment_that_is_damaged_is_salvaged_and_kept(damaged, night, series, damage):
+    rng = random.Random(f"finished {series} {damage.__name__}")
+    for offset in rng.sample(range(len(night[1][series, "finished"].data)), 30):
+        folder, path, written = damaged(series, lambda data, at=offset: damage(data, at, rng), "finished")
+        data = path.read_bytes()
+        done = {result.source: result for result in salvage_session(folder.parent)}
+        assert (read_segment(path) if path.exists() else []) == written.untouched(data)
+        if path in done:
+            assert done[path].kept == folder / "0000.mcap.damaged"
+            assert done[path].kept.read_bytes() == data
+
+
+@pytest.mark.parametrize("series", SERIES)
+def test_every_stretch_between_several_holes_is_delivered(damaged, series):
+    def holes(data):
+        for begin in range(len(data) // 10, len(data), len(data) // 5):
+            data = hole(begin, begin + 100)(data)
+        return data
+
+    folder, path, written = damaged(series, holes)
+    data = path.read_bytes()
+    (done,) = salvage_session(folder.parent)
+    assert read_segment(done.path) == written.untouched(data)
+    assert 0 < done.messages < len(written.messages)
+    assert "5 damaged places" in done.reason
+    assert metadata_of(done.path, "salvage")["damaged_places"] == "5"
+
+
+def test_a_copy_says_from_what_it_was_made_and_reads_like_a_recording(damaged):
+    folder, _, _ = damaged(FRAMES, lambda data: data[:-60])
+    (done,) = salvage_session(folder.parent)
+    assert metadata_of(done.path, "salvage") == {
+        "source": "0001.mcap.part",
+        "reason": done.reason,
+        "messages": "23",
+        "lost_bytes": "0",
+        "damaged_places": "0",
+    }
+    assert metadata_of(done.path, "segment") == {"series": "frames", "number": "0001", "previous": "0000"}
+    session = Session.open(folder.parent)
+    assert (session.metadata, session.attachment("config.yaml")) == (METADATA, ATTACHMENTS["config.yaml"])
+    assert session.frame_count == 24 + 23
+
+
+@pytest.mark.parametrize("series", SERIES)
+def test_a_block_that_was_being_written_is_no_loss(damaged, series):
+    for change in (lambda data: data[:-60], lambda data: data[:-60] + bytes(60), lambda data: data + bytes(9000)):
+        folder, _, _ = damaged(series, change)
+        (done,) = salvage_session(folder.parent)
+        assert (done.lost_bytes, done.kept) == (0, None)
+        assert names(folder) == ["0000.mcap", "0001.mcap"]
+
+
+def test_a_second_damaged_original_of_a_number_gets_a_name_of_its_own(damaged):
+    folder, _, _ = damaged(FRAMES, hole(9000, 9100))
+    (folder / "0001.mcap.damaged").write_bytes(b"an older one")
+    (done,) = salvage_session(folder.parent)
+    assert done.kept == folder / "0001.2.mcap.damaged"
+    assert (folder / "0001.mcap.damaged").read_bytes() == b"an older one"
+    assert set(Session.open(folder.parent).damaged) == {done.kept, folder / "0001.mcap.damaged"}
+
+
+@pytest.mark.parametrize("series", SERIES)
+def test_a_lost_opening_is_taken_from_the_siblings(damaged, night, series):
+    lost = night[1][series, "part"].blocks[0].end
+    folder, path, written = damaged(series, hole(0, lost))
+    data = path.read_bytes()
+    (done,) = salvage_session(folder.parent)
+    assert read_segment(done.path) == written.untouched(data) == written.messages[len(written.blocks[0].messages) :]
+    (folder / "0001.mcap").replace(folder / "0000.mcap")  # read it as the first one
+    assert Session.open(folder.parent).attachment("config.yaml") == ATTACHMENTS["config.yaml"]
+
+
+def test_without_a_sibling_the_channels_stay_unknown_and_the_original_is_kept(tmp_path):
+    written = write_segment(tmp_path / TELEMETRY, TELEMETRY, range(9))
+    part = tmp_path / TELEMETRY / "0000.mcap.part"
+    part.write_bytes(hole(written.opening_bytes, written.opening_bytes + 100)(written.data))
+    (done,) = salvage_session(tmp_path)
+    assert (done.path, done.messages, done.kept) == (None, 0, tmp_path / TELEMETRY / "0000.mcap.damaged")
+    assert "messages are of channels no segment tells of" in done.reason
+
+
+def test_without_a_sibling_a_lost_session_is_not_guessed(tmp_path):
+    written = write_segment(tmp_path / TELEMETRY, TELEMETRY, range(9))
+    (tmp_path / TELEMETRY / "0000.mcap.part").write_bytes(hole(0, written.opening_bytes)(written.data))
+    (done,) = salvage_session(tmp_path)
+    assert (done.path, done.kept) == (None, tmp_path / TELEMETRY / "0000.mcap.damaged")
+    assert "no segment tells which session it belongs to" in done.reason
+
+
+def test_the_other_series_tells_the_session(tmp_path):
+    written = write_segment(tmp_path / TELEMETRY, TELEMETRY, range(9))
+    (tmp_path / TELEMETRY / "0000.mcap.part").write_bytes(hole(0, written.opening_bytes)(written.data))
+    write_segment(tmp_path / FRAMES, FRAMES, range(2), finish=True)
+    (done,) = salvage_session(tmp_path)
+    assert read_segment(done.path) == written.messages
+    assert Session.open(tmp_path).metadata == METADATA
+
+
+@pytest.mark.parametrize(
+    "siblings",
+    [
+        [{"metadata": METADATA | {"session_id": "night-2"}}],
+        [{"attachments": ATTACHMENTS | {"recipe.yaml": "name: other\n"}}],
+        [{}, {"topics": TOPICS[TELEMETRY][::-1]}],
+    ],
+    ids=["other session", "other attachments", "of several minds"],
+)
+def test_a_sibling_that_may_not_be_one_is_not_used(tmp_path, siblings):
+    folder = tmp_path / TELEMETRY
+    for sibling in siblings:
+        write_segment(folder, TELEMETRY, range(9), finish=True, **sibling)
+    written = write_segment(folder, TELEMETRY, range(20, 29))
+    first = written.blocks[0]
+    (part,) = folder.glob("*.part")
+    part.write_bytes(hole(first.begin, first.end)(written.data))
+    (done,) = salvage_session(tmp_path)
+    assert (done.path, done.kept) == (None, part.with_suffix(".damaged"))
+
+
+def test_metadata_is_voted_on(damaged):
+    folder, _, written = damaged(TELEMETRY, lambda data: data.replace("Zoë".encode(), b"Zof!", 1))
+    assert written.data.count("Zoë".encode()) == 1
+    (done,) = salvage_session(folder.parent)
+    assert metadata_of(done.path, "session") == METADATA
+    assert read_segment(done.path) == written.messages
+
+
+@pytest.mark.parametrize("content", [b"", bytes(5000), b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(5000)])
+def test_a_part_that_never_held_anything_is_removed(damaged, content):
+    folder, _, _ = damaged(FRAMES, lambda data: content)
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.kept, done.messages, done.lost_bytes) == (None, None, 0, 0)
+    assert names(folder) == ["0000.mcap"]
+
+
+def test_an_opening_without_a_message_is_removed(damaged, night):
+    folder, _, _ = damaged(FRAMES, lambda data: data[: night[1][FRAMES, "part"].opening_bytes])
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.kept) == (None, None)
+    assert names(folder) == ["0000.mcap"]
+
+
+def test_the_only_telemetry_is_finished_even_if_it_is_empty_so_that_the_frames_can_be_opened(tmp_path):
+    written = write_segment(tmp_path / TELEMETRY, TELEMETRY, range(1))
+    (tmp_path / TELEMETRY / "0000.mcap.part").write_bytes(written.data[: written.opening_bytes])
+    write_segment(tmp_path / FRAMES, FRAMES, range(2))
+    salvage_session(tmp_path)
+    assert Session.open(tmp_path).frame_count == 2
+
+
+def test_bytes_that_are_no_recording_are_kept(damaged):
+    folder, _, _ = damaged(TELEMETRY, lambda data: b"notes of the night\n" * 50)
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.kept) == (None, folder / "0001.mcap.damaged")
+    assert done.kept.read_bytes() == b"notes of the night\n" * 50
+
+
+def test_beside_its_finished_segment_a_part_that_holds_nothing_more_is_removed(damaged):
+    folder, path, written = damaged(TELEMETRY, lambda data: data)
+    (done,) = salvage_session(folder.parent)
+    for cut in (len(written.data), written.blocks[30].end):
+        path.write_bytes(written.data[:cut])
+        (again,) = salvage_session(folder.parent)
+        assert (again.path, again.kept) == (done.path, None)
+        assert names(folder) == ["0000.mcap", "0001.mcap"]
+        assert read_segment(done.path) == written.messages
+
+
+@pytest.mark.parametrize("spoil", [lambda data: data[: len(data) // 3], lambda data: b""])
+def test_beside_a_damaged_finished_segment_the_part_wins(damaged, spoil):
+    folder, path, written = damaged(TELEMETRY, lambda data: data)
+    (done,) = salvage_session(folder.parent)
+    spoiled = spoil(done.path.read_bytes())
+    done.path.write_bytes(spoiled)
+    path.write_bytes(written.data)
+    salvage_session(folder.parent)
+    assert read_segment(done.path) == written.messages
+    assert names(folder)[2:] in (["0001.mcap.damaged"], [])
+    assert (folder / "0001.mcap.damaged").read_bytes() == spoiled
+
+
+def test_beside_a_finished_segment_with_other_messages_the_part_is_kept(damaged, night):
+    folder, path, written = damaged(TELEMETRY, lambda data: data)
+    path.replace(folder / "0000.mcap.part")
+    (done,) = salvage_session(folder.parent)
+    assert (done.source, done.path, done.messages) == (folder / "0000.mcap.part", folder / "0000.mcap", 0)
+    assert done.kept.read_bytes() == written.data
+    assert read_segment(done.path) == night[1][TELEMETRY, "finished"].messages
+
+
+def test_a_living_recording_is_left_alone(damaged):
+    folder, path, written = damaged(FRAMES, lambda data: data[:-5])
+    with path.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        (done,) = salvage_session(folder.parent)
+        assert (done.source, done.path, done.reason) == (path, None, BEING_RECORDED)
+        assert path.read_bytes() == written.data[:-5]
+    (done,) = salvage_session(folder.parent)
+    assert done.path == folder / "0001.mcap"
+
+
+def test_a_copy_that_was_not_finished_is_removed_unless_it_is_being_written(damaged):
+    folder, _, _ = damaged(FRAMES, lambda data: data)
+    copy = folder / "0000.mcap.tmp"
+    copy.write_bytes(b"half a copy")
+    with copy.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        salvage_session(folder.parent)
+        assert copy.exists()
+    salvage_session(folder.parent)
+    assert not copy.exists()
+
+
+@pytest.mark.parametrize("change", [lambda data: data, hole(9000, 9500)], ids=["whole", "damaged"])
+def test_a_salvage_that_was_killed_at_any_step_is_repeated(damaged, change):
+    folder, path, _ = damaged(FRAMES, change)
+    data = path.read_bytes()
+    (done,) = salvage_session(folder.parent)
+    expected, kept = names(folder), read_segment(done.path)
+    assert salvage_session(folder.parent) == []
+
+    path.write_bytes(data)  # killed before the original went: the copy is there
+    salvage_session(folder.parent)
+    assert [name for name in names(folder) if "damaged" not in name] == ["0000.mcap", "0001.mcap"]
+
+    folder, path, _ = damaged(FRAMES, change)  # killed between the second name and the copy's own
+    if len(expected) == 3:
+        os.link(path, folder / expected[2])
+    (folder / "0001.mcap.tmp").write_bytes(b"half a copy")
+    salvage_session(folder.parent)
+    assert names(folder) == expected
+    assert read_segment(done.path) == kept
+    assert salvage_session(folder.parent) == []
+
+
+def test_a_full_disk_leaves_the_original_as_it_was(tmp_path, night):
+    if os.geteuid():
+        pytest.skip("only root can mount a small disk")
+    _, written = night
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    part_bytes = len(written[FRAMES, "part"].data)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={part_bytes + 20_000}", "tmpfs", disk], check=True)
+    try:
+        (disk / "night" / FRAMES).mkdir(parents=True)
+        part = disk / "night" / FRAMES / "0000.mcap.part"
+        part.write_bytes(written[FRAMES, "part"].data)
+        with pytest.raises(SessionError, match=r"cannot be salvaged and is left as it was .*No space left"):
+            salvage_unfinished(disk)
+        assert names(disk) == ["night/frames/0000.mcap.part"]
+        assert part.read_bytes() == written[FRAMES, "part"].data
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def write_with_attachment(path, attached):
+    """A telemetry segment with a binary attachment before its metadata; where that begins."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        begin = file.tell()
+        writer.add_attachment(0, 0, "earlier.mcap", "application/octet-stream", attached)
+        writer.add_metadata("session", METADATA)
+        channel = writer.register_channel("/x", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        for index in range(50):
+            writer.add_message(channel, index, b"%d" % index, index)
+        writer.finish()
+    return begin
+
+
+@pytest.mark.parametrize("place", [None, 0, 40, 3000], ids=["whole", "head", "name", "content"])
+def test_an_attached_recording_is_not_taken_for_this_one(tmp_path, night, place):
+    (tmp_path / TELEMETRY).mkdir()
+    part = tmp_path / TELEMETRY / "0000.mcap.part"
+    begin = write_with_attachment(part, night[1][TELEMETRY, "finished"].data)
+    if place is not None:
+        part.write_bytes(hole(begin + place, begin + place + 8)(part.read_bytes()))
+    (done,) = salvage_session(tmp_path)
+    assert [record.topic for record in read_segment(done.path)] == ["/x"] * 50
+
+
+def test_the_start_of_the_daemon_looks_at_unfinished_segments_only(damaged):
+    assert salvage_unfinished(Path("/nowhere")) == []
+    folder, _, _ = damaged(FRAMES, lambda data: data[:-5])
+    (folder / "0000.mcap").write_bytes(b"damaged")
+    outside = folder.parent / "other"
+    outside.mkdir()
+    (outside / "0000.mcap.part").write_bytes(b"no series of ours")
+    results = salvage_unfinished(folder.parent.parent)
+    assert folder / "0001.mcap.part" in [done.source for done in results]
+    assert (folder / "0000.mcap").read_bytes() == b"damaged"
+    assert (outside / "0000.mcap.part").exists()
+
+
+def test_a_directory_that_is_no_session_is_refused(tmp_path):
+    with pytest.raises(SessionError, match="not a session"):
+        salvage_session(tmp_path)
