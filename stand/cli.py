@@ -26,7 +26,8 @@ from stand.estimate import PricedStep, price
 from stand.hub import Event, Hub, Item, StepMark, StepState
 from stand.progress import progress
 from stand.recipe import Recipe, load_recipe
-from stand.run import Interrupted, Order, run_real, run_virtual
+from stand.run import Interrupted, run_real, run_virtual
+from stand.session_setup import Order
 from stand.simulator import Simulator, laboratory_of
 from stand.usage import OneLineUsage, one_line, tell
 

@@ -257,11 +257,18 @@ class CompressorConfig(Document):
 
 
 class RecordingConfig(Document):
-    """Where sessions go and how often telemetry is committed."""
+    """Where sessions go, how often telemetry is committed, and what is left of the disk.
+
+    roi keeps the markers' surroundings and a whole frame every `whole_every_s`. With less than `stop_frames_below_GB`
+    free no frame is recorded, with less than `alert_below_percent` of the disk there is a warning.
+    """
 
     directory: Annotated[Path, AfterValidator(_printable)] = Path("sessions")
-    frame_encoding: Literal["png", "raw"] = "png"
+    frame_encoding: Literal["png", "raw", "roi"] = "png"
+    whole_every_s: float = Field(default=60.0, gt=0, le=86400)
     telemetry_commit_s: float = Field(default=1.0, gt=0, le=300)
+    stop_frames_below_GB: float = Field(default=2.0, ge=0, le=1000)
+    alert_below_percent: float = Field(default=10.0, ge=0, le=100)
 
 
 class SimulationConfig(Document):

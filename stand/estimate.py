@@ -12,6 +12,7 @@ from experiments.steps import (
     PlannedStep,
     SetTemperature,
     StartChamber,
+    Step,
     estimate_s,
     frames_of,
     kind_of,
@@ -21,7 +22,7 @@ from stand.config import StandConfig
 
 # Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
 # with its share of the index, committed every second.
-_BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0}
+_BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0, "roi": 0.074}
 _TELEMETRY_BYTES_PER_MESSAGE = 116.0
 _SENSOR_PX = (2448, 2048)
 
@@ -55,19 +56,31 @@ def price(plan: Iterable[PlannedStep], config: StandConfig) -> tuple[PricedStep,
     the whole would take more than a year."""
     width_px = config.camera.width_px or _SENSOR_PX[0]
     height_px = config.camera.height_px or _SENSOR_PX[1]
-    frame_bytes = width_px * height_px * _BYTES_PER_PIXEL[config.recording.frame_encoding]
+    frame_px = width_px * height_px
     polled = (config.regulator, config.relays, config.thermometers, config.flap, config.camera, *config.axes.values())
     messages_per_s = sum(1.0 / device.poll_s for device in polled)
     priced: list[PricedStep] = []
     for planned in plan:
         _check(planned, config)
         duration_s, frames = estimate_s(planned.step, config.camera.boot_s), frames_of(planned.step)
-        size_bytes = frames * frame_bytes + duration_s * messages_per_s * _TELEMETRY_BYTES_PER_MESSAGE
+        size_bytes = (
+            frame_px * _image_bytes_per_px(planned.step, config)
+            + duration_s * messages_per_s * _TELEMETRY_BYTES_PER_MESSAGE
+        )
         priced.append(PricedStep(planned, duration_s, frames, size_bytes))
     total_s = sum(step.duration_s for step in priced)
     if total_s > _LONGEST_S:
         raise ConfigError(f"the plan takes {total_s / 86400:.0f} days; more than a year is refused")
     return tuple(priced)
+
+
+def _image_bytes_per_px(step: Step, config: StandConfig) -> float:
+    """What all frames of a step take, per pixel of one; with `roi` a step's first frame is whole, then one at times."""
+    frames, recording = frames_of(step), config.recording
+    whole = 0
+    if isinstance(step, Capture) and recording.frame_encoding == "roi":
+        whole = min(frames, 1 + int((frames - 1) * step.interval_s / recording.whole_every_s))
+    return whole * _BYTES_PER_PIXEL["png"] + (frames - whole) * _BYTES_PER_PIXEL[recording.frame_encoding]
 
 
 def _check(planned: PlannedStep, config: StandConfig) -> None:

@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.metadata
-import platform
 import signal
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack, suppress
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
-from drivers.clock import NS_PER_S, Clock, VirtualClock, WallClock, seconds_ns
+from drivers.clock import Clock, VirtualClock, WallClock, seconds_ns
 from drivers.interface import ConfigError, SessionError, StandError, StandTripped
 from stand.assembly import Assembly, assemble
-from stand.config import StandConfig
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
 from stand.recipe import Recipe
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.recorder import Recorder
+from stand.recording.salvage import salvage_unfinished
 from stand.scheduler import Scheduler
+from stand.session_setup import Order, recorder_of, session_directory
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from stand.stand import Stand
-
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """What to run: the checked files and their texts (they are attached to the recording)."""
-
-    config: StandConfig
-    recipe: Recipe
-    config_text: str
-    recipe_text: str
-    target_text: str
 
 
 class Interrupted(StandError):
@@ -136,8 +122,9 @@ async def _run(
 ) -> Path:
     hub = Hub()
     watch(hub)
+    await _salvage(out, hub, clock)
     assembly = assemble(order.config, hub, clock)
-    directory = _session_directory(out, order, clock)
+    directory = session_directory(out, order, clock)
     async with AsyncExitStack() as stack:
         background: list[asyncio.Task[None]] = []
         stack.push_async_callback(_cancel, background)
@@ -146,7 +133,7 @@ async def _run(
         stack.push_async_callback(_close, assembly)
         stop.stand = assembly.stand
         await _opened(assembly, background, stop)
-        recorder = _recorder(order, directory, assembly)
+        recorder = recorder_of(order, directory, assembly)
         recorder.start()
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording)
@@ -154,6 +141,12 @@ async def _run(
     if recorder.frames_lost:
         raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
     return directory
+
+
+async def _salvage(out: Path, hub: Hub, clock: Clock) -> None:
+    """Finish what an earlier run that was killed has left unfinished, before anything moves."""
+    for segment in await asyncio.to_thread(salvage_unfinished, out):
+        hub.publish(Event(clock.now_ns(), "warning", "salvaged", str(segment)))
 
 
 async def _perform(assembly: Assembly, recipe: Recipe, background: list[asyncio.Task[None]], stop: Stop) -> None:
@@ -244,38 +237,3 @@ async def _cancel(tasks: list[asyncio.Task[None]]) -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def _session_directory(out: Path, order: Order, clock: Clock) -> Path:
-    started = datetime.fromtimestamp(clock.now_ns() / NS_PER_S, UTC)
-    directory = out / f"{started:%Y%m%dT%H%M%SZ}-{order.recipe.name}"
-    if directory.exists():
-        raise ConfigError(f"{directory}: this session exists already; choose another --out or move it away")
-    return directory
-
-
-def _recorder(order: Order, directory: Path, assembly: Assembly) -> Recorder:
-    config, clock = order.config, assembly.clock
-    info = SessionInfo(
-        session_id=directory.name,
-        recipe=order.recipe.name,
-        operator=config.operator,
-        camera_serial=assembly.devices.camera.identity.serial_number,
-        software_version=importlib.metadata.version("thermostand"),
-        clock_source="virtual" if isinstance(clock, VirtualClock) else "wall",
-        simulated=config.simulation is not None,
-        host=platform.node(),
-    )
-    attachments = {
-        "config.yaml": order.config_text,
-        "recipe.yaml": order.recipe_text,
-        "target.yaml": order.target_text,
-    }
-    settings = RecordingSettings(config.recording.frame_encoding, config.recording.telemetry_commit_s)
-    return Recorder(directory, info, attachments, _kinds(config), assembly.hub, clock, settings)
-
-
-def _kinds(config: StandConfig) -> dict[str, str]:
-    """Device name -> what kind of device it is, for the recorder's topics."""
-    kinds = {name: name for name in ("regulator", "relays", "thermometers", "camera", "flap")}
-    return {**kinds, **{str(name): "axis" for name in config.axes}}

@@ -22,7 +22,8 @@ from drivers.interface import StandError
 from stand.config import load_config, packaged
 from stand.hub import Hub, Item, StepMark, StepState
 from stand.recipe import load_recipe
-from stand.run import Order, run_virtual
+from stand.run import run_virtual
+from stand.session_setup import Order
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
 

@@ -12,7 +12,8 @@ from compensation.report import analyse
 from compensation.validation import Evaluation
 from stand.config import packaged
 from stand.progress import progress
-from stand.run import Order, run_virtual
+from stand.run import run_virtual
+from stand.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

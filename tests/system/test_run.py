@@ -19,7 +19,8 @@ from drivers.clock import seconds_ns
 from drivers.interface import ConfigError, SessionError, StandTripped, Unreachable
 from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
 from stand.recording.session import Session
-from stand.run import Interrupted, Order, run_virtual
+from stand.run import Interrupted, run_virtual
+from stand.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 

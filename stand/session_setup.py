@@ -1,0 +1,84 @@
+"""What a run is asked for, and the recording that follows from it: its folder, its recorder."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from compensation.target import Target
+from compensation.windows import marker_windows
+from drivers.clock import NS_PER_S, Clock, VirtualClock
+from drivers.documents import parse_document
+from drivers.interface import ConfigError, Frame
+from stand.assembly import Assembly
+from stand.config import StandConfig
+from stand.recipe import Recipe
+from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.roi import RoiEncoder
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What to run: the checked files and their texts (they are attached to the recording)."""
+
+    config: StandConfig
+    recipe: Recipe
+    config_text: str
+    recipe_text: str
+    target_text: str
+
+
+def session_directory(out: Path, order: Order, clock: Clock) -> Path:
+    """The session's folder below `out`, named for the instant and the recipe; ConfigError when it exists already."""
+    started = datetime.fromtimestamp(clock.now_ns() / NS_PER_S, UTC)
+    directory = out / f"{started:%Y%m%dT%H%M%SZ}-{order.recipe.name}"
+    if directory.exists():
+        raise ConfigError(f"{directory}: this session exists already; choose another --out or move it away")
+    return directory
+
+
+def recorder_of(order: Order, directory: Path, assembly: Assembly) -> Recorder:
+    """The recorder of this run."""
+    config, clock = order.config, assembly.clock
+    info = SessionInfo(
+        session_id=directory.name,
+        recipe=order.recipe.name,
+        operator=config.operator,
+        camera_serial=assembly.devices.camera.identity.serial_number,
+        software_version=importlib.metadata.version("thermostand"),
+        clock_source="virtual" if isinstance(clock, VirtualClock) else "wall",
+        simulated=config.simulation is not None,
+        host=platform.node(),
+    )
+    attachments = {
+        "config.yaml": order.config_text,
+        "recipe.yaml": order.recipe_text,
+        "target.yaml": order.target_text,
+    }
+    settings = RecordingSettings(
+        config.recording.frame_encoding,
+        config.recording.telemetry_commit_s,
+        stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
+        alert_below_fraction=config.recording.alert_below_percent / 100,
+    )
+    return Recorder(directory, info, attachments, _kinds(config), assembly.hub, clock, settings, _partial_frames(order))
+
+
+def _partial_frames(order: Order) -> Callable[[Frame], bytes] | None:
+    """For `roi`: the encoder that keeps the surroundings of the target's markers."""
+    recording = order.config.recording
+    if recording.frame_encoding != "roi":
+        return None
+    target = parse_document(order.target_text, Target, order.config.target)
+    return RoiEncoder(partial(marker_windows, target=target), recording.whole_every_s)
+
+
+def _kinds(config: StandConfig) -> dict[str, str]:
+    """Device name -> what kind of device it is, for the recorder's topics."""
+    kinds = {name: name for name in ("regulator", "relays", "thermometers", "camera", "flap")}
+    return {**kinds, **{str(name): "axis" for name in config.axes}}
