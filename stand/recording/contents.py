@@ -24,6 +24,11 @@ class Channel:
     times_ns: array[int] = field(default_factory=lambda: array("q"))
     values: array[float] = field(default_factory=lambda: array("d"))
 
+    @property
+    def is_degC(self) -> bool:
+        """It is a temperature."""
+        return self.unit == "degC"
+
     def sorted_times_ns(self) -> NDArray[np.int64]:
         """The instants, ascending, shape (n,)."""
         return np.sort(np.array(self.times_ns, np.int64))

@@ -21,10 +21,12 @@ from drivers.clock import NS_PER_S
 from stand.hub import Event
 from stand.recording.instants import date_time, duration
 
+FRAMES_DROPPED = "frames_dropped"  # kind of the recorder's events
 SHORTEST_NS = 5 * NS_PER_S
 MEDIANS = 3
 _RHYTHM = 3  # readings; with fewer there is no spacing to compare with
-_LOST_BLOCKS = re.compile(r"frames lost: \d+ \(blocks (\d+) to (\d+)\)")  # as stand/recording/recorder.py says it
+# As stand/recording/losses.py says it: `block 3`, `blocks 12 to 14, 17`.
+_BLOCKS = re.compile(r"\bblocks? (\d+(?: to \d+)?(?:, \d+(?: to \d+)?)*)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,5 +120,6 @@ def _names(hole: _Hole, channels: frozenset[str]) -> list[str]:
 
 def told_blocks(events: Iterable[Event]) -> list[range]:
     """The block ids of frames that the recorder itself said it lost."""
-    found = [_LOST_BLOCKS.match(event.text) for event in events if event.kind == "frames_dropped"]
-    return [range(int(match[1]), int(match[2]) + 1) for match in found if match is not None]
+    texts = [event.text for event in events if event.kind == FRAMES_DROPPED]
+    runs = [run.split(" to ") for text in texts for found in _BLOCKS.findall(text) for run in found.split(", ")]
+    return [range(int(run[0]), int(run[-1]) + 1) for run in runs]

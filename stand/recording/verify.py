@@ -14,7 +14,7 @@ from pathlib import Path
 
 from drivers.interface import SessionError
 from stand.recording.contents import Contents, FrameKey
-from stand.recording.gaps import silences, told_blocks
+from stand.recording.gaps import FRAMES_DROPPED, silences, told_blocks
 from stand.recording.images import CAMERA_IMAGE
 from stand.recording.instants import date_time
 from stand.recording.inventory import SegmentFile, State, inventory
@@ -218,7 +218,7 @@ def _frames(kind: Callable[[str], Finding], keys: list[FrameKey], what: str) -> 
 def _frames_lost(contents: Contents) -> Iterator[Finding]:
     """What the recorder, and what camera and wire lost, as recorded."""
     for event in contents.events:
-        if event.kind == "frames_dropped":
+        if event.kind == FRAMES_DROPPED:
             yield _note(f"{date_time(event.time_ns)} UTC: {event.text}")
     dropped: Counter[str] = Counter()
     for _, meta in contents.metas:

@@ -1,0 +1,31 @@
+"""How a command ends: 0 as asked, 1 failed or damaged, 2 bad input, 130 interrupted; each with one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+
+import typer
+
+from drivers.interface import ConfigError, StandError
+from stand.usage import tell
+
+FAILED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+
+@contextmanager
+def one_line_errors() -> Generator[None]:
+    """What is raised inside becomes its sentence on standard error and its exit status."""
+    try:
+        yield
+    except ConfigError as error:
+        tell(error)
+        raise typer.Exit(BAD_INPUT) from error
+    except (StandError, OSError) as error:
+        tell(error)
+        raise typer.Exit(FAILED) from error
+    except KeyboardInterrupt as error:
+        typer.echo("interrupted", err=True)
+        raise typer.Exit(INTERRUPTED) from error

@@ -1,0 +1,258 @@
+"""Recorded sessions for people (lines of at most 100 columns) and for programs (JSON)."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from stand.hub import Event, StepState
+from stand.recording.instants import date_time, duration
+from stand.recording.inventory import State
+from stand.recording.overview import Frames, Glance, Overview, Step, Temperature
+from stand.recording.utc import utc_text
+from stand.recording.verify import Verification
+from stand.usage import one_line
+
+WIDTH = 100
+_LABEL = 14
+_MOST = 20  # entries of a list before the rest is only counted
+LIST_COLUMNS = ("session", "recipe", "start (UTC)", "duration", "frames", "size", "devices", "state")
+ENCODING = {CompressedImage.DESCRIPTOR.full_name: "PNG", RawImage.DESCRIPTOR.full_name: "raw"}
+
+
+def size(size_bytes: int) -> str:
+    """`143.7 MB`, in powers of 1000."""
+    for limit, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if size_bytes >= limit:
+            return f"{size_bytes / limit:.1f} {unit}"
+    return f"{size_bytes} B"
+
+
+def list_row(seen: Glance) -> tuple[str, ...]:
+    """A session's cells below LIST_COLUMNS."""
+    length = "" if seen.begin_ns is None or seen.end_ns is None else duration(seen.end_ns - seen.begin_ns)
+    return (
+        one_line(seen.path.resolve().name),
+        one_line(seen.metadata.get("recipe", "?")),
+        "" if seen.begin_ns is None else date_time(seen.begin_ns),
+        length,
+        str(seen.frames),
+        size(seen.size_bytes),
+        "simulated" if seen.simulated else "real",
+        one_line(seen.state),
+    )
+
+
+def glance_json(seen: Glance) -> dict[str, object]:
+    """One session of `stand session list --json`, the head of `info --json`."""
+    has_times = seen.begin_ns is not None and seen.end_ns is not None
+    return {
+        "name": seen.path.resolve().name,
+        "path": str(seen.path),
+        "metadata": seen.metadata,
+        "start": _instant(seen.begin_ns),
+        "end": _instant(seen.end_ns),
+        "duration_s": ((seen.end_ns or 0) - (seen.begin_ns or 0)) / 1e9 if has_times else None,
+        "frames": seen.frames,
+        "bytes": seen.size_bytes,
+        "simulated": seen.simulated,
+        "state": seen.state,
+        "segments": [{"file": file.name, "state": str(file.state), "bytes": file.size_bytes} for file in seen.files],
+        "troubles": list(seen.troubles),
+    }
+
+
+def _instant(time_ns: int | None) -> str | None:
+    return None if time_ns is None else utc_text(time_ns)
+
+
+def info_lines(found: Overview) -> Iterator[str]:
+    """`stand session info`."""
+    parts = (
+        _facts(found),
+        _steps(found.steps),
+        _frames(found),
+        _temperatures(found.temperatures),
+        (*_gaps(found), *_events(found.events)),
+    )
+    for position, part in enumerate(parts):
+        if position:
+            yield ""
+        yield from part
+
+
+def _row(label: str, text: str) -> Iterator[str]:
+    """A label and its text, wrapped beside it."""
+    indent = " " * _LABEL
+    yield from textwrap.wrap(
+        one_line(text), WIDTH, initial_indent=f"{label:<{_LABEL}}", subsequent_indent=indent, break_on_hyphens=False
+    )
+
+
+def _facts(found: Overview) -> Iterator[str]:
+    seen = found.glance
+    told = seen.metadata.get
+    yield from _row("session", f"{seen.path.resolve().name}  ({seen.state})")
+    yield from _row("recipe", told("recipe", "?") + (", simulated devices" if seen.simulated else ""))
+    if seen.begin_ns is not None and seen.end_ns is not None:
+        span = f"{date_time(seen.begin_ns)} to {date_time(seen.end_ns)} UTC"
+        yield from _row(
+            "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {told('clock_source', '?')} clock"
+        )
+    ending = "the recording does not tell" if found.ending is None else found.ending.text
+    yield from _row("ended", ending)
+    yield from _row("operator", told("operator", "") or "not told")
+    yield from _row("camera", told("camera_serial", "?"))
+    host = f", host {told('host')}" if told("host") else ""
+    yield from _row("software", f"thermostand {told('software_version', '?')}{host}")
+    yield from _row("segments", _segments(seen))
+    yield from _row("attached", ", ".join(seen.attachments) or "nothing")
+    for trouble in _limited(found.troubles):
+        yield from _row("damaged", trouble)
+    if found.troubles or seen.count(State.UNFINISHED):
+        yield from _row("to do", f"stand session salvage {seen.path}")
+
+
+def _segments(seen: Glance) -> str:
+    by_series: dict[str, list[int]] = {}
+    for file in seen.files:
+        if file.state is State.FINISHED:
+            by_series.setdefault(file.series, []).append(file.size_bytes)
+    parts = [f"{series} {len(sizes)} ({size(sum(sizes))})" for series, sizes in by_series.items()]
+    others = [
+        f"{file.name} is {file.state} ({size(file.size_bytes)})"
+        for file in seen.files
+        if file.state is not State.FINISHED
+    ]
+    return "; ".join([", ".join(parts) or "none finished", *_limited(others)])
+
+
+def _limited(entries: Sequence[str]) -> list[str]:
+    """The first entries and how many more there are."""
+    more = len(entries) - _MOST
+    return [*entries[:_MOST], *([f"and {more} more"] if more > 0 else [])]
+
+
+def _steps(steps: Sequence[Step]) -> Iterator[str]:
+    done = [step for step in steps if step.state is StepState.DONE]
+    kinds = Counter(step.kind for step in steps)
+    listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    yield from _row("steps", f"{len(done)} of {len(steps)} done: {listed}" if steps else "none")
+    told = {StepState.FAILED: "failed", StepState.STARTED: "has no end in the recording"}
+    for step in steps:
+        if step.state is not StepState.DONE:
+            parameters = " ".join(f"{name}={value}" for name, value in step.parameters.items())
+            text = f"{step.index} {step.kind} {parameters} {told[step.state]}, begun {date_time(step.begin_ns)} UTC"
+            yield from _row("  not done", text)
+
+
+def _frames(found: Overview) -> Iterator[str]:
+    frames = found.frames
+    if not frames.count:
+        yield from _row("frames", f"none{_lost(frames)}")
+        return
+    encoding = ENCODING.get(frames.schema, frames.schema)
+    each = size(round(frames.size_bytes / frames.count))
+    yield from _row("frames", f"{frames.count}, {frames.pixels}, {encoding}, {each} each{_lost(frames)}")
+    if frames.first_ns is not None and frames.last_ns is not None:
+        yield from _row("", f"from {date_time(frames.first_ns)} to {date_time(frames.last_ns)} UTC")
+    captures = [step for step in found.steps if step.frames]
+    yield from _limited([_capture(step) for step in captures])
+
+
+def _lost(frames: Frames) -> str:
+    parts: list[str] = []
+    if frames.dropped:
+        parts.append(f"{frames.dropped} lost by the camera or its wire")
+    if frames.described != frames.count:
+        parts.append(f"{frames.described} are described in the telemetry")
+    return "".join(f"; {part}" for part in parts)
+
+
+def _capture(step: Step) -> str:
+    told = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
+    asked = step.parameters.get("frames", "?")
+    return (
+        f"{'':<{_LABEL}}step {step.index:<4d} {step.frames} of {asked} frames from {date_time(step.begin_ns)}  {told}"
+    )
+
+
+def _temperatures(temperatures: Sequence[Temperature]) -> Iterator[str]:
+    if not temperatures:
+        yield from _row("temperatures", "none")
+        return
+    width = max(len(temperature.channel) for temperature in temperatures)
+    yield f"{'temperatures':<{_LABEL}}{'degC':<{width}}{'min':>9}{'mean':>9}{'max':>9}{'readings':>10}{'BAD':>8}"
+    for row in temperatures:
+        numbers = "".join(
+            f"{value:9.2f}" if not math.isnan(value) else f"{'-':>9}"
+            for value in (row.min_degC, row.mean_degC, row.max_degC)
+        )
+        yield f"{'':<{_LABEL}}{one_line(row.channel):<{width}}{numbers}{row.count:>10}{row.bad:>8}"
+
+
+def _gaps(found: Overview) -> Iterator[str]:
+    for position, gap in enumerate(_limited([str(gap) for gap in found.gaps]) or ["none"]):
+        yield from _row("" if position else "gaps", gap)
+
+
+def _events(events: Sequence[Event]) -> Iterator[str]:
+    counts = Counter(event.level for event in events)
+    yield from _row("events", ", ".join(f"{count} {level}" for level, count in sorted(counts.items())) or "none")
+    grave = [event for event in events if event.level != "info"]
+    for line in _limited([f"{date_time(event.time_ns)} {event.level}: {event.text}" for event in grave]):
+        yield from _row("", line)
+
+
+def info_json(found: Overview) -> dict[str, object]:
+    """`stand session info --json`: everything, lists in full; a temperature that was never good is null."""
+    return {
+        **glance_json(found.glance),
+        "troubles": list(found.troubles),
+        "attachments": list(found.glance.attachments),
+        "ending": None if found.ending is None else found.ending.text,
+        "steps": [
+            {**asdict(step), "begin": _instant(step.begin_ns), "end": _instant(step.end_ns)} for step in found.steps
+        ],
+        "images": {
+            **asdict(found.frames),
+            "first": _instant(found.frames.first_ns),
+            "last": _instant(found.frames.last_ns),
+        },
+        "temperatures": [
+            {name: None if value != value else value for name, value in asdict(temperature).items()}
+            for temperature in found.temperatures
+        ],
+        "gaps": [{**asdict(gap), "begin": _instant(gap.begin_ns), "end": _instant(gap.end_ns)} for gap in found.gaps],
+        "events": [{**asdict(event), "time": _instant(event.time_ns)} for event in found.events],
+    }
+
+
+def verify_lines(found: Verification) -> Iterator[str]:
+    """`stand session verify`: the findings, then what was read."""
+    yield from map(one_line, map(str, found.findings))
+    errors = sum(finding.severity == "error" for finding in found.findings)
+    verdict = "sound" if found.is_sound else f"NOT sound: {errors} errors"
+    yield (
+        f"{verdict}; {found.segments} segments, {found.messages} messages, {found.frames} frames, {size(found.bytes)} "
+        "read"
+    )
+
+
+def verify_json(found: Verification) -> dict[str, object]:
+    """`stand session verify --json`."""
+    return {"sound": found.is_sound, **asdict(found)}
+
+
+def table_lines(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
+    """LIST_COLUMNS and the rows in columns, for a file or a pipe."""
+    lines = [LIST_COLUMNS, *rows]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(LIST_COLUMNS))]
+    for line in lines:
+        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
