@@ -101,7 +101,7 @@ def _write_facts(session: Session, folder: Path) -> None:
     attachments = folder / "attachments"
     attachments.mkdir()
     for name, content in session.attachments.items():
-        if Path(name).name != name:
+        if Path(name).name != name or name in ("", "..") or "\0" in name:
             raise SessionError(f"{session.path}: the attachment {name!r} has no name that a file can have")
         (attachments / name).write_text(content, encoding="utf-8", newline="")
     _write_csv(

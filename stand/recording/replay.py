@@ -93,8 +93,8 @@ async def replay_and_record(
     speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
     has the same metadata (the session's id, too), attachments, devices and items: nothing in it tells of the replay,
     because it is the same session in other segments. SessionError when it has no items, cannot be read or written, or
-    when frames were lost because the disk is slower than `speed`: the copy is then complete but for them, and its
-    events say how many.
+    when frames were lost, as to a disk that is slower than `speed`: the copy is then complete but for them, and its
+    events say why.
     """
     first = next(session.items(), None)
     if first is None:

@@ -17,7 +17,7 @@ MS = 1_000_000
 INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "wall", host="laboratory")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\r\n"}
 DEVICES = {"thermometers": "thermometers", "regulator": "regulator", "camera": "camera"}
-DEVICES |= {"linear": "axis", "rotary": "axis"}
+DEVICES |= {"rotary": "axis", "linear": "axis"}
 
 
 def frame(time_ns, index, dtype=np.uint8):
@@ -53,11 +53,19 @@ def half_second(time_ns, index, dtype=np.uint8):
     yield Event(time_ns, "warning", "note", f"half second {index}, 5 µm")
 
 
-async def record(directory, count=12, items=half_second, encoding="png", segment_s=2.0, period_ns=NS_PER_S // 2):
+async def record(
+    directory,
+    count=12,
+    items=half_second,
+    encoding="png",
+    segment_s=2.0,
+    period_ns=NS_PER_S // 2,
+    attachments=ATTACHMENTS,
+):
     """Publish `items(time_ns, index)` each period; returns all that were published."""
     clock, hub, published = VirtualClock(START_NS), Hub(), []
     settings = RecordingSettings(encoding, telemetry_commit_s=1.0, segment_s=segment_s)
-    recorder = Recorder(directory, INFO, ATTACHMENTS, DEVICES, hub, clock, settings)
+    recorder = Recorder(directory, INFO, attachments, DEVICES, hub, clock, settings)
     hub.subscribe(published.append)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]

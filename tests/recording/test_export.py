@@ -8,16 +8,21 @@ import cv2
 import numpy as np
 import pyarrow.parquet
 import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from mcap.writer import CompressionType
 
 from drivers.clock import NS_PER_S
 from drivers.interface import Reading, SessionError, bad_reading
 from stand.hub import Batch
 from stand.recording.export import export
-from stand.recording.images import decode_image
+from stand.recording.images import CAMERA_IMAGE
 from stand.recording.layout import FRAMES
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
 from stand.recording.session import Session
+from stand.recording.tables import GROUP_ROWS, Column, ParquetTable
 from stand.recording.utc import utc_text
-from tests.recording.recorded import ATTACHMENTS, INFO, MS, START_NS, half_second, record
+from tests.recording.recorded import ATTACHMENTS, INFO, MS, START_NS, frame, half_second, record
 
 # channel of the session -> table and column of the export
 CHANNELS = {
@@ -40,7 +45,7 @@ def csv_rows(path):
 
 def parquet_rows(path):
     table = pyarrow.parquet.read_table(path)
-    return table.drop_columns("time_utc").to_pylist()  # datetime has no ns
+    return table.select([name for name in table.column_names if name != "time_utc"]).to_pylist()  # datetime has no ns
 
 
 async def exported(tmp_path, *, count=12, items=half_second, encoding="png", **choices):
@@ -125,20 +130,23 @@ async def test_every_frame_is_a_png_of_its_pixels(tmp_path, encoding, dtype):
     assert names[:3] == ["000001.png", "000001.txt", "000002.png"]
     assert names[-1] == "index.csv"
     assert len(names) == 2 * 12 + 1
-    for number, frame in enumerate(session.frames(), 1):
+    for number, recorded in enumerate(session.frames(), 1):
         image = cv2.imread(str(out / "frames" / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
         assert image.dtype == dtype
-        np.testing.assert_array_equal(image, frame.image)
+        np.testing.assert_array_equal(image, recorded.image)
 
 
 async def test_a_recorded_png_is_not_coded_again(tmp_path):
-    session, out = await exported(tmp_path, count=3)
-    for number, image in enumerate(session.images(), 1):
-        png = (out / "frames" / f"{number:06d}.png").read_bytes()
-        assert png in image.data
-        np.testing.assert_array_equal(
-            cv2.imdecode(np.frombuffer(png, np.uint8), -1), decode_image(image.schema, image.data).pixels
-        )
+    await record(tmp_path / "s", 1, items=lambda time_ns, index: ())
+    _, png = cv2.imencode(".png", frame(START_NS, 0).image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    message = CompressedImage(frame_id="camera.image", data=png.tobytes(), format="png").SerializeToString()
+    topics = (Topic(CAMERA_IMAGE, CompressedImage),)
+    form = SeriesForm(FRAMES, topics, CompressionType.NONE, INFO.metadata(), ATTACHMENTS, 10**9, 600 * NS_PER_S)
+    series = Series(tmp_path / "s" / FRAMES, form)
+    series.commit([Record(CAMERA_IMAGE, START_NS, message)], START_NS)
+    series.finish()
+    export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
+    assert (tmp_path / "out" / "frames" / "000001.png").read_bytes() == png.tobytes()
 
 
 def sidecar(path):
@@ -149,24 +157,35 @@ def sidecar(path):
 async def test_the_sidecar_tells_the_temperatures_of_its_frame(tmp_path):
     session, out = await exported(tmp_path)
     times_ns, air_degC = session.readings("thermometers.air")
-    for number, frame in enumerate(session.frames(), 1):
+    for number, shot in enumerate(session.frames(), 1):
         told = sidecar(out / "frames" / f"{number:06d}.txt")
         assert told["file"].strip() == f"{number:06d}.png"
-        assert told["time_utc"].strip() == utc_text(frame.time_ns)
-        assert int(told["time_ns"]) == frame.time_ns
-        np.testing.assert_array_equal(float(told["camera_temperature_degC"]), frame.camera_degC)
-        assert (float(told["exposure_s"]), float(told["gain_dB"])) == (frame.exposure_s, frame.gain_dB)
-        assert (int(told["block_id"]), int(told["dropped"])) == (frame.block_id, frame.dropped)
-        assert told["step_id"].strip() == frame.step_id
-        before = times_ns <= frame.time_ns
+        assert told["time_utc"].strip() == utc_text(shot.time_ns)
+        assert int(told["time_ns"]) == shot.time_ns
+        np.testing.assert_array_equal(float(told["camera_temperature_degC"]), shot.camera_degC)
+        assert (float(told["exposure_s"]), float(told["gain_dB"])) == (shot.exposure_s, shot.gain_dB)
+        assert (int(told["block_id"]), int(told["dropped"])) == (shot.block_id, shot.dropped)
+        assert told["step_id"].strip() == shot.step_id
+        before = times_ns <= shot.time_ns
         assert before.sum() == number - 1
         np.testing.assert_array_equal(
             float(told["thermometers.air_degC"]), air_degC[before][-1] if before.any() else np.nan
         )
-        age_s = (frame.time_ns - times_ns[before][-1]) / NS_PER_S if before.any() else np.nan
+        age_s = (shot.time_ns - times_ns[before][-1]) / NS_PER_S if before.any() else np.nan
         np.testing.assert_array_equal(float(told["thermometers.air_age_s"]), age_s)
     assert sidecar(out / "frames" / "000004.txt")["camera_temperature_degC"] == " nan"
     assert sidecar(out / "frames" / "000006.txt")["thermometers.air_degC"] == " nan", "a BAD reading is not passed over"
+
+
+async def test_a_reading_counts_from_its_own_instant(tmp_path):
+    def items(time_ns, index):
+        for at_ns, pv_degC in ((time_ns, 21.0), (time_ns + 1, 22.0)):
+            yield Batch("regulator", at_ns, (Reading("regulator.pv", pv_degC, "degC", at_ns),))
+        yield frame(time_ns, index)
+
+    _, out = await exported(tmp_path, count=1, items=items)
+    told = sidecar(out / "frames" / "000001.txt")
+    assert (told["regulator.pv_degC"], told["regulator.pv_age_s"]) == (" 21.0", " 0.0")
 
 
 async def test_the_index_says_what_the_sidecars_say(tmp_path):
@@ -265,12 +284,33 @@ async def test_nothing_is_overwritten_by_an_export(tmp_path):
     assert (tmp_path / "next.part").is_dir()
 
 
+@pytest.mark.parametrize("name", ["../config.yaml", "/etc/passwd", "a/b", "..", "", "a\0b"])
+async def test_an_attachment_cannot_be_written_elsewhere(tmp_path, name):
+    await record(tmp_path / "s", 1, attachments={name: "text"})
+    with pytest.raises(SessionError, match="has no name that a file can have"):
+        export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
+
+
+def test_a_long_table_is_written_in_groups(tmp_path):
+    table = ParquetTable(tmp_path / "long.parquet", (Column("time_ns", "ns"), Column("device", "word")))
+    rows = [(time_ns, f"axis-{time_ns // 10_000}") for time_ns in range(2 * GROUP_ROWS + 1)]
+    for row in rows:
+        table.add(row)
+    table.close()
+    assert pyarrow.parquet.read_metadata(tmp_path / "long.parquet").num_row_groups == 3
+    assert [tuple(row.values()) for row in parquet_rows(tmp_path / "long.parquet")] == rows
+
+
 PARQUET_WITHOUT_PYARROW = """
 import sys
 sys.modules["pyarrow"] = None  # as an interpreter that has none
 from pathlib import Path
 from stand.recording.export import export
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
 from stand.recording.session import Session
+from stand.recording.tables import GROUP_ROWS, Column, ParquetTable
 export(Session.open(Path(sys.argv[1])), Path(sys.argv[2]), telemetry="parquet", report=print)
 """
 

@@ -8,8 +8,10 @@ from drivers.interface import Frame, SessionError
 from stand.hub import Batch, Hub
 from stand.recording.replay import ReplayClock, replay, replay_and_record
 from stand.recording.session import Session
+from stand.recording.topics import recorded_devices, recorded_topics
 from tests.recording.recorded import (
     ATTACHMENTS,
+    DEVICES,
     MS,
     START_NS,
     frame_key,
@@ -59,6 +61,7 @@ async def test_a_recorded_replay_is_the_same_session(tmp_path, items, encoding):
     assert copy.metadata == original.metadata
     assert dict(copy.attachments) == ATTACHMENTS
     assert copy.channels() == original.channels()
+    assert recorded_topics(copy) == recorded_topics(original)
     assert [path.name for path in (tmp_path / "copies").iterdir()] == ["r"]
 
 
@@ -119,16 +122,17 @@ async def test_a_paced_replay_is_recorded_whole(tmp_path):
 
 def test_a_clock_of_another_speed_reads_and_waits_in_session_time():
     wall = VirtualClock(0)
-    fast, slow = ReplayClock(START_NS, 1000.0, wall), ReplayClock(START_NS, 0.3, wall)
+    clock, slow = ReplayClock(START_NS, 3.0, wall), ReplayClock(START_NS, 0.25, wall)
 
     async def wait():
         running = asyncio.create_task(wall.run())
-        await slow.sleep_until(START_NS + NS_PER_S)
+        await clock.sleep_until(START_NS + NS_PER_S)
         running.cancel()
 
     asyncio.run(wait())
-    assert START_NS + NS_PER_S <= slow.now_ns() <= START_NS + NS_PER_S + 1
-    assert fast.now_ns() == START_NS + 1000 * wall.now_ns()
+    assert wall.now_ns() == 333_333_334
+    assert clock.now_ns() == START_NS + NS_PER_S + 2, "not before the instant that was waited for"
+    assert slow.now_ns() == START_NS + round(wall.now_ns() / 4)
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
@@ -154,6 +158,13 @@ async def test_nothing_is_overwritten_by_a_replay(tmp_path):
     session = Session.open(tmp_path / "s")
     with pytest.raises(SessionError, match="exists already"):
         await replay_and_record(session, tmp_path / "s", None)
+
+
+async def test_a_session_tells_which_devices_it_recorded(tmp_path):
+    await record(tmp_path / "s", 1)
+    devices = recorded_devices(Session.open(tmp_path / "s"))
+    assert devices == DEVICES
+    assert [name for name, kind in devices.items() if kind == "axis"] == ["rotary", "linear"]
 
 
 async def test_a_session_without_items_cannot_be_replayed(tmp_path):
