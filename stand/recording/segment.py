@@ -130,6 +130,11 @@ class Segment:
         return self._sink.committed_bytes
 
     @property
+    def is_empty(self) -> bool:
+        """Whether no message has been committed."""
+        return self._sink.committed_bytes <= self._opening_bytes
+
+    @property
     def reserved_bytes(self) -> int:
         """What of the reserve is not used yet."""
         return self._sink.reserved_bytes
@@ -159,10 +164,10 @@ class Segment:
         """Let go after an error: what was committed stays as `.part`; a file without a message is removed. OSError
         when the file cannot be cut back: as long as that lasts the block that failed may be in it."""
         self._sink.settle()
-        if self._sink.committed_bytes > self._opening_bytes:
-            self.close()
-        else:
+        if self.is_empty:
             self._remove()
+        else:
+            self.close()
 
     def close(self) -> None:
         """Let go of the file as it is; may be called twice."""

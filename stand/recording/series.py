@@ -49,12 +49,11 @@ class Series:
         """All of `records` on the disk when this returns, in a new segment when the present one is full or fails;
         OSError when the new one fails, too. `time_ns` (now) decides whether a segment is old enough to be closed."""
         self.finish_full(time_ns)
+        segment = self.open(time_ns)
         try:
-            self.open(time_ns).commit(records)
+            segment.commit(records)
         except OSError as error:
-            if self._segment is None:  # there is no next one to go on with
-                raise
-            self._give_up(error)
+            self._give_up(segment, error)
             self._commit_anew(records, time_ns)
 
     def _commit_anew(self, records: Sequence[Record], time_ns: int) -> None:
@@ -62,12 +61,13 @@ class Series:
         try:
             segment.commit(records)
         except OSError as error:
-            self._give_up(error)
+            self._give_up(segment, error)
             raise
 
-    def _give_up(self, error: OSError) -> None:
-        self.troubles.append(f"a segment of {self._form.name} was given up ({error})")
-        self._failed, self._segment = self._segment, None
+    def _give_up(self, segment: Segment, error: OSError) -> None:
+        if not segment.is_empty:  # else nothing is left behind that anybody would miss
+            self.troubles.append(f"a segment of {self._form.name} was given up ({error})")
+        self._failed, self._segment = segment, None
         with suppress(OSError):  # tried again before the next segment
             self._let_go()
 

@@ -1,7 +1,6 @@
 import asyncio
 import math
 import random
-import resource
 from contextlib import suppress
 from dataclasses import replace
 
@@ -17,12 +16,12 @@ from drivers.interface import Frame, Reading, SessionError, bad_reading
 from stand.hub import Batch, Event, Hub, StepMark, StepState
 from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.recording.session import Session
-from stand.recording.sink import CommitSink
+from tests.recording.disks import limit_files
 
 START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "virtual")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\n"}
-SETTINGS = RecordingSettings()
+SETTINGS = RecordingSettings(stop_frames_below_bytes=0, alert_below_fraction=0.0)  # whatever this disk has
 DEVICES = {
     "thermometers": "thermometers",
     "regulator": "regulator",
@@ -95,12 +94,6 @@ def contents(directory):
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
-def limit_files(size_bytes=None):
-    """The kernel refuses to let a file of this process grow beyond that (EFBIG), like a full disk; None lifts it."""
-    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    resource.setrlimit(resource.RLIMIT_FSIZE, (hard if size_bytes is None else size_bytes, hard))
-
-
 @pytest.fixture
 def files_limited():
     """`files_limited(size_bytes, seconds)` gives a `between` for `record`: the limit holds in these seconds."""
@@ -169,7 +162,7 @@ async def test_a_reader_no_one_here_wrote_decodes_every_message(tmp_path):
     }
 
 
-@pytest.mark.parametrize("settings", [RecordingSettings(segment_bytes=2000), RecordingSettings(segment_s=1.0)])
+@pytest.mark.parametrize("settings", [replace(SETTINGS, segment_bytes=2000), replace(SETTINGS, segment_s=1.0)])
 async def test_each_segment_stands_alone(tmp_path, settings):
     await record(tmp_path / "s", settings=settings)
     assert len(list((tmp_path / "s" / "frames").iterdir())) == 5
@@ -188,7 +181,7 @@ async def test_each_segment_stands_alone(tmp_path, settings):
 
 
 async def test_raw_frames_are_read_back(tmp_path):
-    await record(tmp_path / "s", 2, settings=RecordingSettings(frame_encoding="raw"))
+    await record(tmp_path / "s", 2, settings=replace(SETTINGS, frame_encoding="raw"))
     images = [got.image for got in Session.open(tmp_path / "s").frames()]
     np.testing.assert_array_equal(images[1], frame(0, 1).image)
 
@@ -204,20 +197,6 @@ async def test_frames_beyond_the_queue_are_dropped_counted_and_told(tmp_path):
     (event,) = session.events()
     assert (event.level, event.kind) == ("error", "frames_dropped")
     assert event.text == "frames lost: 10 (blocks 20 to 29 of step capture-1), 10 in all; the disk is too slow"
-
-
-def test_a_block_the_disk_refuses_is_cut_off_again(tmp_path, files_limited):
-    at = files_limited(1500, {1})
-    sink = CommitSink(tmp_path / "file")
-    sink.append([b"a" * 1000])
-    at(1)
-    with pytest.raises(OSError, match="too large"):
-        sink.append([b"b" * 1000])
-    at(2)
-    assert (tmp_path / "file").read_bytes() == b"a" * 1000
-    sink.append([b"c" * 10])
-    sink.close()
-    assert (tmp_path / "file").read_bytes() == b"a" * 1000 + b"c" * 10
 
 
 def committed_event_texts(directory):

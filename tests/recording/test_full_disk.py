@@ -1,0 +1,150 @@
+"""A recording on a disk of 64 MB: what was acknowledged is readable, what was not is told, and telemetry goes on."""
+
+import asyncio
+import re
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+
+from drivers.clock import NS_PER_S, VirtualClock
+from drivers.interface import Frame
+from stand.hub import Event, Hub
+from stand.recording.images import decode_image
+from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.session import Session
+from tests.recording.disks import tmpfs
+
+START_NS = 1_767_290_400 * NS_PER_S
+INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")
+SMALL_SEGMENTS = RecordingSettings("raw", segment_bytes=8_000_000, stop_frames_below_bytes=0, alert_below_fraction=0.0)
+
+
+@pytest.fixture
+def disk(tmp_path):
+    with tmpfs(tmp_path / "disk", "64m") as folder:
+        yield folder
+
+
+class Night:
+    """A recorder on a virtual clock; each second one frame of 1 MB and one event are published."""
+
+    def __init__(self, directory, settings):
+        self.clock, self.hub, self.events = VirtualClock(START_NS), Hub(), []
+        self.recorder = Recorder(directory, INFO, {}, {}, self.hub, self.clock, settings)
+        self.hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
+        self.published = 0
+
+    async def __aenter__(self):
+        self.recorder.start()
+        self._tasks = [asyncio.create_task(work) for work in (self.recorder.run(), self.clock.run())]
+        return self
+
+    async def __aexit__(self, *_):
+        self._tasks[0].cancel()
+        with suppress(asyncio.CancelledError):
+            await self._tasks[0]
+        await self.recorder.finish()
+        self._tasks[1].cancel()
+
+    async def seconds(self, count):
+        for _ in range(count):
+            time_ns = START_NS + self.published * NS_PER_S
+            await self.clock.sleep_until(time_ns)
+            self.hub.publish(frame(time_ns, self.published))
+            self.hub.publish(Event(time_ns, "info", "note", f"second {self.published}"))
+            self.published += 1
+        await self.recorder.flushed()
+
+    def told(self, kind):
+        return [event.text for event in self.events if event.kind == kind]
+
+
+def frame(time_ns, block_id):
+    image = np.random.default_rng(block_id).integers(0, 255, (1000, 1000), np.uint8)
+    return Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, block_id, block_id, step_id="soak-1")
+
+
+def readable_blocks(directory):
+    """The blocks of all whole images in all frame segments, finished or not, pixels compared with what was sent."""
+    for path in sorted((directory / "frames").iterdir()):
+        messages = []
+        with path.open("rb") as file, suppress(Exception):  # an unfinished file ends anywhere
+            for record in StreamReader(file, validate_crcs=True).records:
+                if isinstance(record, Message):
+                    messages.append(record)
+        for message in messages:
+            sent = frame(message.log_time, message.sequence)
+            np.testing.assert_array_equal(decode_image("foxglove.RawImage", message.data).pixels, sent.image)
+            yield message.sequence
+
+
+def lost_blocks(texts):
+    """The block ids that the events name."""
+    for text in texts:
+        for first, last in re.findall(r"(\d+)(?: to (\d+))?", re.search(r"blocks? ([\d, to]+) of step", text)[1]):
+            yield from range(int(first), int(last or first) + 1)
+
+
+async def test_a_full_disk_loses_no_frame_it_has_acknowledged_and_no_telemetry(disk):
+    async with Night(disk / "s", SMALL_SEGMENTS) as night:
+        await night.seconds(60)
+        full = night.recorder.saved
+        assert 45 <= full.frames <= 51  # 67 MB, 16 of them the telemetry's
+        assert full.frames + full.frames_lost == 60
+        assert sorted(readable_blocks(disk / "s")) == list(range(full.frames))
+        assert full.telemetry >= 60 * 3  # the frame's description, the event, and its log message
+        await night.seconds(20)
+        assert night.recorder.saved.frames == full.frames
+        for path in sorted((disk / "s" / "frames").glob("*.mcap"))[:2]:
+            path.unlink()
+        await night.seconds(5)
+        assert night.recorder.saved.frames == full.frames + 5
+    session = Session.open(disk / "s")
+    assert [path.name for path in session.incomplete] == [f"{full.frames // 8:04d}.mcap.part"]
+    assert len(session.events()) == len(night.events)
+    assert night.told("note") == [f"second {k}" for k in range(85)]
+    assert list(lost_blocks(night.told("frames_dropped"))) == list(range(full.frames, 80))
+    assert all("No space left on device" in text for text in night.told("frames_dropped"))
+    assert night.told("telemetry_not_saved") == []
+    assert night.recorder.frames_lost == 80 - full.frames
+    kept = [got.block_id for got in session.frames()]
+    assert set(kept) | set(readable_blocks(disk / "s")) == set(range(16, full.frames)) | set(range(80, 85))
+
+
+async def test_frames_leave_the_end_of_the_disk_to_the_telemetry_and_come_back(disk):
+    settings = RecordingSettings(
+        "raw", segment_bytes=8_000_000, stop_frames_below_bytes=30_000_000, alert_below_fraction=0.6
+    )
+    async with Night(disk / "s", settings) as night:
+        await night.seconds(30)
+        assert 18 <= night.recorder.saved.frames <= 22  # 67 MB, 16 the telemetry's, 30 left, looked at once a second
+        (disk / "ballast").write_bytes(bytes(9_000_000))
+        await night.seconds(10)
+        for path in [*sorted((disk / "s" / "frames").glob("*.mcap"))[:2], disk / "ballast"]:
+            path.unlink()
+        await night.seconds(5)
+    for kind, text in (
+        ("disk_nearly_full", "GB are free on the disk"),
+        ("frames_stopped", "frames are not recorded any more: less than 0.0 GB free on the disk"),
+        ("frames_resumed", "frames are recorded again"),
+    ):
+        (told,) = night.told(kind)
+        assert told.endswith(text)
+    lost = list(lost_blocks(night.told("frames_dropped")))
+    assert len(lost) == night.recorder.frames_lost == 45 - night.recorder.saved.frames
+    assert lost == list(range(lost[0], lost[-1] + 1))
+    assert all(text.endswith("less than 0.0 GB free on the disk") for text in night.told("frames_dropped"))
+    assert [got.block_id for got in Session.open(disk / "s").frames()][-5:] == [40, 41, 42, 43, 44]
+    assert not Session.open(disk / "s").incomplete
+
+
+async def test_frames_take_no_more_than_is_left_above_the_threshold(disk):
+    """A segment that may have 1 GB begins on a disk of 64 MB."""
+    settings = RecordingSettings("raw", stop_frames_below_bytes=20_000_000, alert_below_fraction=0.0)
+    async with Night(disk / "s", settings) as night:
+        await night.seconds(3)
+        assert night.recorder.saved.frames == 3
+    assert night.told("frames_dropped") == []

@@ -1,0 +1,212 @@
+"""Segments on real disks: what a telemetry segment looks like when it is finished, and what becomes of a failed one."""
+
+import os
+import random
+from contextlib import suppress
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Chunk, Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType
+
+from stand.recording.messages import CLASSES, EVENT, LOG
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series, next_number
+from tests.recording.disks import ext4, limit_files, run, tmpfs
+
+ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
+SESSION = {"session_id": "night-1"}
+RECORDS_PER_COMMIT = 8
+
+
+def form(**changes):
+    fields = {
+        "name": "telemetry",
+        "topics": (Topic(EVENT, CLASSES[EVENT]), Topic(LOG, CLASSES[LOG], ("stand",))),
+        "compression": CompressionType.ZSTD,
+        "session": SESSION,
+        "attachments": ATTACHMENTS,
+        "segment_bytes": 1 << 40,
+        "segment_ns": 1 << 60,
+        "merge_chunks": True,
+    }
+    return SeriesForm(**{**fields, **changes})
+
+
+def records(commit, size_bytes=60):
+    """Eight messages that do not compress, in no order of time."""
+    noise = random.Random(commit)
+    return [
+        Record(
+            noise.choice((EVENT, LOG)), noise.randrange(10**9), noise.randbytes(size_bytes), noise.randrange(1 << 32)
+        )
+        for _ in range(RECORDS_PER_COMMIT)
+    ]
+
+
+def write(folder, commits, size_bytes=60, **changes):
+    folder.mkdir(exist_ok=True)
+    series = Series(folder, form(**changes))
+    for commit in range(commits):
+        series.commit(records(commit, size_bytes), 0)
+    assert series.finish()
+    assert not series.troubles
+    return folder / "0000.mcap"
+
+
+def messages(path):
+    """All messages of a segment, in the order of the file."""
+    found = []
+    collect_messages(path, found)
+    return found
+
+
+def collect_messages(path, found):
+    topics = {}
+    with path.open("rb") as file:
+        for record in StreamReader(file, validate_crcs=True).records:
+            if type(record).__name__ == "Channel":
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                assert record.publish_time == record.log_time
+                found.append(Record(topics[record.channel_id], record.log_time, record.data, record.sequence))
+
+
+def all_records(commits, size_bytes=60):
+    return [record for commit in range(commits) for record in records(commit, size_bytes)]
+
+
+def chunks(path):
+    with path.open("rb") as file:
+        return [record for record in StreamReader(file, emit_chunks=True).records if isinstance(record, Chunk)]
+
+
+@pytest.fixture
+def limited():
+    yield limit_files
+    limit_files()
+
+
+def test_a_finished_segment_has_few_large_chunks_with_everything_in_its_place(tmp_path):
+    path = write(tmp_path / "s", 600, 1000)
+    assert messages(path) == all_records(600, 1000)
+    sizes = [chunk.uncompressed_size for chunk in chunks(path)]
+    assert len(sizes) == 5  # of 4.8 MB
+    assert max(sizes) < (1 << 20) + 2000
+    assert [found.name for found in path.parent.iterdir()] == ["0000.mcap"]
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert {found.name: found.data.decode() for found in reader.iter_attachments()} == ATTACHMENTS
+        metadata = {found.name: found.metadata for found in reader.iter_metadata()}
+        assert metadata["session"] == SESSION
+        assert metadata["segment"] == {"series": "telemetry", "number": "0000", "previous": ""}
+        summary = reader.get_summary()
+    assert summary.statistics.message_count == 600 * RECORDS_PER_COMMIT
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 5
+    assert [channel.metadata for channel in summary.channels.values()] == [{}, {"devices": "stand"}]
+
+
+def test_the_same_records_are_the_same_bytes_and_the_begin_is_that_of_the_uncompacted_file(tmp_path):
+    one, other, plain = (
+        write(tmp_path / name, 100, merge_chunks=merged) for name, merged in (("a", True), ("b", True), ("c", False))
+    )
+    assert one.read_bytes() == other.read_bytes()
+    assert len(chunks(plain)) == 100
+    opening = plain.read_bytes().index(SESSION["session_id"].encode())
+    assert one.read_bytes()[:opening] == plain.read_bytes()[:opening]
+    assert messages(one) == messages(plain)
+
+
+def test_a_segment_of_a_few_chunks_is_left_as_it_is(tmp_path):
+    assert len(chunks(write(tmp_path / "s", 10))) == 10
+
+
+def test_a_disk_without_room_for_the_copy_keeps_the_segment_as_it_was_committed(tmp_path):
+    with tmpfs(tmp_path / "disk", "4m") as disk:
+        path = write(disk / "s", 100, 3000, reserve_bytes=3_500_000)  # 2.4 MB and an index
+        assert len(chunks(path)) == 100
+        assert messages(path) == all_records(100, 3000)
+        assert [found.name for found in path.parent.iterdir()] == ["0000.mcap"]
+
+
+def test_a_name_that_is_taken_is_not_used_again_whatever_it_ends_in(tmp_path):
+    for name, number in (("0003.mcap.damaged", 4), ("0004.mcap.tmp", 5), ("0007.mcap.part", 8), ("0006.mcap", 8)):
+        (tmp_path / name).touch()
+        assert next_number(tmp_path) == number
+    (tmp_path / "notes.txt").touch()
+    assert next_number(tmp_path) == 8
+
+
+def test_no_next_segment_is_begun_while_a_refused_block_may_still_be_in_the_last_one(tmp_path, limited):
+    """An append-only file cannot be made shorter, whoever asks."""
+    with ext4(tmp_path / "disk", 16 << 20) as disk:
+        folder = disk / "s"
+        folder.mkdir()
+        series = Series(folder, form())
+        series.commit(records(0), 0)
+        good_bytes = (folder / "0000.mcap.part").stat().st_size
+        run("chattr", "+a", folder / "0000.mcap.part")
+        limited(good_bytes + 100)
+        with pytest.raises(OSError, match="not permitted"):
+            series.commit(records(1), 0)
+        limited()
+        with pytest.raises(OSError, match="not permitted"):
+            series.commit(records(1), 0)
+        assert [path.name for path in folder.iterdir()] == ["0000.mcap.part"]
+        run("chattr", "-a", folder / "0000.mcap.part")
+        series.commit(records(1), 0)
+        assert (folder / "0000.mcap.part").stat().st_size == good_bytes
+        assert series.finish()
+        assert messages(folder / "0001.mcap") == records(1)
+        assert [text.startswith("a segment of telemetry was given up") for text in series.troubles] == [True]
+
+
+def test_a_folder_that_was_removed_is_made_again(tmp_path):
+    folder = tmp_path / "s"
+    folder.mkdir()
+    series = Series(folder, form())
+    series.commit(records(0), 0)
+    (folder / "0000.mcap.part").unlink()
+    folder.rmdir()
+    series.commit(records(1), 0)
+    assert series.finish()
+    assert messages(folder / "0000.mcap") == records(1)
+
+
+def test_a_segment_whose_name_is_taken_by_a_folder_stays_unfinished_and_whole(tmp_path):
+    folder = tmp_path / "s"
+    folder.mkdir()
+    series = Series(folder, form())
+    series.commit(records(0), 0)
+    (folder / "0000.mcap").mkdir()
+    assert not series.finish()
+    assert series.troubles.pop().startswith("a segment of telemetry stays unfinished")
+    assert messages(folder / "0000.mcap.part") == records(0)
+    series.commit(records(1), 0)
+    assert series.finish()
+    assert messages(folder / "0001.mcap") == records(1)
+
+
+def test_a_disk_that_dies_tells_at_once_and_keeps_what_was_acknowledged(tmp_path):
+    """The disk behind ext4 is a sparse file on a disk of 24 MB: when that is full, ext4 takes a block but cannot sync it,
+    and refuses from then on to cut it off again."""
+    with tmpfs(tmp_path / "small", "24m") as small, ext4(small / "disk", 200 << 20) as disk:
+        folder = disk / "s"
+        folder.mkdir()
+        os.sync()
+        (small / "ballast").write_bytes(bytes(8_000_000))
+        series = Series(folder, form())
+        acknowledged = 0
+        with suppress(OSError):
+            while True:
+                series.commit(records(acknowledged, 100_000), 0)
+                acknowledged += 1
+        assert 2 <= acknowledged < 30
+        series.finish()
+        found = []
+        for path in sorted(folder.iterdir()):
+            with suppress(Exception):  # an unfinished file ends anywhere
+                collect_messages(path, found)
+        assert len(found) >= acknowledged * RECORDS_PER_COMMIT
+        assert found == all_records(acknowledged + 1, 100_000)[: len(found)]  # no message twice
