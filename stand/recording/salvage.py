@@ -24,9 +24,11 @@ from mcap.records import Channel
 from mcap.writer import CompressionType, Writer
 
 from drivers.interface import SessionError
+from stand.recording.block import CHUNK_BYTES
 from stand.recording.layout import FINISHED, FRAMES, SEGMENT_METADATA, SESSION_METADATA, TELEMETRY, UNFINISHED
 from stand.recording.opening import Opening, opening_of, segments_of
-from stand.recording.records import DAMAGE, frame_places, read_frame, read_head, telemetry_messages
+from stand.recording.records import DAMAGE
+from stand.recording.segment_check import check_segment
 from stand.recording.sink import sync_folder
 from stand.recording.walk import Source, StoredMessage, Survey, stored_messages, survey
 
@@ -34,7 +36,6 @@ SALVAGE_METADATA = "salvage"
 BEING_RECORDED = "is being recorded"
 COPY = FINISHED + ".tmp"
 DAMAGED = FINISHED + ".damaged"
-CHUNK_BYTES = 1 << 20
 COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}
 
 
@@ -97,18 +98,8 @@ def _salvage_number(finished: Path, finished_too: bool) -> Iterator[Salvaged]:
 
 
 def _is_sound(path: Path) -> bool:
-    """Whether every message of a finished segment can be read."""
-    try:
-        read_head(path)
-        if path.parent.name == FRAMES:
-            for place in frame_places(path):
-                read_frame(place)
-        else:
-            for _ in telemetry_messages(path, lambda channel: True):
-                pass
-    except SessionError:
-        return False
-    return True
+    """Whether every byte of a finished segment is as it was written."""
+    return not check_segment(path, lambda message: None, lambda read_bytes: None).damages
 
 
 @contextmanager
