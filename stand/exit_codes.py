@@ -23,6 +23,8 @@ def one_line_errors() -> Generator[None]:
     except ConfigError as error:
         tell(error)
         raise typer.Exit(BAD_INPUT) from error
+    except BrokenPipeError:  # whoever reads our output has enough; typer ends quietly
+        raise
     except (StandError, OSError) as error:
         tell(error)
         raise typer.Exit(FAILED) from error

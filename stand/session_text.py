@@ -88,17 +88,19 @@ def info_lines(found: Overview) -> Iterator[str]:
 
 
 def _row(label: str, text: str) -> Iterator[str]:
-    """A label and its text, wrapped beside it."""
-    indent = " " * _LABEL
-    yield from textwrap.wrap(
-        one_line(text), WIDTH, initial_indent=f"{label:<{_LABEL}}", subsequent_indent=indent, break_on_hyphens=False
+    """A label and its text, wrapped beside it; a path stays whole, to be copied."""
+    wrapper = textwrap.TextWrapper(
+        WIDTH, f"{label:<{_LABEL}}", " " * _LABEL, break_long_words=False, break_on_hyphens=False
     )
+    yield from wrapper.wrap(one_line(text))
 
 
 def _facts(found: Overview) -> Iterator[str]:
     seen = found.glance
     told = seen.metadata.get
-    yield from _row("session", f"{seen.path.resolve().name}  ({seen.state})")
+    name, known_as = seen.path.resolve().name, told("session_id", "")
+    alias = f", recorded as {known_as}" if known_as not in ("", name) else ""
+    yield from _row("session", f"{name}  ({seen.state}){alias}")
     yield from _row("recipe", told("recipe", "?") + (", simulated devices" if seen.simulated else ""))
     if seen.begin_ns is not None and seen.end_ns is not None:
         span = f"{date_time(seen.begin_ns)} to {date_time(seen.end_ns)} UTC"
@@ -238,7 +240,7 @@ def verify_lines(found: Verification) -> Iterator[str]:
     """`stand session verify`: the findings, then what was read."""
     yield from map(one_line, map(str, found.findings))
     errors = sum(finding.severity == "error" for finding in found.findings)
-    verdict = "sound" if found.is_sound else f"NOT sound: {errors} errors"
+    verdict = "sound" if found.is_sound else f"NOT sound ({errors} {'error' if errors == 1 else 'errors'})"
     yield (
         f"{verdict}; {found.segments} segments, {found.messages} messages, {found.frames} frames, {size(found.bytes)} "
         "read"

@@ -207,12 +207,13 @@ def overview(path: Path) -> Overview:
         if file.state is State.FINISHED:
             read.read(file)
     contents = read.contents
+    frames = _frames(seen, read)  # before the troubles are told, which it may add to
     times_ns = {name: channel.sorted_times_ns() for name, channel in contents.channels.items()}
     return Overview(
         seen,
         tuple(dict.fromkeys((*seen.troubles, *read.troubles))),
         tuple(_steps(contents)),
-        _frames(seen, read),
+        frames,
         tuple(_temperature(name, channel) for name, channel in sorted(contents.channels.items()) if channel.is_degC),
         tuple(silences(times_ns)),
         tuple(sorted(contents.events, key=lambda event: event.time_ns)),

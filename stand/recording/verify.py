@@ -201,7 +201,7 @@ def _frames_against_descriptions(read: _Read) -> Iterator[Finding]:
     gone = [key for key in (described - read.images) if not read.is_damaged_at(FRAMES, key[0])]
     lost = [key for key in gone if any(block_ids[key] in blocks for blocks in told)]
     yield from _frames(_error, bare, "without a description in the telemetry")
-    yield from _frames(_error, sorted(set(gone) - set(lost)), "missing, though the telemetry describes them")
+    yield from _frames(_error, sorted(set(gone) - set(lost)), "missing, though described in the telemetry")
     yield from _frames(_note, lost, "described but lost by the recorder, as its events say")
 
 
@@ -209,6 +209,9 @@ def _frames(kind: Callable[[str], Finding], keys: list[FrameKey], what: str) -> 
     """One finding for all frames of a kind."""
     if keys:
         times_ns, blocks = sorted(time_ns for time_ns, _ in keys), sorted(block for _, block in keys)
+        if len(keys) == 1:
+            yield kind(f"1 frame is {what}: block {blocks[0]}, {date_time(times_ns[0])} UTC")
+            return
         yield kind(
             f"{len(keys)} frames are {what}: blocks {blocks[0]} to {blocks[-1]}, "
             f"{date_time(times_ns[0])} to {date_time(times_ns[-1])} UTC"
@@ -226,7 +229,8 @@ def _frames_lost(contents: Contents) -> Iterator[Finding]:
     steps = {mark.step_id: f"step {mark.index} ({mark.kind})" for mark in contents.marks}
     for step_id, count in dropped.items():
         if count:
-            yield _note(f"{count} frames of {steps.get(step_id, 'no step')} were lost by the camera or its wire")
+            lost = "1 frame" if count == 1 else f"{count} frames"
+            yield _note(f"{lost} of {steps.get(step_id, 'no step')} lost by the camera or its wire")
 
 
 def _silences(contents: Contents) -> Iterator[Finding]:

@@ -118,7 +118,7 @@ async def test_a_missing_segment_is_named(session, series):
 async def test_frames_that_went_with_a_segment_are_counted_with_their_blocks(session):
     (session / "frames" / "0001.mcap").unlink()
     assert errors(session)[1] == (
-        "error: 4 frames are missing, though the telemetry describes them: blocks 104 to 107, "
+        "error: 4 frames are missing, though described in the telemetry: blocks 104 to 107, "
         "2026-01-01 18:00:04 to 2026-01-01 18:00:07 UTC"
     )
 
@@ -173,7 +173,7 @@ async def test_losses_the_recording_tells_of_are_notes(tmp_path):
 
     directory = await recorded(tmp_path / "s", items)
     assert errors(directory) == []
-    assert notes(directory) == ["note: 2 frames of step 4 (Capture) were lost by the camera or its wire"]
+    assert notes(directory) == ["note: 2 frames of step 4 (Capture) lost by the camera or its wire"]
 
 
 async def test_frames_the_recorder_says_it_lost_are_notes(tmp_path):

@@ -1,0 +1,163 @@
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from drivers.clock import NS_PER_S
+from drivers.interface import ConfigError, Frame, Reading, SessionError, bad_reading
+from stand.hub import Batch, Event, StepMark, StepState
+from stand.recording.instants import date_time, duration, parse_instant
+from stand.recording.inventory import State
+from stand.recording.overview import glance, overview
+
+from .recorded import ATTACHMENTS, START_NS, record
+
+SECONDS = 10
+CAPTURE = {"frames": 6, "interval_s": 1.0, "role": "fit", "chamber_degC": 31.0}
+
+
+def frame(time_ns, index):
+    image = np.random.default_rng(index).integers(0, 4000, (12, 16), np.uint16)
+    return Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, index, 7 * index, 3 if index == 5 else 0, "capture")
+
+
+def second(time_ns, index):
+    """A run with a step that is done, one that failed, and one whose end was not recorded."""
+    air = Reading("thermometers.air", 20.0 + index, "degC", time_ns)
+    camera = bad_reading("camera.temperature", "degC", time_ns, "no answer")
+    yield Batch("thermometers", time_ns, (air if index != 2 else bad_reading(air.channel, "degC", time_ns, "break"),))
+    yield Batch("camera", time_ns, (camera,))
+    yield Batch("linear", time_ns, (Reading("linear.position", 1.0, "mm", time_ns),))
+    marks = {
+        0: ("soak", 3, "Soak", StepState.STARTED, {"duration_s": 2.0}),
+        2: ("soak", 3, "Soak", StepState.DONE, {"duration_s": 2.0}),
+        3: ("capture", 4, "Capture", StepState.STARTED, CAPTURE),
+        8: ("capture", 4, "Capture", StepState.FAILED, CAPTURE),
+        9: ("flap", 5, "CloseFlap", StepState.STARTED, {}),
+    }
+    if index in marks:
+        yield StepMark(time_ns, *marks[index])
+    if 3 <= index < 8:
+        yield frame(time_ns, index)
+    if index == 4:
+        yield Event(time_ns, "warning", "device_lost", "camera: no answer")
+    if index == SECONDS - 1:
+        yield Event(time_ns, "error", "run.end", "aborted: stopped by the operator")
+
+
+@pytest.fixture
+async def session(tmp_path):
+    await record(tmp_path / "s", SECONDS, items=second, segment_s=4.0, period_ns=NS_PER_S)
+    return tmp_path / "s"
+
+
+async def test_a_glance_tells_what_when_and_how_much(session):
+    seen = glance(session)
+    files = [path for path in session.rglob("*") if path.is_file()]
+    assert (seen.frames, seen.state, seen.simulated) == (5, "complete", False)
+    assert (seen.begin_ns, seen.end_ns) == (START_NS, START_NS + 9 * NS_PER_S)
+    assert seen.size_bytes == sum(path.stat().st_size for path in files)
+    assert seen.metadata["recipe"] == "thermal_cycle"
+    assert list(seen.attachments) == list(ATTACHMENTS)
+    assert seen.count(State.FINISHED) == len(files)
+
+
+async def test_the_overview_has_the_steps_as_they_went(session):
+    steps = overview(session).steps
+    assert [(step.index, step.kind, str(step.state), step.frames) for step in steps] == [
+        (3, "Soak", "done", 0),
+        (4, "Capture", "failed", 5),
+        (5, "CloseFlap", "started", 0),
+    ]
+    assert [step.begin_ns - START_NS for step in steps] == [0, 3 * NS_PER_S, 9 * NS_PER_S]
+    assert [step.end_ns and step.end_ns - START_NS for step in steps] == [2 * NS_PER_S, 8 * NS_PER_S, None]
+    assert steps[1].parameters == CAPTURE
+
+
+async def test_the_overview_has_frames_temperatures_and_events(session):
+    found = overview(session)
+    frames = found.frames
+    assert (frames.count, frames.described, frames.dropped) == (5, 5, 3)
+    assert frames.pixels == "16 x 12 px, 16 bit"
+    assert (frames.first_ns, frames.last_ns) == (START_NS + 3 * NS_PER_S, START_NS + 7 * NS_PER_S)
+    camera, air = found.temperatures
+    assert (air.channel, air.count, air.bad, air.min_degC, air.max_degC) == ("thermometers.air", 10, 1, 20.0, 29.0)
+    assert air.mean_degC == pytest.approx((sum(range(20, 30)) - 22) / 9)
+    assert (camera.channel, camera.count, camera.bad) == ("camera.temperature", 10, 10)
+    assert math.isnan(camera.mean_degC)
+    assert found.gaps == found.troubles == ()
+    assert [event.kind for event in found.events] == ["device_lost", "run.end"]
+    assert found.ending is not None
+    assert found.ending.text == "aborted: stopped by the operator"
+
+
+async def test_a_damaged_segment_is_told_and_the_others_are_read(session):
+    path = session / "telemetry" / "0001.mcap"
+    path.write_bytes(path.read_bytes()[:-20])
+    assert glance(session).state.startswith("damaged: telemetry/0001.mcap: ")
+    found = overview(session)
+    assert [trouble.startswith("telemetry/0001.mcap: ") for trouble in found.troubles] == [True] * len(found.troubles)
+    assert found.troubles
+    assert 5 <= found.temperatures[1].count < 10
+    assert found.frames.count == 5
+
+
+async def test_a_damaged_image_is_a_trouble_of_its_own(session):
+    path = session / "frames" / "0000.mcap"
+    data = bytearray(path.read_bytes())
+    data[data.index(b"IDAT") + 20] ^= 1
+    path.write_bytes(data)
+    found = overview(session)
+    assert (found.frames.count, found.frames.pixels) == (5, "")
+    assert found.troubles[0].startswith("frames/0000.mcap: ")
+
+
+async def test_a_recording_without_a_finished_segment_still_tells_what_it_is(session):
+    for path in session.rglob("*.mcap"):
+        path.rename(path.with_name(f"{path.name}.part"))
+    seen = glance(session)
+    assert seen.metadata["recipe"] == "thermal_cycle"
+    assert seen.state == f"{len(seen.files)} unfinished"
+    assert (seen.frames, seen.begin_ns, seen.end_ns) == (0, None, None)
+    assert overview(session).steps == ()
+
+
+async def test_what_a_salvage_kept_and_what_is_no_segment(session):
+    shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
+    (session / "frames" / "notes.txt").write_text("a cloudy night")
+    assert glance(session).state == "1 kept damaged"
+
+
+def test_a_folder_without_segments_is_no_session(tmp_path):
+    (tmp_path / "telemetry").mkdir()
+    with pytest.raises(SessionError, match="not a session"):
+        glance(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "after_begin_s"),
+    [
+        ("+90", 90),
+        ("+1h30m", 5400),
+        ("+2m5.5s", 125.5),
+        ("+0s", 0),
+        ("1970-01-01T00:00:12", 2),
+        ("1970-01-01T01:00:12+01:00", 2),
+        ("1970-01-01 00:01:00.25Z", 50.25),
+    ],
+)
+def test_an_instant_is_a_time_in_utc_or_counts_from_the_beginning(text, after_begin_s):
+    assert parse_instant(text, 10 * NS_PER_S) == round((10 + after_begin_s) * NS_PER_S)
+
+
+@pytest.mark.parametrize("text", ["", "+", "noon", "+5x", "12:00", "+-5", "2026-13-01"])
+def test_what_is_no_time_says_what_would_be(text):
+    with pytest.raises(ConfigError, match=r"expected a time such as 2026-01-01T18:30:00, \+1h30m or step:12"):
+        parse_instant(text, 0)
+
+
+def test_instants_and_durations_as_people_write_them():
+    assert date_time(START_NS) == "2026-01-01 18:00:00"
+    texts = [duration(round(length_s * NS_PER_S)) for length_s in (4.25, 59.99, 61, 3600, 90_000)]
+    assert texts == ["4.2 s", "60.0 s", "0:01:01", "1:00:00", "1 day, 1:00:00"]

@@ -1,0 +1,270 @@
+import asyncio
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from stand.recording.session import Session
+from stand.session_cli import app
+from tests.recording.recorded import START_NS, item_key, record
+
+runner = CliRunner()
+COUNT = 12  # half seconds, a frame each
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six seconds of a night in a folder of sessions; not to be changed."""
+    directory = tmp_path_factory.mktemp("sessions") / "20260101T180000Z-thermal_cycle"
+    asyncio.run(record(directory, COUNT))
+    return directory
+
+
+@pytest.fixture
+def session(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "sessions" / whole.name))
+
+
+def ask(*arguments: object, status: int = 0):
+    result = runner.invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == status, result.output
+    return result
+
+
+def refused(*arguments: object) -> str:
+    """The one line that says what is wrong with the arguments."""
+    (line,) = ask(*arguments, status=2).stderr.splitlines()
+    return line
+
+
+def flip(path: Path, marker: bytes, behind: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[data.index(marker) + behind] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("command", ["list", "info", "verify", "salvage", "replay", "export", "trim"])
+def test_every_command_explains_itself_with_an_example(command: str):
+    assert f"Example: stand session {command}" in " ".join(ask(command, "--help").stdout.split())
+
+
+def test_the_list_has_a_line_for_each_session_and_for_a_damaged_one(session: Path):
+    damaged = Path(shutil.copytree(session, session.parent / "z-damaged"))
+    (damaged / "telemetry" / "0001.mcap").write_bytes(b"")
+    shutil.copytree(session / "frames", session.parent / "y-running" / "frames", copy_function=_as_part)
+    (session.parent / "no-session").mkdir()
+    (session.parent / "notes.txt").write_text("a cloudy night")
+    header, *lines = ask("list", session.parent).stdout.splitlines()
+    assert header.split() == ["session", "recipe", "start", "(UTC)", "duration", "frames", "size", "devices", "state"]
+    running, first, last = (line.split(maxsplit=8) for line in lines)  # the one without a known start is first
+    assert (running[0], running[1]) == ("y-running", "thermal_cycle")
+    assert lines[0].endswith("3 unfinished")
+    assert first[:6] == [session.name, "thermal_cycle", "2026-01-01", "18:00:00", "5.5", "s"]
+    assert first[6] == "12"
+    assert lines[1].endswith("real     complete")
+    assert last[0] == "z-damaged"
+    assert "damaged: telemetry/0001.mcap: " in lines[2]
+
+
+def _as_part(source: str, target: str) -> str:
+    return shutil.copy(source, f"{target}.part")
+
+
+def test_the_list_as_json(session: Path):
+    (listed,) = json.loads(ask("list", session.parent, "--json").stdout)
+    assert listed["name"] == session.name
+    assert (listed["frames"], listed["state"], listed["simulated"]) == (COUNT, "complete", False)
+    assert listed["start"] == "2026-01-01T18:00:00.073456789Z"  # the first frame's middle, half of its exposure ago
+    assert listed["bytes"] == sum(path.stat().st_size for path in session.rglob("*.mcap"))
+    assert {entry["file"].partition("/")[0] for entry in listed["segments"]} == {"telemetry", "frames"}
+    assert json.loads(ask("list", session, "--json").stdout) == [listed]  # a session is a list of itself
+
+
+def test_a_folder_without_sessions_and_no_folder(tmp_path: Path):
+    assert "no sessions there" in ask("list", tmp_path).stderr
+    assert "no such folder" in refused("list", tmp_path / "nowhere")
+
+
+def test_info_tells_a_person_what_was_recorded(session: Path):
+    output = ask("info", session).stdout
+    assert max(map(len, output.splitlines())) <= 100
+    said = " ".join(output.split())
+    for fact in (
+        f"session {session.name} (complete), recorded as night-1",
+        "recipe thermal_cycle",
+        "recorded 2026-01-01 18:00:00 to 2026-01-01 18:00:05 UTC, 5.5 s, wall clock",
+        "ended the recording does not tell",
+        "operator M. Adamczyk",
+        "camera DA1234567",
+        "software thermostand 0.1.0, host laboratory",
+        "attached config.yaml, target.yaml",
+        "steps 12 of 12 done: 12 Capture",
+        "frames 12, 40 x 30 px, 8 bit, PNG",
+        "6 lost by the camera or its wire",
+        "step 3 1 of 1 frames from 2026-01-01 18:00:01",
+        "thermometers.air 20.00 20.81 21.57 12 1",
+        "gaps none",
+        "events 12 warning",
+        "2026-01-01 18:00:02 warning: half second 4, 5 µm",
+    ):
+        assert fact in said
+
+
+def test_info_as_json_has_everything_and_no_nan(session: Path):
+    def fail(name: str) -> None:
+        pytest.fail(f"{name} is not JSON")
+
+    found = json.loads(ask("info", session, "--json").stdout, parse_constant=fail)
+    assert found["metadata"]["camera_serial"] == "DA1234567"
+    assert len(found["steps"]) == len(found["events"]) == COUNT
+    assert found["steps"][4]["parameters"] == {"frames": 1, "interval_s": 0.5}
+    assert (found["images"]["count"], found["images"]["dropped"]) == (COUNT, 6)
+    (air,) = [row for row in found["temperatures"] if row["channel"] == "thermometers.air"]
+    assert (air["count"], air["bad"], air["min_degC"]) == (COUNT, 1, 20.0)
+
+
+def test_info_says_what_is_unfinished_and_what_to_do(session: Path):
+    path = session / "frames" / "0001.mcap"
+    path.rename(path.with_name("0001.mcap.part"))
+    said = " ".join(ask("info", session).stdout.split())
+    assert "(1 unfinished)" in said
+    assert "frames/0001.mcap.part is unfinished (" in said
+    assert f"to do stand session salvage {session}" in said
+
+
+def test_verify_tells_what_was_lost_before_the_recording_and_that_the_session_is_sound(session: Path):
+    lines = ask("verify", session).stdout.splitlines()
+    assert lines[:-1] == [
+        f"note: 1 frame of step {k} (Capture) lost by the camera or its wire" for k in range(1, 12, 2)
+    ]
+    assert lines[-1].startswith("sound; 7 segments, 143 messages, 12 frames, ")
+
+
+def test_verify_fails_with_a_sentence_for_each_damage(session: Path):
+    flip(session / "frames" / "0000.mcap", b"IDAT", 20)
+    (session / "telemetry" / "0001.mcap").unlink()
+    lines = ask("verify", session, status=1).stdout.splitlines()
+    assert "error: telemetry/0001.mcap: is missing" in lines
+    assert any(line.startswith("error: frames/0000.mcap: is damaged: the CRC of a chunk is wrong") for line in lines)
+    assert lines[-1].startswith("NOT sound (")
+    found = json.loads(ask("verify", session, "--json", status=1).stdout)
+    assert found["sound"] is False
+    assert {"severity": "error", "where": "telemetry/0001.mcap", "text": "is missing"} in found["findings"]
+
+
+def test_salvage_finishes_what_is_unfinished_in_every_session(session: Path):
+    whole = Path(shutil.copytree(session, session.parent / "other"))
+    path = session / "frames" / "0001.mcap"
+    path.rename(path.with_name("0001.mcap.part"))
+    (line,) = ask("salvage", session.parent).stdout.splitlines()
+    assert line.startswith(f"{session.name}/frames/0001.mcap.part: 4 messages in 0001.mcap (")
+    assert Session.open(session).frame_count == Session.open(whole).frame_count == COUNT
+    assert ask("salvage", session).stdout == "nothing to salvage\n"
+
+
+def test_salvage_fails_when_something_is_lost_and_keeps_the_original(session: Path):
+    flip(session / "frames" / "0001.mcap", b"IDAT", 20)
+    (line,) = ask("salvage", session, status=1).stdout.splitlines()
+    assert f"{session.name}/frames/0001.mcap: 3 messages in 0001.mcap, " in line
+    assert "bytes lost, the original is kept as 0001.mcap.damaged" in line
+
+
+def items(directory: Path) -> list[object]:
+    return [item_key(item) for item in Session.open(directory).items()]
+
+
+@pytest.mark.parametrize("speed", ["max", "200"])
+def test_a_replay_is_recorded_with_the_same_items(session: Path, tmp_path: Path, speed: str):
+    result = ask("replay", session, "--speed", speed, "--record", tmp_path / "again")
+    assert result.stdout.splitlines()[-1] == str(tmp_path / "again")
+    assert items(tmp_path / "again") == items(session)
+
+
+@pytest.mark.parametrize("speed", ["max", "200"])
+def test_a_replay_prints_steps_and_events_as_they_come(session: Path, speed: str):
+    lines = ask("replay", session, "--speed", speed).stdout.splitlines()
+    assert lines[:3] == [
+        "2026-01-01 18:00:00  step 0 Capture started",
+        "2026-01-01 18:00:00  step 0 Capture done",
+        "2026-01-01 18:00:00  warning note: half second 0, 5 µm",
+    ]
+    assert len(lines) == 3 * COUNT
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", "fast", "nan", "1e9", ""])
+def test_a_speed_is_a_number_or_max(session: Path, speed: str):
+    assert "expected max or a number from 0.001 to 1000000" in refused("replay", session, f"--speed={speed}")
+
+
+def test_export_writes_images_and_tables(session: Path, tmp_path: Path):
+    assert ask("export", session, "--out", tmp_path / "files").stdout.strip() == str(tmp_path / "files")
+    assert len(list((tmp_path / "files" / "frames").glob("*.png"))) == COUNT
+    assert list((tmp_path / "files" / "telemetry").glob("*.csv"))
+    ask("export", session, "--out", tmp_path / "bare", "--no-frames", "--no-telemetry")
+    assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == [
+        "attachments",
+        "events.csv",
+        "session.json",
+        "steps.csv",
+    ]
+
+
+def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):
+    parts = {
+        "offset": ("--from", "+1s", "--to", "+3s"),
+        "time": ("--from", "2026-01-01T18:00:01.073456", "--to", "2026-01-01T18:00:03.073456"),
+        "step": ("--from", "step:2", "--to", "step:6"),
+    }
+    for name, times in parts.items():
+        assert ask("trim", session, "--out", tmp_path / name, *times).stdout.strip() == str(tmp_path / name)
+    frames = {name: Session.open(tmp_path / name).frame_times_ns.tolist() for name in parts}
+    assert frames["offset"] == frames["time"]
+    middles_ns = [START_NS + k * 500_000_000 - 50_000_000 for k in range(COUNT)]
+    assert frames["offset"] == middles_ns[2:6]
+    assert frames["step"] == middles_ns[3:7]  # a step begins half an exposure after the middle of its first frame
+    ask("trim", session, "--out", tmp_path / "all")
+    assert Session.open(tmp_path / "all").frame_count == COUNT
+
+
+@pytest.mark.parametrize(
+    ("times", "sentence"),
+    [
+        (("--from", "noon"), "noon: expected a time such as"),
+        (("--from", "step:77"), "step:77: the session has no step 77"),
+        (("--from", "+3s", "--to", "+1s"), "--to +1s is not after --from +3s"),
+        (("--from", "+1h"), "is not after --from +1h"),
+    ],
+)
+def test_trim_refuses_times_that_are_none(session: Path, tmp_path: Path, times: tuple[str, ...], sentence: str):
+    assert sentence in refused("trim", session, "--out", tmp_path / "part", *times)
+    assert not (tmp_path / "part").exists()
+
+
+@pytest.mark.parametrize("command", ["info", "verify", "replay", "salvage"])
+def test_what_is_no_session_is_refused(tmp_path: Path, command: str):
+    (line,) = ask(command, tmp_path / "nowhere", status=2).stderr.splitlines()
+    assert line.startswith(f"error: {tmp_path / 'nowhere'}: ")
+
+
+@pytest.mark.parametrize("arguments", [("export", "--out"), ("trim", "--out"), ("replay", "--record")])
+def test_what_exists_is_not_overwritten(session: Path, tmp_path: Path, arguments: tuple[str, str]):
+    command, option = arguments
+    (tmp_path / "there").mkdir()
+    assert "there: exists already" in refused(command, session, option, tmp_path / "there")
+
+
+def test_text_in_a_recording_cannot_write_to_the_terminal(session: Path):
+    trick = session.rename(session.parent / "a\x1b[2Jb")
+    for command in (("list", session.parent), ("info", trick)):
+        output = ask(*command).output
+        assert "\x1b" not in output
+        assert "a\\x1b[2Jb" in output
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_may_not_be_read_is_told(session: Path):
+    (session / "frames" / "0000.mcap").chmod(0)
+    assert "Permission" in ask("info", session).stdout
