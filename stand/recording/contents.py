@@ -13,6 +13,7 @@ from stand.recording import messages
 from stand.recording.messages import FrameMeta
 from stand.recording.records import Message
 
+RUN_END = "run.end"  # kind of the event that tells how a run ended
 FrameKey = tuple[int, int]  # time_ns and sequence, which an image and its description share
 
 

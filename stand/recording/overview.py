@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.interface import SessionError
 from stand.hub import Event, StepMark, StepState
-from stand.recording.contents import Channel, Contents
+from stand.recording.contents import RUN_END, Channel, Contents
 from stand.recording.gaps import Silence, silences
 from stand.recording.images import decode_image
 from stand.recording.inventory import SegmentFile, State, inventory
@@ -21,8 +21,6 @@ from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.records import FramePlace, frame_places, read_frame, read_head, reading, telemetry_messages
 from stand.recording.summary import Summary, read_summary
 from stand.recording.walk import Source, survey
-
-RUN_END = "run.end"
 
 
 @dataclass(frozen=True, slots=True)

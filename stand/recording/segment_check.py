@@ -8,11 +8,10 @@ which nothing reads, and what metadata says, which stand/recording/verify.py com
 
 from __future__ import annotations
 
-import io
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from math import inf
@@ -40,14 +39,13 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from stand.recording.records import CHUNK_LIMIT_BYTES, DAMAGE, Message
+from stand.recording.summary import CRC, RECORD, records, stream
 
-_RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
 _LENGTH = struct.Struct("<Q")
 _MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
-_CRC = struct.Struct("<I")
-_FOOTER_BYTES = _RECORD.size + 20  # places of the summary and of its offsets, CRC
-_DATA_END_BYTES = _RECORD.size + _CRC.size
+_FOOTER_BYTES = RECORD.size + 20  # places of the summary and of its offsets, CRC
+_DATA_END_BYTES = RECORD.size + CRC.size
 
 
 class Damage(NamedTuple):
@@ -108,26 +106,26 @@ def _read_index(file: BinaryIO, size: int) -> _Index:
     tail = file.read()
     if tail[_FOOTER_BYTES:] != MCAP0_MAGIC:
         raise ValueError("it ends in the middle")
-    begin = Footer.read(_stream(tail[_RECORD.size :])).summary_start
+    begin = Footer.read(stream(tail[RECORD.size :])).summary_start
     if not len(MCAP0_MAGIC) <= begin <= size - tail_bytes:
         raise ValueError("its index is not in the file")
     file.seek(begin)
     summary = file.read(size - tail_bytes - begin)
-    covered = _FOOTER_BYTES - _CRC.size
+    covered = _FOOTER_BYTES - CRC.size
     _check_crc(summary + tail[:covered], _crc_at(tail, covered), "its index")
     return _parsed(memoryview(summary), begin)
 
 
 def _parsed(summary: memoryview, begin: int) -> _Index:
     contents: dict[int, list[ReadDataStream]] = {}
-    for _, opcode, content in _records(summary):
-        contents.setdefault(opcode, []).append(_stream(content))
-    schemas = [Schema.read(stream) for stream in contents.get(Opcode.SCHEMA, ())]
-    channels = [Channel.read(stream) for stream in contents.get(Opcode.CHANNEL, ())]
-    chunks = [ChunkIndex.read(stream) for stream in contents.get(Opcode.CHUNK_INDEX, ())]
-    attachments = [AttachmentIndex.read(stream) for stream in contents.get(Opcode.ATTACHMENT_INDEX, ())]
-    metadata = [MetadataIndex.read(stream) for stream in contents.get(Opcode.METADATA_INDEX, ())]
-    (statistics,) = [Statistics.read(stream) for stream in contents.get(Opcode.STATISTICS, ())]
+    for opcode, content in records(summary):
+        contents.setdefault(opcode, []).append(stream(content))
+    schemas = [Schema.read(data) for data in contents.get(Opcode.SCHEMA, ())]
+    channels = [Channel.read(data) for data in contents.get(Opcode.CHANNEL, ())]
+    chunks = [ChunkIndex.read(data) for data in contents.get(Opcode.CHUNK_INDEX, ())]
+    attachments = [AttachmentIndex.read(data) for data in contents.get(Opcode.ATTACHMENT_INDEX, ())]
+    metadata = [MetadataIndex.read(data) for data in contents.get(Opcode.METADATA_INDEX, ())]
+    (statistics,) = [Statistics.read(data) for data in contents.get(Opcode.STATISTICS, ())]
     return _Index(
         begin,
         statistics,
@@ -137,18 +135,6 @@ def _parsed(summary: memoryview, begin: int) -> _Index:
         {schema.id: schema for schema in schemas},
         {channel.id: channel for channel in channels},
     )
-
-
-def _records(data: memoryview) -> Iterator[tuple[int, int, memoryview]]:
-    """(place, opcode, content) of each record; struct.error when the last one is cut."""
-    offset = 0
-    while offset < len(data):
-        opcode, length = _RECORD.unpack_from(data, offset)
-        begin = offset + _RECORD.size
-        if length > len(data) - begin:
-            raise struct.error("a record is cut short")
-        yield offset, opcode, data[begin : begin + length]
-        offset = begin + length
 
 
 class _Walk:
@@ -198,21 +184,21 @@ class _Walk:
             self._check.damages.append(Damage(f"{_sentence(error)} (at byte {place})", *times_ns))
 
     def _header(self, place: int, data: bytes) -> None:
-        content = data[len(MCAP0_MAGIC) + _RECORD.size :]
-        header = Header.read(_stream(content))
+        content = data[len(MCAP0_MAGIC) + RECORD.size :]
+        header = Header.read(stream(content))
         if data != MCAP0_MAGIC + _bytes_of(header) or header.profile:
             raise ValueError("its first bytes are not the header of one of our files")
 
     def _record(self, place: int, data: bytes) -> None:
         index = self._index
-        content = data[_RECORD.size :]
+        content = data[RECORD.size :]
         if place in index.chunks:
             self._chunk(index.chunks[place], data)
         elif place in index.attachments:
-            attachment = Attachment.read(_stream(content))
+            attachment = Attachment.read(stream(content))
             _check_same(_bytes_of(attachment), data, "an attachment")
         else:
-            metadata = Metadata.read(_stream(content))
+            metadata = Metadata.read(stream(content))
             _check_same(_bytes_of(metadata), data, "a metadata record")
             if metadata.name != index.metadata[place].name:
                 raise ValueError("a metadata record has another name than in the index")
@@ -220,7 +206,7 @@ class _Walk:
 
     def _chunk(self, told: ChunkIndex, data: bytes) -> None:
         """A chunk and the message indexes behind it."""
-        chunk = Chunk.read(_stream(data[_RECORD.size : told.chunk_length]))
+        chunk = Chunk.read(stream(data[RECORD.size : told.chunk_length]))
         head = _head_of(chunk, told)
         _check_same(head, data[: len(head)], "the head of a chunk")
         messages = self._contents(_uncompressed(chunk))
@@ -246,20 +232,22 @@ class _Walk:
     def _contents(self, data: memoryview) -> list[_Placed]:
         """The messages of a chunk; its schemas and channels are learnt."""
         placed: list[_Placed] = []
-        for offset, opcode, content in _records(data):
+        offset = 0
+        for opcode, content in records(data):
             if opcode == Opcode.MESSAGE:
                 channel, sequence, time_ns, _ = _MESSAGE.unpack_from(content)
                 topic = self._index.channels[channel].topic  # the first chunk, which tells it too, may be damaged
                 message = Message(topic, sequence, time_ns, bytes(content[_MESSAGE.size :]))
                 placed.append(_Placed(channel, offset, time_ns, message))
             elif opcode == Opcode.SCHEMA:
-                schema = Schema.read(_stream(content))
+                schema = Schema.read(stream(content))
                 self._schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                known = Channel.read(_stream(content))
+                known = Channel.read(stream(content))
                 self._channels[known.id] = known
             else:
                 raise ValueError(f"a chunk holds a record of kind {opcode}")
+            offset += RECORD.size + len(content)
         return placed
 
     def _count(self, placed: _Placed) -> None:
@@ -272,7 +260,7 @@ class _Walk:
 
     def _data_end(self, place: int, data: bytes) -> None:
         """Our writer makes no CRC of the whole data section (0): chunks and attachments have their own."""
-        _check_same(_RECORD.pack(Opcode.DATA_END, _CRC.size) + _CRC.pack(0), data, "the end of the data")
+        _check_same(RECORD.pack(Opcode.DATA_END, CRC.size) + CRC.pack(0), data, "the end of the data")
 
     def _compare(self) -> None:
         """What the whole walk found against the index; ValueError when they differ."""
@@ -309,7 +297,7 @@ def _head_of(chunk: Chunk, told: ChunkIndex) -> bytes:
     name = told.compression.encode()
     times_ns = told.message_start_time, told.message_end_time
     return (
-        _RECORD.pack(Opcode.CHUNK, told.chunk_length - _RECORD.size)
+        RECORD.pack(Opcode.CHUNK, told.chunk_length - RECORD.size)
         + _CHUNK.pack(*times_ns, told.uncompressed_size, chunk.uncompressed_crc, len(name))
         + name
         + _LENGTH.pack(told.compressed_size)
@@ -323,9 +311,9 @@ def _message_indexes(messages: list[_Placed], place: int) -> tuple[dict[int, int
         entries.setdefault(message.channel, []).append((message.time_ns, message.offset))
     offsets: dict[int, int] = {}
     data = b""
-    for channel, records in entries.items():
+    for channel, places in entries.items():
         offsets[channel] = place + len(data)
-        data += _bytes_of(MessageIndex(channel, records))
+        data += _bytes_of(MessageIndex(channel, places))
     return offsets, data
 
 
@@ -359,14 +347,10 @@ def _check_same(expected: bytes, found: bytes, what: str) -> None:
 
 
 def _crc_at(data: bytes, place: int) -> int:
-    (crc,) = _CRC.unpack_from(data, place)
+    (crc,) = CRC.unpack_from(data, place)
     return crc
 
 
 def _check_crc(data: bytes, crc: int, what: str) -> None:
     if zlib.crc32(data) != crc:
         raise ValueError(f"the CRC of {what} is wrong")
-
-
-def _stream(data: bytes | memoryview) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(data))

@@ -7,22 +7,26 @@ that the recording itself tells of: silence of a device, frames the camera or a 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import inf
 from pathlib import Path
 
+from drivers.clock import NS_PER_S
 from drivers.interface import SessionError
-from stand.recording.contents import Contents, FrameKey
+from stand.recording.contents import RUN_END, Contents, FrameKey
 from stand.recording.gaps import FRAMES_DROPPED, silences, told_blocks
 from stand.recording.images import CAMERA_IMAGE
 from stand.recording.instants import date_time
 from stand.recording.inventory import SegmentFile, State, inventory
 from stand.recording.layout import FRAMES, SEGMENT_METADATA, SESSION_METADATA, TELEMETRY
 from stand.recording.records import Message
+from stand.recording.salvage import SALVAGE_METADATA
 from stand.recording.segment_check import Damage, SegmentCheck, check_segment
 
-SALVAGE_METADATA = "salvage"
+# Between the middle of a frame's exposure and its description being on the disk, or the frame itself.
+TORN_NS = 5 * NS_PER_S
 
 
 class Severity(StrEnum):
@@ -83,6 +87,24 @@ class _Read:
             if name.startswith(f"{series}/")
             for damage in check.damages
         )
+
+    def is_torn_at(self, series: str, time_ns: int) -> bool:
+        """The series lost what it held of that instant because the recorder was killed: it lies behind the end of a
+        salvaged segment and before the next one, or right behind the last segment of a run without an end."""
+        checks = [check for name, check in self.checks.items() if name.startswith(f"{series}/")]
+        is_ended = any(event.kind == RUN_END for event in self.contents.events)
+        late_ns = TORN_NS if series == TELEMETRY else 0  # a description is written after what happened meanwhile
+        next_ns = [*(check.first_ns for check in checks[1:]), inf]
+        for check, end_ns in zip(checks, next_ns, strict=True):
+            if SALVAGE_METADATA in check.metadata:
+                torn_ns = end_ns
+            elif end_ns == inf and not is_ended:
+                torn_ns = check.last_ns + TORN_NS
+            else:
+                continue
+            if check.last_ns - late_ns < time_ns < torn_ns:
+                return True
+        return False
 
 
 def _no_report(done_bytes: float, text: str) -> None:
@@ -197,15 +219,19 @@ def _frames_against_descriptions(read: _Read) -> Iterator[Finding]:
     described = Counter(key for key, _ in read.contents.metas)
     block_ids = {key: meta.block_id for key, meta in read.contents.metas}
     told = told_blocks(read.contents.events)
-    bare = [key for key in (read.images - described) if not read.is_damaged_at(TELEMETRY, key[0])]
-    gone = [key for key in (described - read.images) if not read.is_damaged_at(FRAMES, key[0])]
-    lost = [key for key in gone if any(block_ids[key] in blocks for blocks in told)]
-    yield from _frames(_error, bare, "without a description in the telemetry")
-    yield from _frames(_error, sorted(set(gone) - set(lost)), "missing, though described in the telemetry")
-    yield from _frames(_note, lost, "described but lost by the recorder, as its events say")
+    bare = [key for key in read.images - described if not read.is_damaged_at(TELEMETRY, key[0])]
+    gone = [key for key in described - read.images if not read.is_damaged_at(FRAMES, key[0])]
+    bare_torn = [key for key in bare if read.is_torn_at(TELEMETRY, key[0])]
+    gone_told = [key for key in gone if any(block_ids[key] in blocks for blocks in told)]
+    gone_torn = [key for key in gone if key not in gone_told and read.is_torn_at(FRAMES, key[0])]
+    yield from _frames(_error, set(bare) - {*bare_torn}, "without a description in the telemetry")
+    yield from _frames(_error, set(gone) - {*gone_told, *gone_torn}, "missing, though described in the telemetry")
+    yield from _frames(_note, gone_told, "described but lost by the recorder, as its events say")
+    yield from _frames(_note, bare_torn, "without a description, which was lost when the recorder was killed")
+    yield from _frames(_note, gone_torn, "described but were lost when the recorder was killed")
 
 
-def _frames(kind: Callable[[str], Finding], keys: list[FrameKey], what: str) -> Iterator[Finding]:
+def _frames(kind: Callable[[str], Finding], keys: Collection[FrameKey], what: str) -> Iterator[Finding]:
     """One finding for all frames of a kind."""
     if keys:
         times_ns, blocks = sorted(time_ns for time_ns, _ in keys), sorted(block for _, block in keys)

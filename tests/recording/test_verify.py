@@ -4,12 +4,14 @@ import shutil
 
 import numpy as np
 import pytest
+from mcap.reader import SeekingReader
 
 from drivers.clock import NS_PER_S
 from drivers.interface import Frame, Reading, SessionError
 from stand.hub import Batch, Event, StepMark, StepState
 from stand.recording.gaps import silences
 from stand.recording.inventory import inventory
+from stand.recording.salvage import salvage_session
 from stand.recording.session import Session
 from stand.recording.verify import Severity, verify
 
@@ -107,6 +109,39 @@ async def test_every_byte_is_guarded_but_the_name_of_the_writers_library(tmp_pat
             unguarded.append(place)
     begin = data.index(b"mcap-python/")
     assert set(unguarded) <= set(range(begin, begin + len("mcap-python/1.6.0 ")))
+
+
+def tear(path, chunk):
+    """The segment as a kill leaves it: unfinished, and cut within its chunk of that number (from the end, from 1)."""
+    data = path.read_bytes()
+    with path.open("rb") as file:
+        summary = SeekingReader(file).get_summary()
+    path.with_name(f"{path.name}.part").write_bytes(data[: summary.chunk_indexes[-chunk].chunk_start_offset + 30])
+    path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("series", "text"),
+    [
+        ("telemetry", "without a description, which was lost when the recorder was killed"),
+        ("frames", "described but were lost when the recorder was killed"),
+    ],
+)
+async def test_the_end_that_a_kill_cost_is_a_note_once_the_session_is_salvaged(session, series, text):
+    tear(max((session / series).iterdir()), chunk=1)
+    assert any("is not finished" in error for error in errors(session))
+    salvage_session(session)
+    assert errors(session) == []
+    assert any(text in note for note in notes(session))
+
+
+async def test_a_salvaged_segment_and_what_the_kill_cost_within_the_session_are_notes(tmp_path):
+    directory = await recorded(tmp_path / "s")
+    tear(directory / "telemetry" / "0001.mcap", chunk=1)
+    salvage_session(directory)
+    assert errors(directory) == []
+    assert any(note.startswith("note: telemetry/0001.mcap: was salvaged (source: 000") for note in notes(directory))
+    assert any("without a description, which was lost when" in note for note in notes(directory))
 
 
 @pytest.mark.parametrize("series", ["telemetry", "frames"])
