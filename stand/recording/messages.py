@@ -326,7 +326,7 @@ def decode_step(data: bytes, time_ns: int) -> StepMark:
     try:
         parameters = json.loads(_get(m, "parameters_json"))
         state = StepState(_get(m, "state"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # JSON may be nested deeper than Python goes
         raise SessionError(f"a recorded step cannot be read ({error})") from error
     if not isinstance(parameters, dict):
         raise SessionError("a recorded step has parameters that are not keys and values")

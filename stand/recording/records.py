@@ -7,6 +7,7 @@ one, too. Anything wrong is a SessionError that names the file.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Container, Generator, Iterator
 from contextlib import contextmanager
@@ -27,8 +28,19 @@ from stand.recording.messages import CLASSES
 from stand.recording.summary import CRC, RECORD, ChunkPlace, Summary, check_crc, read_summary, records, stream
 
 # What reading damaged bytes raises; CRC and Unicode errors are ValueErrors.
-DAMAGE = (McapError, OSError, struct.error, zstandard.ZstdError, ValueError, LookupError, EOFError, MemoryError)
+DAMAGE = (
+    McapError,
+    OSError,
+    struct.error,
+    zstandard.ZstdError,
+    ValueError,
+    LookupError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+)
 CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; whoever claims more is damaged
+INFLATED_LIMIT_BYTES = 1 << 26  # only telemetry is compressed, and its chunks are 1 MiB and a message
 SCHEMAS = {
     CAMERA_IMAGE: {image.DESCRIPTOR.full_name for image in IMAGE_CLASS.values()},
     **{topic: {message.DESCRIPTOR.full_name} for topic, message in CLASSES.items()},
@@ -176,8 +188,8 @@ def _channels(summary: Summary) -> Iterator[tuple[int, Channel]]:
 
 def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
     """The records of the chunk at that place, their CRC checked."""
-    if place.length > CHUNK_LIMIT_BYTES:
-        raise ValueError(f"a chunk of {place.length} bytes")
+    if place.length > CHUNK_LIMIT_BYTES or place.offset + place.length > os.fstat(file.fileno()).st_size:
+        raise ValueError(f"a chunk of {place.length} bytes at {place.offset}")
     file.seek(place.offset)
     ((opcode, chunk),) = records(memoryview(file.read(place.length)))
     if opcode != Opcode.CHUNK:
@@ -193,10 +205,9 @@ def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
 
 def _uncompressed(compression: bytes, data: memoryview, size: int) -> memoryview:
     """The content of a chunk that says it has that size."""
-    if size > CHUNK_LIMIT_BYTES:
-        raise ValueError(f"a chunk of {size} bytes")
     if compression == b"zstd":
-        if zstandard.frame_content_size(data) != size:  # else a damaged size would be allocated as told
+        # As much memory is taken as the frame says: so both have to say the same, and not too much.
+        if size > INFLATED_LIMIT_BYTES or zstandard.frame_content_size(data) != size:
             raise ValueError("a chunk's size is wrong")
         data = memoryview(zstandard.decompress(data))
     elif compression:
@@ -251,4 +262,7 @@ def read_frame(place: FramePlace) -> Message:
     with reading(place.path), place.path.open("rb") as file:
         chunk = _chunk(file, place.chunk)
         ((_, offset, end),) = _message_places(chunk, (place.channel,))
-        return _message(CAMERA_IMAGE, chunk, offset, end)
+        message = _message(CAMERA_IMAGE, chunk, offset, end)
+        if message.time_ns != place.time_ns:
+            raise ValueError("the index tells another time")
+        return message

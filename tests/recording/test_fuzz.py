@@ -1,0 +1,214 @@
+"""Ten thousand broken sessions: each read is what was recorded, or a SessionError in one sentence that names it."""
+
+import resource
+import shutil
+import signal
+from contextlib import contextmanager
+from random import Random
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+
+from drivers.clock import NS_PER_S
+from drivers.interface import Frame, Reading, SessionError
+from stand.hub import Batch, Event, StepMark, StepState
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
+from stand.recording.session import Session
+from stand.recording.telemetry import TelemetryEncoder
+from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
+
+START_NS = 1_767_290_400 * NS_PER_S
+METADATA = {"session_id": "night-1", "operator": "J. Krukowski"}
+ATTACHMENTS = {"config.yaml": "a: 1\n"}
+ENCODER = TelemetryEncoder({"camera": "camera"})
+SEGMENTS = (f"{TELEMETRY}/0000.mcap", f"{FRAMES}/0000.mcap")
+MEMORY_BYTES = 192 << 20  # more than it had; the largest honest need is 64 MiB for a chunk
+LIMIT_S = 5.0
+ROUNDS = 8
+INPUTS = 10_000
+
+
+class TooSlow(BaseException):
+    """No Exception, so that nothing takes it for damage."""
+
+
+def items(second):
+    time_ns = START_NS + second * NS_PER_S
+    remark = "slow" if second % 2 else ""
+    yield Batch("camera", time_ns, (Reading("camera.temperature", 40 + second / 8, "degC", time_ns, reason=remark),))
+    yield frame(second)
+    yield StepMark(time_ns, f"soak-{second}", second, "Soak", StepState.DONE, {"dwell_s": 2700.0})
+    yield Event(time_ns, "info", "note", f"second {second}")
+
+
+def frame(second):
+    image = np.random.default_rng(second).integers(0, 255, (6, 8), np.uint8)
+    return Frame("camera.image", image, START_NS + second * NS_PER_S + 7, 0.1, 0.0, 41.0, second, 7 * second)
+
+
+def write_session(directory, encoding):
+    """Four seconds in two chunks of telemetry, and four frames."""
+    topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS[encoding]),)
+    images = [
+        [Record(CAMERA_IMAGE, frame(k).time_ns, encode_image(frame(k), encoding), frame(k).block_id)] for k in range(4)
+    ]
+    halves = ([item for k in seconds for item in items(k)] for seconds in ((0, 1), (2, 3)))
+    telemetry = [[record for item in half for record in ENCODER.encode(item)] for half in halves]
+    write_series(directory / FRAMES, topics, CompressionType.NONE, images)
+    write_series(directory / TELEMETRY, ENCODER.topics(), CompressionType.ZSTD, telemetry)
+
+
+def write_series(folder, topics, compression, commits):
+    folder.mkdir(parents=True)
+    series = Series(folder, SeriesForm(folder.name, topics, compression, METADATA, ATTACHMENTS, 1 << 40, 1 << 60))
+    for records in commits:
+        series.commit(records, START_NS)
+    series.finish()
+
+
+@pytest.fixture(scope="module", params=["png", "raw"])
+def sound(request, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("sound") / request.param
+    write_session(directory, request.param)
+    return directory
+
+
+def frame_key(got):
+    return (*(repr(getattr(got, name)) for name in ("time_ns", "camera_degC", "block_id", "step_id")), *image_key(got))
+
+
+def image_key(got):
+    return got.image.shape, got.image.tobytes()
+
+
+def item_key(item):
+    return frame_key(item) if isinstance(item, Frame) else repr(item)
+
+
+# What a session can be asked for, each as a sequence in the order it is delivered.
+READS = {
+    "metadata": lambda session: session.metadata.items(),
+    "attachments": lambda session: session.attachments.items(),
+    "channels": lambda session: session.channels(),
+    "readings": lambda session: [(name, *map(list, session.readings(name))) for name in session.channels()],
+    "temperature": lambda session: zip(*session.readings("camera.temperature"), strict=True),
+    "steps": lambda session: session.steps(),
+    "events": lambda session: session.events(),
+    "frame times": lambda session: session.frame_times_ns.tolist(),
+    "descriptions": lambda session: session.frame_metas,
+    "frame": lambda session: [frame_key(session.frame(2))],
+    "frames": lambda session: map(frame_key, session.frames()),
+    "items": lambda session: map(item_key, session.items()),
+}
+
+
+def read_everything(directory, delivered):
+    """Fill `delivered` with what each read gives, and return the errors."""
+    errors = []
+    try:
+        session = Session.open(directory)
+    except SessionError as error:
+        return [error]
+    for name, read in READS.items():
+        values = delivered[name] = []
+        try:
+            for value in read(session):
+                values.append(repr(value))
+        except SessionError as error:
+            errors.append(error)
+            values.append("refused")
+    return errors
+
+
+@contextmanager
+def limits():
+    """Little more memory than there is in use, and an alarm for what takes too long."""
+
+    def ring(*_):
+        raise TooSlow
+
+    with open("/proc/self/statm") as statm:
+        used_bytes = int(statm.read().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    handler = signal.signal(signal.SIGALRM, ring)
+    resource.setrlimit(resource.RLIMIT_AS, (used_bytes + MEMORY_BYTES, before[1]))
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def mutants(directory, seed, mutations, count):
+    """Yields `count` times after one segment in `directory` was broken, and in the end repairs it."""
+    rng = Random(seed)
+    originals = {name: (directory / name).read_bytes() for name in SEGMENTS}
+    for _ in range(count):
+        name = rng.choice(SEGMENTS)
+        (directory / name).write_bytes(rng.choice(mutations)(rng, originals[name]))
+        signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+        yield
+        (directory / name).write_bytes(originals[name])
+
+
+def check_errors(errors, directory):
+    for error in errors:
+        text = str(error)
+        assert str(directory) in text, text
+        assert "\n" not in text
+        assert "MemoryError" not in text, "sizes are checked before memory is taken"
+
+
+@pytest.mark.parametrize("seed", range(ROUNDS // 4))
+def test_damage_is_refused_or_harmless_and_never_wrong_data(sound, tmp_path, seed):
+    directory = shutil.copytree(sound, tmp_path / "copy")
+    expected = {}
+    assert read_everything(directory, expected) == []
+    refused = 0
+    mutations = (mutate_bytes, mutate_bytes, mutate_field, mutate_order)
+    count = INPUTS // ROUNDS
+    with limits():
+        for _ in mutants(directory, seed, mutations, count):
+            delivered = {}
+            errors = read_everything(directory, delivered)
+            check_errors(errors, directory)
+            refused += bool(errors)
+            for name, values in delivered.items():
+                if values[-1:] == ["refused"]:
+                    assert values[:-1] == expected[name][: len(values) - 1], name
+                else:
+                    assert values == expected[name], name
+    assert refused > count / 2
+
+
+@pytest.mark.parametrize("seed", range(ROUNDS // 4))
+def test_wrong_content_under_right_crcs_is_data_or_a_sentence(sound, tmp_path, seed):
+    directory = shutil.copytree(sound, tmp_path / "copy")
+    refused = 0
+    count = INPUTS // ROUNDS
+    with limits():
+        for _ in mutants(directory, 100 + seed, (mutate_inside,), count):
+            errors = read_everything(directory, {})
+            check_errors(errors, directory)
+            refused += bool(errors)
+    assert count / 10 < refused < count
+
+
+def test_the_broken_sessions_begin_with_sound_ones(sound, tmp_path):
+    """Taken apart and put together again a segment reads the same: then what is refused is so for its mutation."""
+    directory = shutil.copytree(sound, tmp_path / "copy")
+    expected, got = {}, {}
+    read_everything(sound, expected)
+    for name in SEGMENTS:
+        data = (directory / name).read_bytes()
+        (directory / name).write_bytes(put_together(take_apart(data)))
+        assert len(data) < 10_000
+    assert read_everything(directory, got) == []
+    assert got == expected
+    assert len(expected["frames"]) == 4
+    assert len(expected["items"]) == 16
