@@ -2,9 +2,8 @@
 
 Read by place from the front. A chunk and an attachment prove themselves by their CRC (our writer always makes one,
 so a CRC of 0 is a CRC), the records without one by being, byte for byte, what the writer makes of what they say.
-Behind a damaged place the walk goes on: at the end the damaged record claims if a record stands there, else at the
-next place that looks like the head of a chunk and proves to be one. Inside sound records nothing is searched, so an
-MCAP file that is attached is an attachment.
+Behind a damaged place the walk goes on where the next record looks like one and proves to be one. Inside sound
+records nothing is searched, so an MCAP file that is attached is an attachment.
 
 Memory is flat: one record at a time. Only OSError is raised, when the disk does not give a byte.
 """
@@ -194,13 +193,6 @@ class _Walk:
 
     def _next_record(self, offset: int) -> _Proven | None:
         """The first sound record behind the damaged one at `offset`."""
-        claim = _claim(self._source.read(offset, _RECORD.size))
-        if offset == 0:
-            claimed = len(MCAP0_MAGIC)
-        else:
-            claimed = offset + _RECORD.size + claim.length if claim else self._source.size
-        if claimed < self._source.size and (record := self._record_at(claimed)):
-            return record
         pattern = _AFTER_OPENING if self.found.is_opening_whole else _IN_OPENING
         candidates = self._candidates(offset + 1, pattern)
         return next((record for place in candidates if (record := self._record_at(place))), None)

@@ -3,6 +3,7 @@ import os
 import random
 import subprocess
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from drivers.interface import SessionError
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
 from stand.recording.session import Session
+from stand.recording.sink import CommitSink
 from tests.recording.damage import (
     ATTACHMENTS,
     DAMAGES,
@@ -220,6 +222,16 @@ def test_metadata_is_voted_on(damaged):
     assert read_segment(done.path) == written.messages
 
 
+def test_metadata_with_the_zeros_of_a_lost_block_is_no_metadata(tmp_path):
+    written = write_segment(tmp_path / TELEMETRY, TELEMETRY, range(3))
+    write_segment(tmp_path / FRAMES, FRAMES, range(3))
+    name = written.data.index("Zoë".encode())
+    (tmp_path / TELEMETRY / "0000.mcap.part").write_bytes(hole(name, name + 2)(written.data))
+    done, _ = salvage_session(tmp_path)
+    assert metadata_of(done.path, "session") == METADATA
+    assert read_segment(done.path) == written.messages
+
+
 @pytest.mark.parametrize("content", [b"", bytes(5000), b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(5000)])
 def test_a_part_that_never_held_anything_is_removed(damaged, content):
     folder, _, _ = damaged(FRAMES, lambda data: content)
@@ -259,6 +271,17 @@ def test_beside_its_finished_segment_a_part_that_holds_nothing_more_is_removed(d
         assert (again.path, again.kept) == (done.path, None)
         assert names(folder) == ["0000.mcap", "0001.mcap"]
         assert read_segment(done.path) == written.messages
+
+
+def test_beside_a_finished_segment_a_part_that_holds_more_replaces_it(damaged, night):
+    cut = night[1][TELEMETRY, "part"].blocks[30].end
+    folder, path, written = damaged(TELEMETRY, lambda data: data[:cut])
+    salvage_session(folder.parent)
+    path.write_bytes(written.data)
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.messages, done.kept) == (folder / "0001.mcap", len(written.messages), None)
+    assert read_segment(done.path) == written.messages
+    assert names(folder) == ["0000.mcap", "0001.mcap"]
 
 
 @pytest.mark.parametrize("spoil", [lambda data: data[: len(data) // 3], lambda data: b""])
@@ -328,24 +351,40 @@ def test_a_salvage_that_was_killed_at_any_step_is_repeated(damaged, change):
     assert salvage_session(folder.parent) == []
 
 
-def test_a_full_disk_leaves_the_original_as_it_was(tmp_path, night):
+@contextmanager
+def small_disk(folder, size_bytes):
     if os.geteuid():
         pytest.skip("only root can mount a small disk")
-    _, written = night
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    part_bytes = len(written[FRAMES, "part"].data)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={part_bytes + 20_000}", "tmpfs", disk], check=True)
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_bytes}", "tmpfs", folder], check=True)
     try:
+        yield folder
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_leaves_the_original_as_it_was(tmp_path, night):
+    data = night[1][FRAMES, "part"].data
+    with small_disk(tmp_path / "disk", len(data) + 20_000) as disk:
         (disk / "night" / FRAMES).mkdir(parents=True)
         part = disk / "night" / FRAMES / "0000.mcap.part"
-        part.write_bytes(written[FRAMES, "part"].data)
+        part.write_bytes(data)
         with pytest.raises(SessionError, match=r"cannot be salvaged and is left as it was .*No space left"):
             salvage_unfinished(disk)
         assert names(disk) == ["night/frames/0000.mcap.part"]
-        assert part.read_bytes() == written[FRAMES, "part"].data
-    finally:
-        subprocess.run(["umount", disk], check=True)
+        assert part.read_bytes() == data
+
+
+def test_what_a_dead_recorder_had_reserved_is_room_for_the_copy(tmp_path, night):
+    data = night[1][FRAMES, "part"].data
+    disk_bytes = 4 * len(data)
+    with small_disk(tmp_path / "disk", disk_bytes) as disk:
+        (disk / "night" / FRAMES).mkdir(parents=True)
+        sink = CommitSink(disk / "night" / FRAMES / "0000.mcap.part", disk_bytes - 20_000)
+        sink.append([data])
+        sink.close()
+        (done,) = salvage_unfinished(disk)
+        assert read_segment(done.path) == night[1][FRAMES, "part"].messages
 
 
 def write_with_attachment(path, attached):
