@@ -23,8 +23,11 @@ TEMPORARY = f"{FINISHED}.tmp"
 
 
 def merge_chunks(source: Path, target: Path, compression: CompressionType) -> None:
-    """Copy the complete segment `source` to `target`, durably; one chunk is in memory at a time. On any error there is
-    neither a target nor a temporary file: OSError from the disk, others when the source does not read as written."""
+    """Copy the complete segment `source` to `target`, durably; one chunk is in memory at a time.
+
+    On an error the temporary file is removed and `source` is as it was; OSError from the disk, others when the source
+    does not read as it was written.
+    """
     temporary = target.with_name(target.name.removesuffix(FINISHED) + TEMPORARY)
     sink = CommitSink(temporary)
     try:

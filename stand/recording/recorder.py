@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from mcap.writer import CompressionType
@@ -23,11 +22,13 @@ from drivers.clock import Clock, seconds_ns
 from drivers.interface import Frame, SessionError
 from drivers.lane import Lane
 from stand.hub import Event, Hub, Item
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.losses import Losses
+from stand.recording.raw import encode_raw
 from stand.recording.segment import SeriesForm, Topic
 from stand.recording.series import Series
+from stand.recording.settings import USUAL, RecordingSettings, SessionInfo
 from stand.recording.sink import sync_folder
 from stand.recording.space import Notice, SpaceWatch
 from stand.recording.telemetry import TelemetryEncoder
@@ -35,49 +36,6 @@ from stand.recording.writers import ImageWriter, TelemetryWriter
 
 TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it goes on when frames or others fill the disk
 NO_IMAGE = np.empty((0, 0), np.uint8)
-
-
-@dataclass(frozen=True, slots=True)
-class SessionInfo:
-    """Who recorded what with which; the metadata record `session` of every segment.
-
-    simulated: the devices were fakes, in whatever time. On a virtual clock `host` is not recorded: the same run on
-    another machine is the same session.
-    """
-
-    session_id: str
-    recipe: str
-    camera_serial: str
-    operator: str
-    software_version: str
-    clock_source: Literal["wall", "virtual"]
-    simulated: bool = False
-    host: str = ""
-
-    def metadata(self) -> dict[str, str]:
-        """The fields as MCAP metadata."""
-        fields: dict[str, str] = {**asdict(self), "simulated": str(self.simulated).lower()}
-        if self.clock_source == "virtual":
-            del fields["host"]
-        return fields
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingSettings:
-    """How to record. `telemetry_commit_s` is on the stand's clock: on a virtual one a long period (60) costs nothing
-    that a real night would lose and spares tens of thousands of disk syncs. A segment is closed at the first commit
-    after it has `segment_bytes` or `segment_s`, whichever is first.
-
-    With less than `stop_frames_below_bytes` free on the disk no frames are recorded, so that telemetry can go on;
-    with less than `alert_below_fraction` of the disk free there is a warning."""
-
-    frame_encoding: ImageEncoding = "png"
-    telemetry_commit_s: float = 1.0
-    segment_bytes: int = 1_000_000_000
-    segment_s: float = 600.0
-    queue_frames: int = 20
-    stop_frames_below_bytes: int = 2_000_000_000
-    alert_below_fraction: float = 0.10
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +64,7 @@ class Recorder:
         devices: Mapping[str, str],
         hub: Hub,
         clock: Clock,
-        settings: RecordingSettings = RecordingSettings(),
+        settings: RecordingSettings = USUAL,
         encode: Callable[[Frame], bytes] | None = None,
     ) -> None:
         self.directory = directory
@@ -135,7 +93,7 @@ class Recorder:
 
     @property
     def saved(self) -> Saved:
-        """What has been acknowledged: it is on the disk and stays there."""
+        """What has been acknowledged since `start`: it is on the disk and stays there."""
         return Saved(self._image_writer.saved, self._telemetry_writer.messages_saved, self._losses.total)
 
     def start(self) -> None:
@@ -186,7 +144,8 @@ class Recorder:
         self._telemetry_series.open(self._clock.now_ns())
 
     def _encode_alone(self, frame: Frame) -> bytes:
-        return encode_image(frame, self._settings.frame_encoding)
+        encoding = self._settings.frame_encoding
+        return encode_raw(frame) if encoding == "raw" else encode_image(frame, encoding)
 
     async def run(self) -> None:
         """Record until cancelled."""
@@ -266,19 +225,21 @@ class Recorder:
             self._tell_progress()
 
     async def _save_telemetry_on_ticks(self) -> None:
-        async for _ in self._ticks():
+        due_ns = self._clock.now_ns()
+        while True:
+            due_ns = await self._next_tick(due_ns)
             await self._save_telemetry()
 
     async def _report_on_ticks(self) -> None:
-        async for _ in self._ticks():
-            self._report()
-
-    async def _ticks(self) -> AsyncIterator[None]:
         due_ns = self._clock.now_ns()
         while True:
-            due_ns += seconds_ns(self._settings.telemetry_commit_s)
-            await self._clock.sleep_until(due_ns)
-            yield
+            due_ns = await self._next_tick(due_ns)
+            self._report()
+
+    async def _next_tick(self, last_ns: int) -> int:
+        due_ns = last_ns + seconds_ns(self._settings.telemetry_commit_s)
+        await self._clock.sleep_until(due_ns)
+        return due_ns
 
     async def _save_telemetry(self) -> OSError | None:
         """Commit what was published since the last time and what failed before; the error when the disk refuses."""

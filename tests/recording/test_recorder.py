@@ -14,7 +14,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.interface import Frame, Reading, SessionError, bad_reading
 from stand.hub import Batch, Event, Hub, StepMark, StepState
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.images import encode_image
+from stand.recording.losses import Losses, ranges
+from stand.recording.recorder import Recorder, RecordingSettings, Saved, SessionInfo
 from stand.recording.session import Session
 from tests.recording.disks import limit_files
 
@@ -278,3 +280,119 @@ def test_a_place_where_nothing_can_be_written_is_a_session_error(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(SessionError, match="no session can be recorded here"):
         Recorder(tmp_path / "file", INFO, {}, DEVICES, Hub(), VirtualClock(START_NS)).start()
+
+
+async def start(directory, settings, encode=None):
+    """A recorder that runs on a virtual clock; returns it, its clock, its hub and its tasks."""
+    clock, hub = VirtualClock(START_NS), Hub()
+    recorder = Recorder(directory, INFO, ATTACHMENTS, DEVICES, hub, clock, settings, encode)
+    recorder.start()
+    return recorder, clock, hub, [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
+
+
+async def stop(tasks):
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_flushed_returns_when_all_before_it_is_on_the_disk_without_a_wait_for_the_tick(tmp_path):
+    recorder, clock, hub, tasks = await start(tmp_path / "s", replace(SETTINGS, telemetry_commit_s=60.0))
+    assert recorder.saved == Saved(0, 0, 0)
+    for index in range(12):
+        hub.publish(frame(START_NS + index, index))
+        hub.publish(Event(START_NS + index, "info", "note", f"second {index}"))
+    assert recorder.saved == Saved(0, 0, 0)
+    await recorder.flushed()
+    assert recorder.saved == Saved(12, 36, 0)  # a description for each frame; two messages for each event
+    assert clock.now_ns() == START_NS
+    assert len(list(committed_event_texts(tmp_path / "s"))) == 12
+    await recorder.flushed()
+    await stop(tasks)
+    await recorder.finish()
+    assert Session.open(tmp_path / "s").frame_count == 12
+
+
+async def test_flushed_waits_for_telemetry_the_disk_refuses(tmp_path, files_limited):
+    at = files_limited(100, {1})
+    recorder, clock, hub, tasks = await start(tmp_path / "s", SETTINGS)
+    at(1)
+    hub.publish(Event(START_NS, "info", "note", "kept in memory"))
+    waiting = asyncio.create_task(recorder.flushed())
+    await clock.sleep_until(START_NS + 3 * NS_PER_S)
+    assert not waiting.done()
+    at(2)
+    await waiting
+    assert next(committed_event_texts(tmp_path / "s")) == "kept in memory"
+    await stop(tasks)
+    await recorder.finish()
+
+
+async def test_frames_that_did_not_fit_the_queue_are_described_all_the_same(tmp_path):
+    recorder, _, hub, tasks = await start(tmp_path / "s", replace(SETTINGS, queue_frames=3))
+    for index in range(10):
+        hub.publish(frame(START_NS + index, index))
+    await recorder.flushed()
+    assert recorder.saved == Saved(3, 10, 7)
+    await stop(tasks)
+    await recorder.finish()
+
+
+async def test_a_frame_that_cannot_be_encoded_is_lost_and_the_next_one_is_not(tmp_path):
+    def encode(got):
+        if got.block_id == 1:
+            raise ValueError("no marker in sight")
+        return encode_image(got, "png")
+
+    recorder, _, hub, tasks = await start(tmp_path / "s", SETTINGS, encode)
+    for index in range(3):
+        hub.publish(frame(START_NS + index, index))
+    await recorder.flushed()
+    assert recorder.saved == Saved(2, 3, 1)
+    await stop(tasks)
+    await recorder.finish()
+    session = Session.open(tmp_path / "s")
+    assert [got.block_id for got in session.frames()] == [0, 2]
+    (event,) = session.events()
+    assert event.text == "frames lost: 1 (block 1 of step capture-1), 1 in all; no marker in sight"
+
+
+async def test_finish_goes_to_its_end_also_when_its_caller_is_cancelled(tmp_path):
+    recorder, _, hub, tasks = await start(tmp_path / "s", SETTINGS)
+    for index in range(15):
+        hub.publish(frame(START_NS + index, index))
+    await stop(tasks)
+    finishing = asyncio.create_task(recorder.finish())
+    await asyncio.sleep(0)
+    finishing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await finishing
+    assert Session.open(tmp_path / "s").frame_count == 15
+    assert not Session.open(tmp_path / "s").incomplete
+    await recorder.finish()
+
+
+@pytest.mark.parametrize(
+    ("blocks", "text"),
+    [
+        ([3], "block 3"),
+        ([12, 13, 14, 17], "blocks 12 to 14, 17"),
+        ([1, 2, 5, 7, 8], "blocks 1 to 2, 5, 7 to 8"),
+        ([5, 4], "blocks 5, 4"),
+    ],
+)
+def test_every_lost_block_is_named(blocks, text):
+    assert ranges(blocks) == text
+
+
+def test_losses_are_told_by_reason_and_step():
+    losses = Losses()
+    for block_id, step_id, reason in [(1, "a", "slow"), (2, "a", "slow"), (4, "b", "slow"), (5, "", "full")]:
+        losses.count(replace(frame(START_NS, block_id), step_id=step_id), reason)
+    assert losses.total == 4
+    assert losses.take() == [
+        "frames lost: 3 (blocks 1 to 2 of step a and block 4 of step b), 4 in all; slow",
+        "frames lost: 1 (block 5), 4 in all; full",
+    ]
+    assert losses.take() == []
+    assert losses.total == 4

@@ -189,8 +189,8 @@ def test_a_segment_whose_name_is_taken_by_a_folder_stays_unfinished_and_whole(tm
 
 
 def test_a_disk_that_dies_tells_at_once_and_keeps_what_was_acknowledged(tmp_path):
-    """The disk behind ext4 is a sparse file on a disk of 24 MB: when that is full, ext4 takes a block but cannot sync it,
-    and refuses from then on to cut it off again."""
+    """The disk behind ext4 is a sparse file on a disk of 24 MB: when that is full, a block is taken but not synced,
+    and from then on ext4 refuses to cut it off again."""
     with tmpfs(tmp_path / "small", "24m") as small, ext4(small / "disk", 200 << 20) as disk:
         folder = disk / "s"
         folder.mkdir()

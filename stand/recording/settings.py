@@ -1,0 +1,54 @@
+"""What a recording is told before it begins: who records what, and how."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from stand.recording.images import ImageEncoding
+
+
+@dataclass(frozen=True, slots=True)
+class SessionInfo:
+    """Who recorded what with which; the metadata record `session` of every segment.
+
+    simulated: the devices were fakes, in whatever time. On a virtual clock `host` is not recorded: the same run on
+    another machine is the same session.
+    """
+
+    session_id: str
+    recipe: str
+    camera_serial: str
+    operator: str
+    software_version: str
+    clock_source: Literal["wall", "virtual"]
+    simulated: bool = False
+    host: str = ""
+
+    def metadata(self) -> dict[str, str]:
+        """The fields as MCAP metadata."""
+        fields: dict[str, str] = {**asdict(self), "simulated": str(self.simulated).lower()}
+        if self.clock_source == "virtual":
+            del fields["host"]
+        return fields
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingSettings:
+    """How to record. `telemetry_commit_s` is on the stand's clock: on a virtual one a long period (60) costs nothing
+    that a real night would lose and spares tens of thousands of disk syncs. A segment is closed at the first commit
+    after it has `segment_bytes` or `segment_s`, whichever is first.
+
+    With less than `stop_frames_below_bytes` free on the disk no frames are recorded, so that telemetry can go on;
+    with less than `alert_below_fraction` of the disk free there is a warning."""
+
+    frame_encoding: ImageEncoding = "png"
+    telemetry_commit_s: float = 1.0
+    segment_bytes: int = 1_000_000_000
+    segment_s: float = 600.0
+    queue_frames: int = 20
+    stop_frames_below_bytes: int = 2_000_000_000
+    alert_below_fraction: float = 0.10
+
+
+USUAL = RecordingSettings()
