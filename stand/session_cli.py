@@ -160,12 +160,19 @@ def salvage(
     Example: stand session salvage sessions
     """
     with one_line_errors():
-        done = [(path, salvaged) for path in _sessions_in(directory) for salvaged in salvage_session(path)]
-        for path, salvaged in done:
-            typer.echo(one_line(_salvage_line(path, salvaged)))
+        sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
+        done: list[Salvaged] = []
+        done_bytes = 0
+        with _progress_of("salvage", sum(sizes.values()), sum(sizes.values())) as report:
+            for path, size_bytes in sizes.items():
+                for salvaged in salvage_session(path):
+                    typer.echo(one_line(_salvage_line(path, salvaged)))
+                    done.append(salvaged)
+                done_bytes += size_bytes
+                report(done_bytes, one_line(path.name))
         if not done:
             typer.echo("nothing to salvage")
-        if any(salvaged.kept for _, salvaged in done):
+        if any(salvaged.kept for salvaged in done):
             raise typer.Exit(FAILED)
 
 
