@@ -18,18 +18,20 @@ import typer
 
 from compensation.target import load_target
 from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import ConfigError, StandError
+from drivers.interface import ConfigError
 from experiments.steps import kind_of, parameters_of
+from stand import session_cli
 from stand.config import StandConfig, load_config, packaged
 from stand.demo import run_demo
 from stand.estimate import PricedStep, price
+from stand.exit_codes import INTERRUPTED, one_line_errors
 from stand.hub import Event, Hub, Item, StepMark, StepState
 from stand.progress import progress
 from stand.recipe import Recipe, load_recipe
 from stand.run import Interrupted, run_real, run_virtual
 from stand.session_setup import Order
 from stand.simulator import Simulator, laboratory_of
-from stand.usage import OneLineUsage, one_line, tell
+from stand.usage import OneLineUsage, one_line
 
 app = typer.Typer(
     cls=OneLineUsage,
@@ -38,6 +40,8 @@ app = typer.Typer(
     help="Drive the thermal test stand: plan, run, simulate.\n\n"
     "Example: stand run thermal-cycle --config my-stand.yaml",
 )
+
+app.add_typer(session_cli.app, name="session")
 
 _ENDING = {signal.SIGINT, signal.SIGTERM}
 
@@ -55,7 +59,7 @@ def demo(
 
     Example: stand demo --out /tmp/demo
     """
-    with _one_line_errors():
+    with _run_errors():
         config, recipe = _config("simulated"), _recipe("demo")
         order = _order(config, recipe)
         directory = _unused(out)
@@ -74,7 +78,7 @@ def simulate(
 
     Example: stand simulate & stand run demo
     """
-    with _one_line_errors():
+    with one_line_errors():
         stand_config, _ = _config(config)
         simulator = Simulator(laboratory_of(stand_config, virtual=False, seed=None))
         # Blocked only now, or the simulator would inherit it; unblocked, SIGTERM would end us and leave it behind.
@@ -94,7 +98,7 @@ def plan(
 
     Example: stand plan thermal-cycle --json
     """
-    with _one_line_errors():
+    with one_line_errors():
         steps = price(_recipe(recipe)[0].plan(), _config(config)[0])
         total_s = sum(step.duration_s for step in steps)
         now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
@@ -130,7 +134,7 @@ def run(
 
     Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions
     """
-    with _one_line_errors():
+    with _run_errors():
         if seed is not None and not virtual_time:
             raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
         if seed is not None and seed < 0:
@@ -199,19 +203,14 @@ def _run_progress(steps: tuple[PricedStep, ...]) -> Generator[Callable[[Hub], No
 
 
 @contextmanager
-def _one_line_errors() -> Generator[None]:
-    """Bad input ends with status 2, a stand that fails with 1, an interrupted run with 130; each with its sentence."""
-    try:
-        yield
-    except ConfigError as error:
-        tell(error)
-        raise typer.Exit(2) from error
-    except Interrupted as error:
-        typer.echo(one_line(error), err=True)
-        raise typer.Exit(130) from error
-    except (StandError, OSError) as error:
-        tell(error)
-        raise typer.Exit(1) from error
+def _run_errors() -> Generator[None]:
+    """As every error; an interrupted run says whether the stand is safe."""
+    with one_line_errors():
+        try:
+            yield
+        except Interrupted as error:
+            typer.echo(one_line(error), err=True)
+            raise typer.Exit(INTERRUPTED) from error
 
 
 def _line(step: PricedStep) -> str:

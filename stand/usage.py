@@ -34,7 +34,8 @@ def _usage_in_one_line() -> Generator[None]:
     try:
         yield
     except _UsageError as error:
-        tell(error.format_message())
+        if error.format_message():  # else it has shown its help
+            tell(error.format_message())
         raise typer.Exit(2) from error
 
 
