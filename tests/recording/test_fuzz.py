@@ -3,7 +3,8 @@
 import resource
 import shutil
 import signal
-from contextlib import contextmanager
+from collections import Counter
+from contextlib import contextmanager, suppress
 from random import Random
 
 import numpy as np
@@ -15,6 +16,8 @@ from drivers.interface import Frame, Reading, SessionError
 from stand.hub import Batch, Event, StepMark, StepState
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.records import frame_places, read_frame, telemetry_messages
+from stand.recording.salvage import salvage_session
 from stand.recording.segment import Record, SeriesForm, Topic
 from stand.recording.series import Series
 from stand.recording.session import Session
@@ -30,6 +33,7 @@ MEMORY_BYTES = 192 << 20  # more than it had; the largest honest need is 64 MiB 
 LIMIT_S = 5.0
 ROUNDS = 8
 INPUTS = 10_000
+SALVAGES = 1000
 
 
 class TooSlow(BaseException):
@@ -197,6 +201,56 @@ def test_wrong_content_under_right_crcs_is_data_or_a_sentence(sound, tmp_path, s
             check_errors(errors, directory)
             refused += bool(errors)
     assert count / 10 < refused < count
+
+
+def recorded_messages(directory):
+    """Every message of the finished segments, telemetry first, in the order of the files."""
+    session = Session.open(directory)
+    for path in session.segments:
+        if path.parent.name == TELEMETRY:
+            yield from telemetry_messages(path, lambda channel: True)
+        else:
+            yield from map(read_frame, frame_places(path))
+
+
+@pytest.mark.parametrize("seed", range(ROUNDS // 4))
+def test_what_is_salvaged_was_recorded_and_nothing_else(sound, tmp_path, seed):
+    expected = Counter(recorded_messages(sound))
+    rng = Random(200 + seed)
+    mutations = (mutate_bytes, mutate_bytes, mutate_field, mutate_order)
+    recovered = 0
+    with limits():
+        for _ in range(SALVAGES // ROUNDS):
+            directory = shutil.copytree(sound, tmp_path / "copy")
+            path = directory / rng.choice(SEGMENTS)
+            path.write_bytes(rng.choice(mutations)(rng, path.read_bytes()))
+            if rng.random() < 0.5:
+                path = path.rename(path.with_suffix(".mcap.part"))
+            signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+            salvage_session(directory)
+            with suppress(SessionError):  # when nothing could be recovered of a series
+                got = Counter(recorded_messages(directory))
+                assert got.keys() <= expected.keys()  # a chunk that stands in the file twice is found twice
+                recovered += got.total()
+            check_errors(read_everything(directory, {}), directory)
+            shutil.rmtree(directory)
+    assert recovered > SALVAGES // ROUNDS * expected.total() / 2
+
+
+def test_salvage_of_wrong_content_under_right_crcs_gives_data_or_a_sentence(sound, tmp_path):
+    rng = Random(300)
+    with limits():
+        for _ in range(SALVAGES // 4):
+            directory = shutil.copytree(sound, tmp_path / "copy")
+            path = directory / rng.choice(SEGMENTS)
+            path.write_bytes(mutate_inside(rng, path.read_bytes()))
+            signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+            try:
+                salvage_session(directory)
+            except SessionError as error:
+                check_errors([error], directory)
+            check_errors(read_everything(directory, {}), directory)
+            shutil.rmtree(directory)
 
 
 def test_the_broken_sessions_begin_with_sound_ones(sound, tmp_path):
