@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,12 +15,20 @@ def run(*command: str | Path) -> None:
     subprocess.run(command, check=True, capture_output=True, text=True)
 
 
+def require(*programs: str) -> None:
+    """Skip the test where a disk cannot be made and mounted."""
+    if os.geteuid() != 0:
+        pytest.skip("making and mounting a disk needs root")
+    missing = [program for program in programs if shutil.which(program) is None]
+    if missing:
+        pytest.skip(f"there is no {' and no '.join(missing)} here")
+
+
 @contextmanager
 def mounted(folder: Path, *arguments: str | Path) -> Iterator[Path]:
     """`mount ARGUMENTS folder`; skips the test where that is not allowed."""
+    require("mount", "umount")
     folder.mkdir(parents=True, exist_ok=True)
-    if os.geteuid() != 0:
-        pytest.skip("mounting a disk needs root")
     try:
         run("mount", *arguments, folder)
     except subprocess.CalledProcessError as error:
@@ -38,6 +47,7 @@ def tmpfs(folder: Path, size: str):
 @contextmanager
 def ext4(folder: Path, size_bytes: int) -> Iterator[Path]:
     """An ext4 disk of that size in a file beside `folder`."""
+    require("mkfs.ext4", "chattr", "fsfreeze")
     image = folder.with_suffix(".img")
     image.touch()
     os.truncate(image, size_bytes)

@@ -121,6 +121,7 @@ async def test_frames_leave_the_end_of_the_disk_to_the_telemetry_and_come_back(d
     async with Night(disk / "s", settings) as night:
         await night.seconds(30)
         assert 18 <= night.recorder.saved.frames <= 22  # 67 MB, 16 the telemetry's, 30 left, looked at once a second
+        assert not list((disk / "s" / "frames").glob("*.part"))  # nothing is open, and nothing reserved
         (disk / "ballast").write_bytes(bytes(9_000_000))
         await night.seconds(10)
         for path in [*sorted((disk / "s" / "frames").glob("*.mcap"))[:2], disk / "ballast"]:

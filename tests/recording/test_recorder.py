@@ -357,6 +357,25 @@ async def test_a_frame_that_cannot_be_encoded_is_lost_and_the_next_one_is_not(tm
     assert event.text == "frames lost: 1 (block 1 of step capture-1), 1 in all; no marker in sight"
 
 
+async def test_on_a_nearly_full_disk_not_even_the_first_frame_is_taken(tmp_path):
+    """The disk is looked at before a segment is begun, not only on ticks."""
+    nearly_full = replace(SETTINGS, telemetry_commit_s=60.0, stop_frames_below_bytes=10**18)
+    recorder, clock, hub, tasks = await start(tmp_path / "s", nearly_full)
+    hub.publish(frame(START_NS, 0))
+    await clock.sleep_until(START_NS + NS_PER_S)
+    assert recorder.saved == Saved(0, 0, 1)
+    await stop(tasks)
+    await recorder.finish()
+    assert [(event.level, event.kind, event.text) for event in Session.open(tmp_path / "s").events()] == [
+        ("error", "frames_stopped", f"frames are not recorded any more: less than {10**9}.0 GB free on the disk"),
+        (
+            "error",
+            "frames_dropped",
+            f"frames lost: 1 (block 0 of step capture-1), 1 in all; less than {10**9}.0 GB free on the disk",
+        ),
+    ]
+
+
 async def test_finish_goes_to_its_end_also_when_its_caller_is_cancelled(tmp_path):
     recorder, _, hub, tasks = await start(tmp_path / "s", SETTINGS)
     for index in range(15):

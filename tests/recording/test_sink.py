@@ -3,6 +3,7 @@ import fcntl
 import os
 from contextlib import suppress
 
+import numpy as np
 import pytest
 
 from stand.recording.sink import CommitSink
@@ -102,6 +103,19 @@ def test_more_parts_than_the_kernel_takes_at_once_are_written_in_order(tmp_path)
     sink.append(parts)
     sink.close()
     assert (tmp_path / "file").read_bytes() == b"".join(parts)
+
+
+@pytest.mark.nightly
+def test_a_block_larger_than_the_kernel_writes_at_once_is_whole(tmp_path):
+    """Linux writes 2 GiB less a page at a time and returns."""
+    part = np.random.default_rng(1).bytes(3_000_001)
+    with tmpfs(tmp_path / "disk", "3g") as folder:
+        sink = CommitSink(folder / "file")
+        sink.append([part] * 720)
+        sink.close()
+        with (folder / "file").open("rb") as file:
+            assert all(file.read(len(part)) == part for _ in range(720))
+            assert file.read() == b""
 
 
 def test_the_file_is_locked_as_long_as_it_is_open(tmp_path):
