@@ -1,0 +1,340 @@
+"""What a session gives beside its columns: items in order, single frames; and that it reads no more than it needs."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType
+
+from drivers.clock import NS_PER_S, VirtualClock
+from drivers.interface import Frame, Quality, Reading, SessionError, bad_reading
+from stand.hub import Batch, Hub
+from stand.recording import messages
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.recorder import Recorder
+from stand.recording.records import telemetry_messages
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
+from stand.recording.session import Session
+from stand.recording.telemetry import TelemetryEncoder
+from tests.recording.fuzzed import put_together, take_apart
+from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
+
+METADATA = {"session_id": "night-1"}
+
+
+def at(second):
+    return START_NS + round(second * NS_PER_S)
+
+
+def small_frame(second, block_id=None):
+    image = np.full((4, 6), round(second), np.uint8)
+    number = round(second) if block_id is None else block_id
+    return Frame("camera.image", image, at(second), 0.1, 0.0, 41.0, number, 0)
+
+
+def write(folder, topics, commits, compression=CompressionType.NONE, attachments=ATTACHMENTS):
+    """One more segment in `folder`, a chunk for each commit."""
+    folder.mkdir(parents=True, exist_ok=True)
+    series = Series(folder, SeriesForm(folder.name, topics, compression, METADATA, attachments, 1 << 40, 1 << 60))
+    for records in commits:
+        series.commit(records, START_NS)
+    series.finish()
+
+
+def write_items(directory, items, devices=DEVICES, **options):
+    """A telemetry segment with these items, each in a chunk of its own."""
+    encoder = TelemetryEncoder(devices)
+    write(directory / TELEMETRY, encoder.topics(), [list(encoder.encode(item)) for item in items], **options)
+
+
+def write_images(directory, frames):
+    commits = [[Record(CAMERA_IMAGE, f.time_ns, encode_image(f, "png"), f.block_id & 0xFFFF_FFFF)] for f in frames]
+    write(directory / FRAMES, (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),), commits)
+
+
+def air(value, second, **changes):
+    return Reading("thermometers.air", value, "degC", at(second), **changes)
+
+
+def batch(second, *readings):
+    return Batch("thermometers", at(second), readings)
+
+
+def comparable(item):
+    """As item_key, with the readings of a batch sorted: a message keeps the order only in part."""
+    if isinstance(item, Batch):
+        item = replace(item, readings=tuple(sorted(item.readings, key=repr)))
+    return item_key(item)
+
+
+async def record_again(session, directory):
+    hub = Hub()
+    recorder = Recorder(directory, INFO, ATTACHMENTS, DEVICES, hub, VirtualClock(START_NS))
+    recorder.start()
+    for item in session.items():
+        hub.publish(item)
+    await recorder.finish()
+    return Session.open(directory)
+
+
+async def test_items_are_what_was_published_in_that_order(tmp_path):
+    published = await record(tmp_path / "session")
+    items = list(Session.open(tmp_path / "session").items())
+    assert [comparable(item) for item in items] == [comparable(item) for item in published]
+
+
+async def test_items_recorded_again_are_the_same_messages(tmp_path):
+    await record(tmp_path / "first")
+    first = Session.open(tmp_path / "first")
+    second = await record_again(first, tmp_path / "second")
+    assert telemetry(second) == telemetry(first)
+    assert images(second) == images(first)
+
+
+kinds = st.sampled_from(sorted(messages.KINDS))
+
+
+@st.composite
+def batches(draw):
+    """Any batch of a device: readings in any order, repeated, of other devices, with times and reasons of their own."""
+    kind = draw(kinds)
+    names = [(f"dev.{q.name}", q.unit) for q in messages.KINDS[kind].quantities] + [("dev.new", "%"), ("x.y", "K")]
+    time_ns = draw(st.sampled_from([1, START_NS]))
+    readings = []
+    for channel, unit in draw(st.lists(st.sampled_from(names), max_size=8)):
+        value = draw(st.floats())
+        quality = Quality.BAD if math.isnan(value) else draw(st.sampled_from([Quality.GOOD, Quality.STALE]))
+        own_ns = draw(st.sampled_from([time_ns, time_ns, 0, START_NS - 1, -1]))
+        readings.append(Reading(channel, value, unit, own_ns, quality, draw(st.sampled_from(["", "", "late"]))))
+    return kind, Batch("dev", time_ns, tuple(readings))
+
+
+@given(batches())
+def test_a_batch_read_and_encoded_again_is_the_same_bytes_and_lost_nothing(case):
+    kind, original = case
+    encoder = messages.BatchEncoder("dev", messages.KINDS[kind])
+    data = encoder.encode(original)
+    decoded = messages.decode_batch(encoder.topic, data, original.time_ns)
+    assert encoder.encode(decoded) == data
+    assert comparable(decoded) == comparable(original)
+
+
+def test_an_empty_batch_is_an_item_too(tmp_path):
+    items = [batch(0), batch(1, air(20.0, 1)), batch(2)]
+    write_items(tmp_path, items)
+    assert list(Session.open(tmp_path).items()) == items
+
+
+def test_a_frame_without_description_comes_in_order_of_time_and_a_description_without_frame_gives_none(tmp_path):
+    write_items(tmp_path, [batch(0), small_frame(1), batch(2), small_frame(3), batch(4)])
+    write_images(tmp_path, [small_frame(second) for second in (1, 1.5, 5)])
+    session = Session.open(tmp_path)
+    told = [(type(item).__name__, (item.time_ns - START_NS) / NS_PER_S) for item in session.items()]
+    assert told == [("Batch", 0), ("Frame", 1), ("Frame", 1.5), ("Batch", 2), ("Batch", 4), ("Frame", 5)]
+    assert [time_ns for time_ns, _ in session.frame_metas] == [at(1), at(3)]
+    assert [meta.block_id for _, meta in session.frame_metas] == [1, 3]
+
+
+def test_frames_of_one_instant_are_told_apart_by_their_number(tmp_path):
+    write_items(tmp_path, [small_frame(1, 8), batch(1), small_frame(1, 7), batch(2)])
+    write_images(tmp_path, [small_frame(1, number) for number in (7, 8, 9)])
+    items = list(Session.open(tmp_path).items())
+    assert [item.block_id if isinstance(item, Frame) else "batch" for item in items] == [8, "batch", 7, 9, "batch"]
+
+
+def test_items_hold_one_image_at_a_time(tmp_path):
+    write_items(tmp_path, [small_frame(second) for second in range(3)])
+    write_images(tmp_path, [small_frame(second) for second in range(3)])
+    items = Session.open(tmp_path).items()
+    next(items)
+    (tmp_path / FRAMES / "0000.mcap").write_bytes(b"")
+    with pytest.raises(SessionError, match=r"frames/0000\.mcap"):
+        next(items)
+
+
+def test_a_frame_is_found_by_its_index_in_order_of_time(tmp_path):
+    write_items(tmp_path, [small_frame(second) for second in range(7)])
+    for seconds in ((0, 2, 1), (3,), (4, 6, 5)):
+        write_images(tmp_path, [small_frame(second) for second in seconds])
+    session = Session.open(tmp_path)
+    assert [session.frame(index).block_id for index in (6, 0, 3, 1, 2, 5, 4)] == [6, 0, 3, 1, 2, 5, 4]
+    assert session.frame(4).camera_degC == 41.0
+    for index in (-1, 7):
+        with pytest.raises(SessionError, match=f"has no frame {index}; it has 7"):
+            session.frame(index)
+
+
+def test_segments_that_overlap_in_time_are_one_order(tmp_path):
+    write_items(tmp_path, [batch(0)])
+    for seconds in ((0, 3), (1, 2), (4,)):
+        write_images(tmp_path, [small_frame(second) for second in seconds])
+    session = Session.open(tmp_path)
+    assert [session.frame(index).block_id for index in range(5)] == [0, 1, 2, 3, 4]
+    assert [image.sequence for image in session.images()] == [0, 1, 2, 3, 4]
+    assert session.frame_times_ns.tolist() == [at(second) for second in range(5)]
+
+
+def test_images_come_as_they_were_recorded(tmp_path):
+    write_items(tmp_path, [small_frame(0)])
+    write_images(tmp_path, [small_frame(0), small_frame(1)])
+    described, bare = Session.open(tmp_path).images()
+    assert described.schema == "foxglove.CompressedImage"
+    assert described.data == encode_image(small_frame(0), "png")
+    assert (described.sequence, described.time_ns, described.meta.block_id) == (0, at(0), 0)
+    assert described.path == tmp_path / FRAMES / "0000.mcap"
+    assert bare.meta is None
+
+
+def test_only_the_segments_that_are_needed_are_read(tmp_path):
+    for second in range(4):
+        write_items(tmp_path, [batch(second, air(20.0, second)), small_frame(second)])
+        write_images(tmp_path, [small_frame(second)])
+    (tmp_path / FRAMES / "0003.mcap").write_bytes(b"")
+    session = Session.open(tmp_path)
+    assert session.readings("thermometers.air")[0].shape == (4,)
+    with pytest.raises(SessionError, match=r"frames/0003\.mcap"):
+        session.frame(0)  # which one is the first needs the times of all
+    (tmp_path / FRAMES / "0003.mcap").unlink()
+    (tmp_path / TELEMETRY / "0003.mcap").write_bytes(b"")
+    session = Session.open(tmp_path)
+    assert session.frame_count == 3
+    with pytest.raises(SessionError, match=r"telemetry/0003\.mcap"):
+        session.readings("thermometers.air")
+
+
+def test_segments_attachments_and_damaged_originals_are_listed(tmp_path):
+    write_items(tmp_path, [batch(0)])
+    write_images(tmp_path, [small_frame(0)])
+    damaged = tmp_path / FRAMES / "0000.mcap.damaged"
+    damaged.write_bytes(b"")
+    session = Session.open(tmp_path)
+    assert session.segments == (tmp_path / TELEMETRY / "0000.mcap", tmp_path / FRAMES / "0000.mcap")
+    assert session.damaged == (damaged,)
+    assert session.attachments == ATTACHMENTS
+
+
+def test_columns_keep_the_order_of_the_files_where_times_are_equal(tmp_path):
+    remarked = air(3.0, 1, quality=Quality.STALE, reason="not confirmed")
+    write_items(tmp_path, [batch(1, air(2.0, 1)), batch(2, remarked), batch(1, air(4.0, 1)), batch(0, air(1.0, 0))])
+    times_ns, values = Session.open(tmp_path).readings("thermometers.air")
+    assert values.tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert times_ns.tolist() == [at(0), at(1), at(1), at(1)]
+    assert (times_ns.dtype, values.dtype) == (np.int64, np.float64)
+
+
+def test_columns_know_absent_bad_and_unforeseen_readings(tmp_path):
+    humidity = Reading("thermometers.humidity", 45.0, "%", at(1))
+    bad = bad_reading("thermometers.air", "degC", at(2), "")
+    write_items(tmp_path, [batch(0), batch(1, humidity), batch(2, bad), batch(3, air(20.0, 3))])
+    session = Session.open(tmp_path)
+    assert session.channels() == ["thermometers.air", "thermometers.humidity"]
+    assert session.readings("thermometers.humidity")[1].tolist() == [45.0]
+    np.testing.assert_array_equal(session.readings("thermometers.air")[1], [np.nan, 20.0])
+
+
+def test_a_device_that_joined_a_topic_later_takes_nothing_from_the_first(tmp_path):
+    def moved(device, unit, second):
+        return Batch(device, at(second), (Reading(f"{device}.position", float(second), unit, at(second)),))
+
+    write_items(tmp_path, [moved("linear", "mm", 0)], {"linear": "axis"})
+    write_items(tmp_path, [moved("linear", "mm", 1), moved("rotary", "deg", 2)], {"linear": "axis", "rotary": "axis"})
+    session = Session.open(tmp_path)
+    assert session.readings("rotary.position")[1].tolist() == [2.0]
+    assert session.readings("linear.position")[1].tolist() == [0.0, 1.0]
+
+
+def rewrite(path, change):
+    """The segment with its records changed and its CRCs right."""
+    records = take_apart(path.read_bytes())
+    change(records)
+    path.write_bytes(put_together(records))
+
+
+def chunks(records):
+    return [record for record in records if record.opcode == Opcode.CHUNK]
+
+
+def value_beside_a_bad_quality(records):
+    message = chunks(records)[0].inner[-1]
+    good = messages.CLASSES["/sensors/temperature"].FromString(message.content[22:])
+    good.air_degC_quality = 3
+    message.content = message.content[:22] + good.SerializeToString()
+
+
+def unknown_quality(records):
+    message = chunks(records)[0].inner[-1]
+    good = messages.CLASSES["/sensors/temperature"].FromString(message.content[22:])
+    good.air_degC_quality = 9
+    message.content = message.content[:22] + good.SerializeToString()
+
+
+def message_removed(records):
+    chunks(records)[1].inner.pop()
+
+
+def attachment_without_end(records):
+    attachment = next(record for record in records if record.opcode == Opcode.ATTACHMENT)
+    text = ATTACHMENTS["config.yaml"].encode()
+    length = len(text).to_bytes(8, "little")
+    assert length + text in attachment.content
+    attachment.content = attachment.content.replace(length + text, b"\xff" * 8 + text)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (value_beside_a_bad_quality, r"thermometers\.air: the recorded value 20\.0 does not fit its quality 3"),
+        (unknown_quality, "does not fit its quality 9"),
+        (message_removed, r"0000\.mcap: damaged .*it does not hold the messages its index tells of"),
+        (attachment_without_end, r"0000\.mcap: damaged .*OverflowError"),
+    ],
+)
+def test_wrong_content_under_right_crcs_is_told(tmp_path, change, sentence):
+    write_items(tmp_path, [batch(0, air(20.0, 0)), batch(1, air(21.0, 1))])
+    rewrite(tmp_path / TELEMETRY / "0000.mcap", change)
+    with pytest.raises(SessionError, match=sentence):
+        Session.open(tmp_path).readings("thermometers.air")
+
+
+def test_a_step_nested_deeper_than_python_goes_is_told(tmp_path):
+    step = messages.CLASSES[messages.STEP](state="done", parameters_json="[" * 200_000).SerializeToString()
+    write(tmp_path / TELEMETRY, TelemetryEncoder({}).topics(), [[Record(messages.STEP, START_NS, step)]])
+    with pytest.raises(SessionError, match="a recorded step cannot be read"):
+        Session.open(tmp_path).steps()
+
+
+def test_a_chunk_in_the_place_of_another_is_refused(tmp_path):
+    write_items(tmp_path, [batch(second, air(20.0 + second, second)) for second in range(3)])
+    path = tmp_path / TELEMETRY / "0000.mcap"
+    data = path.read_bytes()
+    times = [at(second).to_bytes(8, "little") for second in (1, 2)]
+    heads = [data.index(2 * time) - 9 for time in times]  # a chunk's record begins with its first and last time
+    lengths = [int.from_bytes(data[head + 1 : head + 9], "little") for head in heads]
+    assert lengths[0] == lengths[1], "else this is no test"
+    chunk = data[heads[0] : heads[0] + 9 + lengths[0]]
+    path.write_bytes(data[: heads[1]] + chunk + data[heads[1] + len(chunk) :])
+    with pytest.raises(SessionError, match="the index points to another chunk"):
+        Session.open(tmp_path).readings("thermometers.air")
+
+
+def test_metadata_that_changed_is_seen_by_its_second_copy(tmp_path):
+    write_items(tmp_path, [batch(0)])
+    write_images(tmp_path, [small_frame(0)])
+    path = tmp_path / TELEMETRY / "0000.mcap"
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"night-1", b"night-7"))
+    with pytest.raises(SessionError, match="belongs to another session"):
+        Session.open(tmp_path)
+
+
+def test_compressed_chunks_are_read_message_by_message(tmp_path):
+    write_items(tmp_path, [batch(second, air(20.0, second)) for second in range(20)], compression=CompressionType.ZSTD)
+    path = tmp_path / TELEMETRY / "0000.mcap"
+    assert [m.time_ns for m in telemetry_messages(path, lambda channel: True)] == [at(second) for second in range(20)]
+    assert list(telemetry_messages(path, lambda channel: False)) == []
