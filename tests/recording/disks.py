@@ -36,7 +36,7 @@ def mounted(folder: Path, *arguments: str | Path) -> Iterator[Path]:
     try:
         yield folder
     finally:
-        run("umount", folder)
+        run("umount", "--lazy", folder)  # a failed test may still have a file open there
 
 
 def tmpfs(folder: Path, size: str):
