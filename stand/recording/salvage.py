@@ -76,13 +76,13 @@ def salvage_unfinished(root: Path) -> list[Salvaged]:
 def _salvage_folder(folder: Path, finished_too: bool) -> Iterator[Salvaged]:
     for copy in folder.glob(f"*{COPY}"):
         _remove_left_over(copy)
-    for number in sorted({int(path.name.partition(".")[0]) for path in folder.glob(f"[0-9]*{FINISHED}*")}):
+    for number in sorted({int(path.name.partition(".")[0]) for path in segments_of(folder)}):
         yield from _salvage_number(folder / f"{number:04d}{FINISHED}", finished_too)
 
 
 def _remove_left_over(copy: Path) -> None:
     """Remove what a killed salvage has left; not what one that lives is writing."""
-    with _locked(copy) as fd:
+    with _refusing(copy), _locked(copy) as fd:
         if fd is not None:
             copy.unlink()
 
@@ -103,8 +103,17 @@ def _is_sound(path: Path) -> bool:
 
 
 @contextmanager
+def _refusing(path: Path) -> Generator[None]:
+    """What the disk refuses inside becomes a SessionError that names the file."""
+    try:
+        yield
+    except DAMAGE as error:  # OSError; the rest only when the file changes under our hands
+        raise SessionError(f"{path}: cannot be salvaged and is left as it was ({error})") from error
+
+
+@contextmanager
 def _locked(path: Path) -> Generator[int | None]:
-    """The file, opened and locked; None when somebody else has it, or has just removed it."""
+    """The file, opened and locked; None when somebody else has it, or has just given it another name."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -113,8 +122,8 @@ def _locked(path: Path) -> Generator[int | None]:
     try:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            is_ours = os.fstat(fd).st_nlink > 0
-        except BlockingIOError:
+            is_ours = os.path.samestat(os.fstat(fd), path.stat())
+        except (BlockingIOError, FileNotFoundError):
             is_ours = False
         yield fd if is_ours else None
     finally:
@@ -153,26 +162,22 @@ class _Original:
 
     @property
     def is_all_there(self) -> bool:
-        """Whether a copy holds all that was ever acknowledged."""
-        is_rotten = self.path == self.finished and not self.found.has_index
-        return not (self.found.damages or self.unknown or is_rotten)
+        """Whether a copy holds all that was ever acknowledged; of what was finished and is damaged nobody knows."""
+        return self.path != self.finished and not self.found.damages and not self.unknown
 
 
 def _salvage_segment(path: Path) -> Salvaged:
     """One segment; SessionError when the disk refuses."""
     finished = path.with_name(f"{path.name.partition('.')[0]}{FINISHED}")
-    try:
-        with _locked(path) as fd:
-            if fd is None:
-                return Salvaged(path, None, 0, 0, BEING_RECORDED, None)
-            source = Source(fd)
-            found = survey(source)
-            original = _Original(path, finished, source, found, opening_of(path, found))
-            if path != finished and finished.exists():
-                return _salvage_beside(original)
-            return _salvage_alone(original)
-    except DAMAGE as error:  # OSError; the rest only when the file changes under our hands
-        raise SessionError(f"{path}: cannot be salvaged and is left as it was ({error})") from error
+    with _refusing(path), _locked(path) as fd:
+        if fd is None:
+            return Salvaged(path, None, 0, 0, BEING_RECORDED, None)
+        source = Source(fd)
+        found = survey(source)
+        original = _Original(path, finished, source, found, opening_of(path, found))
+        if path != finished and finished.exists():
+            return _salvage_beside(original)
+        return _salvage_alone(original)
 
 
 def _salvage_alone(original: _Original) -> Salvaged:

@@ -1,44 +1,46 @@
 """A segment's bytes, whatever happened to them: what in them proves itself, and where nothing does.
 
-Read by place from the front. A chunk and an attachment prove themselves by their CRC (our writer always makes one,
-so a CRC of 0 is a CRC), the records without one by being, byte for byte, what the writer makes of what they say.
-Behind a damaged place the walk goes on where the next record looks like one and proves to be one. Inside sound
-records nothing is searched, so an MCAP file that is attached is an attachment.
+Read by place from the front; what counts as a proof is in stand/recording/proof.py. Behind a damaged place the walk
+goes on where the next record looks like one and proves to be one. Inside sound records nothing is searched, so an
+MCAP file that is attached is an attachment.
 
 Memory is flat: one record at a time. Only OSError is raised, when the disk does not give a byte.
 """
 
 from __future__ import annotations
 
-import io
 import os
 import re
-import struct
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, DataEnd, Footer, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from stand.recording.layout import SESSION_METADATA
-from stand.recording.records import CHUNK_LIMIT_BYTES, DAMAGE
+from stand.recording.proof import (
+    CRC,
+    MESSAGE,
+    OPCODES,
+    RECORD,
+    RECORD_LIMIT_BYTES,
+    Contents,
+    check_chunk_lengths,
+    check_crc,
+    claim_of,
+    proven,
+    records_of,
+    stream_of,
+    uncompressed,
+)
+from stand.recording.records import DAMAGE
 
-RECORD_LIMIT_BYTES = CHUNK_LIMIT_BYTES + 1024
 WINDOW_BYTES = 4 << 20
 
-_RECORD = struct.Struct("<BQ")  # opcode, length
-_CHUNK = struct.Struct("<QQQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
-_LENGTH = struct.Struct("<Q")
-_CRC = struct.Struct("<I")
-_MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
-_INDEX = struct.Struct("<HI")  # channel id, length of the entries of 16 bytes
-_FOOTER_BYTES = _RECORD.size + 20
+_FOOTER_BYTES = RECORD.size + 20
 
 # Heads of records, little endian: lengths below 2**29, compression "" or "zstd".
 _CHUNK_HEAD = (
@@ -96,7 +98,6 @@ class Survey:
     `session`: the metadata record of that name, None when it is gone. `is_opening_whole`: nothing is damaged before
     the first chunk. `messages`: how many there are, by channel number. `damages`: the places that are damaged; neither
     `torn_bytes` at the end of the file, where a block was being written, nor a damaged index is among them.
-    `has_index`: the file is whole to its last byte.
     """
 
     session: dict[str, str] | None = None
@@ -108,7 +109,6 @@ class Survey:
     damages: list[Gap] = field(default_factory=list[Gap])
     torn_bytes: int = 0
     is_opening_whole: bool = False
-    has_index: bool = False
 
     @property
     def lost_bytes(self) -> int:
@@ -125,18 +125,10 @@ def survey(source: Source, to_first_chunk: bool = False) -> Survey:
 
 def stored_messages(source: Source, place: ChunkPlace) -> Iterator[StoredMessage]:
     """The messages of a sound chunk in their order; one of DAMAGE when it is not sound any more."""
-    for opcode, record in _records(_uncompressed(memoryview(source.read(*place)))):
+    for opcode, record in records_of(uncompressed(memoryview(source.read(*place)))):
         if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(record)
-            yield StoredMessage(channel, sequence, log_time_ns, publish_time_ns, bytes(record[_MESSAGE.size :]))
-
-
-class _Contents(NamedTuple):
-    """What a chunk holds."""
-
-    schemas: list[Schema]
-    channels: list[Channel]
-    messages: Counter[int]
+            channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(record)
+            yield StoredMessage(channel, sequence, log_time_ns, publish_time_ns, bytes(record[MESSAGE.size :]))
 
 
 class _Proven(NamedTuple):
@@ -144,7 +136,7 @@ class _Proven(NamedTuple):
 
     begin: int
     end: int
-    content: _Contents | Metadata | Attachment | DataEnd | None
+    content: Contents | Metadata | Attachment | DataEnd | None
 
 
 class _Walk:
@@ -178,18 +170,18 @@ class _Walk:
             is_magic = self._source.read(0, len(MCAP0_MAGIC)) == MCAP0_MAGIC
             return _Proven(0, len(MCAP0_MAGIC), None) if is_magic else None
         head = self._source.read(offset, _HEAD_BYTES)
-        claim = _claim(head)
-        if claim is None or offset + _RECORD.size + claim.length > self._source.size:
+        claim = claim_of(head)
+        if claim is None or offset + RECORD.size + claim.length > self._source.size:
             return None
         try:
             if claim.opcode == Opcode.CHUNK:  # before its bytes are read: a false one may claim very many
-                _check_chunk_lengths(head[_RECORD.size :], claim.length)
-            content = _proof(claim.opcode, self._source.read(offset + _RECORD.size, claim.length))
+                check_chunk_lengths(head[RECORD.size :], claim.length)
+            content = proven(claim.opcode, self._source.read(offset + RECORD.size, claim.length))
         except DAMAGE as error:
             if isinstance(error, OSError):
                 raise
             return None
-        return _Proven(offset, offset + _RECORD.size + claim.length, content)
+        return _Proven(offset, offset + RECORD.size + claim.length, content)
 
     def _next_record(self, offset: int) -> _Proven | None:
         """The first sound record behind the damaged one at `offset`."""
@@ -218,13 +210,13 @@ class _Walk:
     def _take(self, record: _Proven) -> None:
         found = self.found
         match record.content:
-            case _Contents(schemas, channels, messages):
+            case Contents(schemas, channels, messages):
                 if not found.chunks:
                     found.is_opening_whole = found.session is not None and not found.damages
                 found.schemas.update({schema.id: schema for schema in schemas})
                 found.channels.update({channel.id: channel for channel in channels})
                 found.messages.update(messages)
-                found.chunks.append(ChunkPlace(record.begin + _RECORD.size, record.end - record.begin - _RECORD.size))
+                found.chunks.append(ChunkPlace(record.begin + RECORD.size, record.end - record.begin - RECORD.size))
             case Metadata(name=name, metadata=entries) if name == SESSION_METADATA:
                 if found.chunks and not found.is_opening_whole:
                     self._forget_attached()
@@ -249,134 +241,33 @@ class _Walk:
         try:
             if footer_begin < 0 or not data.endswith(MCAP0_MAGIC):
                 raise ValueError("the file ends in its index")
-            footer = Footer.read(_stream(data[footer_begin + _RECORD.size :]))
-            _check_crc(data[: footer_begin + _FOOTER_BYTES - _CRC.size], footer.summary_crc)
+            footer = Footer.read(stream_of(data[footer_begin + RECORD.size :]))
+            check_crc(data[: footer_begin + _FOOTER_BYTES - CRC.size], footer.summary_crc)
             if footer.summary_start != begin:
                 raise ValueError("the index does not begin behind the data")
-            for opcode, record in _records(memoryview(data)[:footer_begin]):
+            for opcode, record in records_of(memoryview(data)[:footer_begin]):
                 if opcode == Opcode.SCHEMA:
-                    schema = Schema.read(_stream(record))
+                    schema = Schema.read(stream_of(record))
                     self.found.schemas[schema.id] = schema
                 elif opcode == Opcode.CHANNEL:
-                    channel = Channel.read(_stream(record))
+                    channel = Channel.read(stream_of(record))
                     self.found.channels[channel.id] = channel
         except DAMAGE:
             return False
-        self.found.has_index = True
         return True
-
-
-class _Claim(NamedTuple):
-    opcode: int
-    length: int
-
-
-def _claim(head: bytes) -> _Claim | None:
-    """What a record's head says it is; None when that is no record of the data section."""
-    if len(head) < _RECORD.size:
-        return None
-    opcode, length = _RECORD.unpack_from(head)
-    return _Claim(opcode, length) if opcode in _OPCODES and length <= RECORD_LIMIT_BYTES else None
-
-
-_EXACT: dict[int, type[Header | Metadata | DataEnd]] = {
-    Opcode.HEADER: Header,
-    Opcode.METADATA: Metadata,
-    Opcode.DATA_END: DataEnd,
-}
-_OPCODES = {*_EXACT, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT}
-
-
-def _proof(opcode: int, content: bytes) -> _Contents | Metadata | Attachment | DataEnd | None:
-    """What the record says; one of DAMAGE when it does not prove itself."""
-    if opcode == Opcode.CHUNK:
-        return _contents(_uncompressed(memoryview(content)))
-    if opcode == Opcode.ATTACHMENT:
-        _check_crc(content[: -_CRC.size], *_CRC.unpack(content[-_CRC.size :]))
-        return Attachment.read(_stream(content))
-    if opcode == Opcode.MESSAGE_INDEX:
-        _, entries_bytes = _INDEX.unpack_from(content)
-        if len(content) != _INDEX.size + entries_bytes or entries_bytes % 16:
-            raise ValueError("a message index is damaged")
-        return None
-    record = _EXACT[opcode].read(_stream(content))
-    if _bytes_of(record)[_RECORD.size :] != content or not _is_text(record):
-        raise ValueError("a record is damaged")
-    return None if isinstance(record, Header) else record
-
-
-def _is_text(record: Header | Metadata | DataEnd) -> bool:
-    """Nobody writes NUL into a text; a lost block of the disk reads as zeros."""
-    if isinstance(record, Metadata):
-        texts = [record.name, *record.metadata.keys(), *record.metadata.values()]
-        return not any("\0" in text for text in texts)
-    return True
-
-
-def _contents(data: memoryview) -> _Contents:
-    contents = _Contents([], [], Counter())
-    for opcode, record in _records(data):
-        if opcode == Opcode.MESSAGE:
-            channel, *_ = _MESSAGE.unpack_from(record)
-            contents.messages[channel] += 1
-        elif opcode == Opcode.SCHEMA:
-            contents.schemas.append(Schema.read(_stream(record)))
-        elif opcode == Opcode.CHANNEL:
-            contents.channels.append(Channel.read(_stream(record)))
-        else:
-            raise ValueError(f"a chunk holds a record of kind {opcode}")
-    return contents
-
-
-def _check_chunk_lengths(head: bytes, length: int) -> None:
-    """ValueError when the lengths in a chunk's head contradict each other; struct.error when it is cut."""
-    *_, size, _, name_bytes = _CHUNK.unpack_from(head)
-    name_end = _CHUNK.size + name_bytes
-    (data_bytes,) = _LENGTH.unpack_from(head, name_end)
-    name = head[_CHUNK.size : name_end]
-    if name not in (b"", b"zstd") or size > CHUNK_LIMIT_BYTES or (not name and size != data_bytes):
-        raise ValueError("no chunk of ours")
-    if length != name_end + _LENGTH.size + data_bytes:
-        raise ValueError("a chunk's lengths contradict each other")
-
-
-def _uncompressed(content: memoryview) -> memoryview:
-    """The records of a chunk, its CRC checked."""
-    _, _, size, crc, name_bytes = _CHUNK.unpack_from(content)
-    data = content[_CHUNK.size + name_bytes + _LENGTH.size :]
-    if name_bytes:
-        if zstandard.frame_content_size(data) != size:  # else a damaged size would be allocated as told
-            raise ValueError("a chunk's size is wrong")
-        data = memoryview(zstandard.decompress(data))
-    if len(data) != size:
-        raise ValueError("a chunk's size is wrong")
-    _check_crc(data, crc)
-    return data
-
-
-def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, content) of each record; struct.error when the last one is cut."""
-    offset = 0
-    while offset < len(data):
-        opcode, length = _RECORD.unpack_from(data, offset)
-        offset += _RECORD.size
-        if length > len(data) - offset:
-            raise struct.error("a record is cut short")
-        yield opcode, data[offset : offset + length]
-        offset += length
 
 
 def _is_torn(source: Source, gap: Gap) -> bool:
     """Whether the end of the file is what an interrupted write leaves: the beginning of one record, then zeros or
     nothing. What a whole block held was acknowledged; a block that is cut or zero at its end never was."""
     written_end = _last_written(source, gap)
-    head = source.read(gap.begin, min(_RECORD.size, written_end - gap.begin))
+    head = source.read(gap.begin, min(RECORD.size, written_end - gap.begin))
     if gap.begin == 0:
         return MCAP0_MAGIC.startswith(head)
-    if len(head) < _RECORD.size:
-        return not head or head[0] in _OPCODES
-    claim = _claim(head)
-    return claim is not None and written_end < gap.begin + _RECORD.size + claim.length
+    if len(head) < RECORD.size:
+        return not head or head[0] in OPCODES
+    claim = claim_of(head)
+    return claim is not None and written_end < gap.begin + RECORD.size + claim.length
 
 
 def _last_written(source: Source, gap: Gap) -> int:
@@ -388,18 +279,3 @@ def _last_written(source: Source, gap: Gap) -> int:
             return begin + len(data)
         end = begin
     return gap.begin
-
-
-def _bytes_of(record: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()
-
-
-def _check_crc(data: bytes | memoryview, crc: int) -> None:
-    if zlib.crc32(data) != crc:
-        raise ValueError("a CRC is wrong")
-
-
-def _stream(data: bytes | memoryview) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(data))
