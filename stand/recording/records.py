@@ -89,8 +89,8 @@ class FramePlace:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameSpan:
-    """How many frames a segment has, and the times of the first and the last."""
+class MessageSpan:
+    """How many messages a segment has, and the times of the first and the last."""
 
     count: int
     first_ns: int
@@ -121,7 +121,7 @@ def read_head(path: Path) -> Head:
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
         head = _head(path, file)
-        if len(head.attachments) != summary.statistics.attachment_count:
+        if len(head.attachments) != summary.attachment_count:
             raise ValueError("its attachments are not those its index tells of")
         return head
 
@@ -164,7 +164,7 @@ def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterato
     """The messages of the wanted channels of a telemetry segment, in the order of the file."""
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
-        topics = {number: channel.topic for number, channel in _channels(summary) if wanted(channel)}
+        topics = {number: channel.topic for number, (channel, _) in _channels(summary).items() if wanted(channel)}
         counts = dict.fromkeys(topics, 0)
         for place in summary.chunks():
             if topics.keys().isdisjoint(place.channels):
@@ -177,13 +177,14 @@ def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterato
             raise ValueError("it does not hold the messages its index tells of")
 
 
-def _channels(summary: Summary) -> Iterator[tuple[int, Channel]]:
-    """The channels and their numbers; ValueError when a topic of ours holds messages that are not."""
-    for number, channel in summary.channels.items():
-        known, schema = SCHEMAS.get(channel.topic), summary.schemas[channel.schema_id]
+def _channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
+    """Channel id -> channel and schema; ValueError when a topic of ours holds messages that are not."""
+    channels = summary.channels()
+    for channel, schema in channels.values():
+        known = SCHEMAS.get(channel.topic)
         if known is not None and schema not in known:
             raise ValueError(f"{channel.topic} holds {schema}, not {' or '.join(sorted(known))}")
-        yield number, channel
+    return channels
 
 
 def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
@@ -239,20 +240,23 @@ def _message(topic: str, chunk: memoryview, offset: int, end: int) -> Message:
     return Message(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]))
 
 
-def frame_span(path: Path) -> FrameSpan:
-    """How many frames a segment has and when, from its statistics alone."""
+def message_span(path: Path) -> MessageSpan:
+    """How many messages a segment has and when, from its statistics alone."""
     with reading(path), path.open("rb") as file:
-        statistics = _open(path, file).statistics
-        return FrameSpan(statistics.message_count, statistics.message_start_time, statistics.message_end_time)
+        summary = _open(path, file)
+        return MessageSpan(summary.message_count, summary.first_ns, summary.last_ns)
 
 
 def frame_places(path: Path) -> list[FramePlace]:
     """The frames of a segment, from its index alone."""
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
-        schemas = {number: summary.schemas[channel.schema_id] for number, channel in _channels(summary)}
-        places = [FramePlace(path, chunk, chunk.channels[0], schemas[chunk.channels[0]]) for chunk in summary.chunks()]
-        if summary.statistics.message_count != len(places):
+        channels = _channels(summary)
+        places: list[FramePlace] = []
+        for chunk in summary.chunks():
+            (number,) = chunk.channels
+            places.append(FramePlace(path, chunk, number, channels[number][1]))
+        if summary.message_count != len(places):
             raise ValueError("its chunks are not one frame each")
         return places
 

@@ -7,9 +7,7 @@ wrong with a session is a SessionError with a sentence.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, chain, pairwise
 from operator import attrgetter
@@ -22,17 +20,27 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from drivers.interface import Frame, SessionError
-from stand.hub import Batch, Event, Item, StepMark
+from stand.hub import Event, Item, StepMark
 from stand.recording import messages
 from stand.recording.columns import Column, TopicColumns
-from stand.recording.images import decode_image
-from stand.recording.layout import DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from stand.recording.items import (
+    ImagesToCome,
+    RecordedImage,
+    describes_frame,
+    description_of,
+    event_of,
+    frame_of,
+    item_of,
+    stands_for_item,
+    step_of,
+)
+from stand.recording.layout import DAMAGED, DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED
 from stand.recording.records import (
     FramePlace,
-    FrameSpan,
     Message,
+    MessageSpan,
     frame_places,
-    frame_span,
+    message_span,
     naming,
     read_frame,
     read_head,
@@ -40,22 +48,6 @@ from stand.recording.records import (
 )
 
 T = TypeVar("T")
-
-DAMAGED = FINISHED + ".damaged"  # the original of a segment from which a salvage could not take everything
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedImage:
-    """An image as it was recorded: `data` is a message of `schema`, for decode_image; `meta` is the frame's
-    description, None when it did not reach the disk. `sequence` is the low 32 bits of the frame's block id, `path` the
-    segment it was read from."""
-
-    schema: str
-    data: bytes
-    sequence: int
-    time_ns: int
-    meta: messages.FrameMeta | None
-    path: Path
 
 
 class Session:
@@ -77,6 +69,7 @@ class Session:
         self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
         self._all_columns_read = False
         self._places_of: dict[Path, list[FramePlace]] = {}
+        self._metas_of: dict[Path, dict[tuple[int, int], messages.FrameMeta]] = {}
 
     @classmethod
     def open(cls, path: Path) -> Session:
@@ -148,12 +141,12 @@ class Session:
 
     def steps(self) -> list[StepMark]:
         """Every step mark, in order of time."""
-        found = self._decoded(lambda channel: channel.topic == messages.STEP, _step)
+        found = self._decoded(lambda channel: channel.topic == messages.STEP, step_of)
         return sorted(found, key=attrgetter("time_ns"))
 
     def events(self) -> list[Event]:
         """Every event, in order of time."""
-        found = self._decoded(lambda channel: channel.topic == messages.EVENT, _event)
+        found = self._decoded(lambda channel: channel.topic == messages.EVENT, event_of)
         return sorted(found, key=attrgetter("time_ns"))
 
     @property
@@ -171,16 +164,16 @@ class Session:
         if not 0 <= index < self.frame_count:
             raise SessionError(f"{self.path}: has no frame {index}; it has {self.frame_count}, counted from 0")
         if not self._is_in_order:
-            return _frame(self._image(self._sorted_places[index]))
+            return frame_of(self._image(self._sorted_places[index]))
         ends = list(accumulate(span.count for span in self._spans))
         number = bisect_right(ends, index)
         places = self._places_in(self._frames[number])
-        return _frame(self._image(places[index - ends[number]]))  # counted from the segment's end
+        return frame_of(self._image(places[index - ends[number]]))  # counted from the segment's end
 
     def frames(self) -> Iterator[Frame]:
         """The frames in order of time, each read and decoded when asked for. A frame whose description did not reach
         the disk has NaN for exposure, gain and temperature."""
-        return map(_frame, self.images())
+        return map(frame_of, self.images())
 
     def images(self) -> Iterator[RecordedImage]:
         """The images in order of time as they were recorded, each read when asked for and not decoded."""
@@ -192,23 +185,47 @@ class Session:
         A frame's place in that order is that of its description; a frame whose description is lost comes in order of
         time. Publishing the items to a recorder gives the same messages again.
         """
-        images = _ImagesToCome(self._places(), self._descriptions, self._image)
-        for message, item in self._decoded(_stands_for_item, lambda message: (message, _item(message))):
-            yield from map(_frame, images.undescribed_before(message.time_ns))
+        images = ImagesToCome(self._places(), (time_ns for time_ns, _ in self.frame_metas), self._image)
+        for message, item in self._decoded(stands_for_item, lambda message: (message, item_of(message))):
+            yield from map(frame_of, images.undescribed_before(message.time_ns))
             if item is None:
-                yield from map(_frame, images.described_by(message))
+                yield from map(frame_of, images.described_by(message))
             else:
                 yield item
-        yield from map(_frame, images.undescribed_before(None))
+        yield from map(frame_of, images.undescribed_before(None))
+
+    @property
+    def frame_metas(self) -> list[tuple[int, messages.FrameMeta]]:
+        """(time_ns, description) of every frame in order of publication, also of those whose image was lost."""
+        return [(message.time_ns, meta) for message, meta in self._decoded(describes_frame, description_of)]
 
     def _image(self, place: FramePlace) -> RecordedImage:
         message = read_frame(place)
-        meta = self._metas.get((message.time_ns, message.sequence))
+        meta = self._meta(message.time_ns, message.sequence)
         return RecordedImage(place.schema, message.data, message.sequence, message.time_ns, meta, place.path)
 
+    def _meta(self, time_ns: int, sequence: int) -> messages.FrameMeta | None:
+        """A frame's description, None when it is lost; only segments with messages before and after are read."""
+        for path, span in self._telemetry_spans:
+            if span.first_ns <= time_ns <= span.last_ns:
+                found = self._metas_in(path).get((time_ns, sequence))
+                if found is not None:
+                    return found
+        return None
+
     @cached_property
-    def _spans(self) -> list[FrameSpan]:
-        return [frame_span(path) for path in self._frames]
+    def _telemetry_spans(self) -> list[tuple[Path, MessageSpan]]:
+        return [(path, message_span(path)) for path in self._telemetry]
+
+    def _metas_in(self, segment: Path) -> dict[tuple[int, int], messages.FrameMeta]:
+        if segment not in self._metas_of:
+            found = self._decoded(describes_frame, description_of, (segment,))
+            self._metas_of[segment] = {(message.time_ns, message.sequence): meta for message, meta in found}
+        return self._metas_of[segment]
+
+    @cached_property
+    def _spans(self) -> list[MessageSpan]:
+        return [message_span(path) for path in self._frames]
 
     @cached_property
     def _is_in_order(self) -> bool:
@@ -233,22 +250,11 @@ class Session:
             self._places_of[segment] = sorted(frame_places(segment), key=attrgetter("time_ns"))
         return self._places_of[segment]
 
-    @property
-    def frame_metas(self) -> list[tuple[int, messages.FrameMeta]]:
-        """(time_ns, description) of every frame in order of publication, also of those whose image was lost."""
-        return [(description.time_ns, description.meta) for description in self._descriptions]
-
-    @cached_property
-    def _descriptions(self) -> list[_Description]:
-        return list(self._decoded(lambda channel: channel.topic == messages.CAMERA_META, _description))
-
-    @cached_property
-    def _metas(self) -> dict[tuple[int, int], messages.FrameMeta]:
-        return {(known.time_ns, known.sequence): known.meta for known in self._descriptions}
-
-    def _decoded(self, wanted: Callable[[Channel], bool], decode: Callable[[Message], T]) -> Iterator[T]:
-        """The telemetry of the wanted channels in the order of the files, each message decoded."""
-        for path in self._telemetry:
+    def _decoded(
+        self, wanted: Callable[[Channel], bool], decode: Callable[[Message], T], segments: Iterable[Path] | None = None
+    ) -> Iterator[T]:
+        """The messages of the wanted channels in the order of the files (None: all of the telemetry), decoded."""
+        for path in self._telemetry if segments is None else segments:
             self._check(path)
             for message in telemetry_messages(path, wanted):
                 try:
@@ -263,104 +269,6 @@ class Session:
             if read_head(segment).session != self.metadata:
                 raise SessionError(f"{segment}: belongs to another session than {self._telemetry[0]}")
             self._checked.add(segment)
-
-
-@dataclass(frozen=True, slots=True)
-class _Description:
-    """A frame's description and where its image is found."""
-
-    time_ns: int
-    sequence: int
-    meta: messages.FrameMeta
-
-
-class _ImagesToCome:
-    """The images that `items` has not given yet, found by the descriptions that stand for them."""
-
-    def __init__(
-        self,
-        places: Iterable[FramePlace],
-        descriptions: Iterable[_Description],
-        read: Callable[[FramePlace], RecordedImage],
-    ) -> None:
-        self._read = read
-        self._places: dict[int, list[FramePlace]] = {}
-        for place in places:
-            self._places.setdefault(place.time_ns, []).append(place)
-        self._descriptions = Counter(description.time_ns for description in descriptions)  # to come, by their time
-        self._undescribed = deque(time_ns for time_ns in self._places if time_ns not in self._descriptions)
-
-    def undescribed_before(self, time_ns: int | None) -> Iterator[RecordedImage]:
-        """The images before `time_ns` (None: all) whose time no description has."""
-        while self._undescribed and (time_ns is None or self._undescribed[0] < time_ns):
-            yield from map(self._read, self._places.pop(self._undescribed.popleft()))
-
-    def described_by(self, message: Message) -> Iterator[RecordedImage]:
-        """The image that the description in `message` stands for, none when it is lost; behind the last description
-        of that time whatever else was recorded then."""
-        places = self._places.get(message.time_ns, [])
-        for place in places:
-            image = self._read(place)
-            if image.sequence == message.sequence:
-                places.remove(place)
-                yield image
-                break
-        self._descriptions[message.time_ns] -= 1
-        if not self._descriptions[message.time_ns]:
-            yield from map(self._read, self._places.pop(message.time_ns, []))
-
-
-def _step(message: Message) -> StepMark:
-    return messages.decode_step(message.data, message.time_ns)
-
-
-def _event(message: Message) -> Event:
-    return messages.decode_event(message.data, message.time_ns)
-
-
-def _description(message: Message) -> _Description:
-    return _Description(message.time_ns, message.sequence, messages.decode_frame_meta(message.data))
-
-
-def _stands_for_item(channel: Channel) -> bool:
-    """The log and the table's pose do not: the recorder derives them from events and batches."""
-    return channel.topic in {*messages.KIND_OF_TOPIC, messages.STEP, messages.EVENT, messages.CAMERA_META}
-
-
-def _item(message: Message) -> Batch | StepMark | Event | None:
-    """The item that a message stands for; None when that is a frame."""
-    match message.topic:
-        case messages.STEP:
-            return _step(message)
-        case messages.EVENT:
-            return _event(message)
-        case messages.CAMERA_META:
-            return None
-        case topic:
-            return messages.decode_batch(topic, message.data, message.time_ns)
-
-
-def _frame(recorded: RecordedImage) -> Frame:
-    with naming(recorded.path):
-        image = decode_image(recorded.schema, recorded.data)
-    meta = recorded.meta or _unknown(image.channel, recorded.sequence)
-    return Frame(
-        channel=image.channel,
-        image=image.pixels,
-        time_ns=recorded.time_ns,
-        exposure_s=meta.exposure_s,
-        gain_dB=meta.gain_dB,
-        camera_degC=meta.camera_degC,
-        block_id=meta.block_id,
-        camera_ticks=meta.camera_ticks,
-        dropped=meta.dropped,
-        step_id=meta.step_id,
-        windows=image.windows,
-    )
-
-
-def _unknown(channel: str, block_id: int) -> messages.FrameMeta:
-    return messages.FrameMeta(channel, "", block_id, 0, np.nan, np.nan, np.nan, 0)
 
 
 def _files_of(path: Path, suffix: str) -> tuple[Path, ...]:

@@ -1,7 +1,7 @@
 """The index at a segment's end: what is in the segment and where, checked by the CRC that covers it.
 
-mcap's own reader makes an object of every chunk index, which costs milliseconds per GB; here they are walked when
-somebody asks for them, and everything else stands before them.
+mcap's own reader makes an object of every record of it, which costs milliseconds per GB; here the statistics alone are
+read, and the rest when somebody asks for it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import BinaryIO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema, Statistics
+from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
 RECORD = struct.Struct("<BQ")  # opcode, length
@@ -24,8 +24,10 @@ CRC = struct.Struct("<I")
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, begin of its offsets; a CRC follows
 _FOOTER_BYTES = _FOOTER.size + CRC.size + len(MCAP0_MAGIC)
 _TAIL_BYTES = 1 << 16  # read at once from the end: the whole summary of most segments
-_CHUNK_INDEX = struct.Struct("<qqQQI")  # first and last log time, offset, length, length of the map behind it
-_MAP_ENTRY = struct.Struct("<HQ")  # channel id, offset of its message index
+# Messages, schemas, channels, attachments, metadata, chunks, first and last log time, length of the map behind them
+_STATISTICS = struct.Struct("<QHIIIIqqI")
+_CHUNK_INDEX = struct.Struct("<qqQQI")  # first and last log time, offset, length, length of the map behind them
+_MAP_ENTRY = struct.Struct("<HQ")  # channel id; count of its messages or offset of its message index
 
 
 class ChunkPlace(NamedTuple):
@@ -40,50 +42,49 @@ class ChunkPlace(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a segment's index tells; `schemas` are id -> name, `message_counts` channel id -> messages."""
+    """What a segment's index tells; `message_counts` are by channel id, the log times 0 when there is no message."""
 
-    statistics: Statistics
-    channels: dict[int, Channel]
-    schemas: dict[int, str]
-    _chunk_indexes: memoryview
+    message_count: int
+    attachment_count: int
+    first_ns: int
+    last_ns: int
+    message_counts: dict[int, int]
+    _content: memoryview
 
-    @property
-    def message_counts(self) -> dict[int, int]:
-        """Channel id -> how many messages it has."""
-        return self.statistics.channel_message_counts
+    def channels(self) -> dict[int, tuple[Channel, str]]:
+        """Channel id -> the channel and its schema's name; ValueError or LookupError when they do not fit together."""
+        schemas: dict[int, str] = {}
+        channels: list[Channel] = []
+        for opcode, record in records(self._content):
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream(record))
+                schemas[schema.id] = schema.name
+            elif opcode == Opcode.CHANNEL:
+                channels.append(Channel.read(stream(record)))
+            elif opcode == Opcode.CHUNK_INDEX:
+                break  # of these there may be thousands, and no more channels behind them
+        return {channel.id: (channel, schemas[channel.schema_id]) for channel in channels}
 
     def chunks(self) -> Iterator[ChunkPlace]:
         """The chunks in the order of the file."""
-        for opcode, record in records(self._chunk_indexes):
+        for opcode, record in records(self._content):
             if opcode == Opcode.CHUNK_INDEX:
                 first_ns, last_ns, offset, length, map_bytes = _CHUNK_INDEX.unpack_from(record)
-                entries = record[_CHUNK_INDEX.size : _CHUNK_INDEX.size + map_bytes]
-                channels = tuple(number for number, _ in _MAP_ENTRY.iter_unpack(entries))
-                yield ChunkPlace(first_ns, last_ns, offset, length, channels)
+                yield ChunkPlace(first_ns, last_ns, offset, length, tuple(_map(record, _CHUNK_INDEX.size, map_bytes)))
 
 
 def read_summary(file: BinaryIO, size_bytes: int) -> Summary:
     """The summary of a finished segment of that size; ValueError, struct.error or EOFError when it is damaged."""
     content = _summary_bytes(file, size_bytes)
-    statistics: Statistics | None = None
-    channels: dict[int, Channel] = {}
-    schemas: dict[int, str] = {}
-    begin = 0
-    for opcode, record in records(content):
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(stream(record))
-            schemas[schema.id] = schema.name
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(stream(record))
-            channels[channel.id] = channel
-        elif opcode == Opcode.STATISTICS:
-            statistics = Statistics.read(stream(record))
-        elif opcode == Opcode.CHUNK_INDEX:
-            break  # whatever is behind the first one is left for `chunks`
-        begin += RECORD.size + len(record)
+    statistics = next((record for opcode, record in records(content) if opcode == Opcode.STATISTICS), None)
     if statistics is None:
         raise ValueError("the index has no statistics")
-    return Summary(statistics, channels, schemas, content[begin:])
+    count, _, _, attachments, _, _, first_ns, last_ns, map_bytes = _STATISTICS.unpack_from(statistics)
+    return Summary(count, attachments, first_ns, last_ns, _map(statistics, _STATISTICS.size, map_bytes), content)
+
+
+def _map(record: memoryview, begin: int, size_bytes: int) -> dict[int, int]:
+    return dict(_MAP_ENTRY.iter_unpack(record[begin : begin + size_bytes]))
 
 
 def _summary_bytes(file: BinaryIO, size_bytes: int) -> memoryview:
