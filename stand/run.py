@@ -18,6 +18,7 @@ from stand.recording.recorder import Recorder
 from stand.recording.salvage import salvage_unfinished
 from stand.scheduler import Scheduler
 from stand.session_setup import Order, recorder_of, session_directory
+from stand.session_text import salvage_line
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from stand.stand import Stand
 
@@ -146,7 +147,7 @@ async def _run(
 async def _salvage(out: Path, hub: Hub, clock: Clock) -> None:
     """Finish what an earlier run that was killed has left unfinished, before anything moves."""
     for segment in await asyncio.to_thread(salvage_unfinished, out):
-        hub.publish(Event(clock.now_ns(), "warning", "salvaged", str(segment)))
+        hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
 
 
 async def _perform(assembly: Assembly, recipe: Recipe, background: list[asyncio.Task[None]], stop: Stop) -> None:

@@ -26,7 +26,7 @@ from stand.recording.instants import date_time, parse_instant
 from stand.recording.inventory import State, inventory
 from stand.recording.overview import Glance, glance, overview
 from stand.recording.replay import ReplayClock, replay, replay_and_record
-from stand.recording.salvage import BEING_RECORDED, Salvaged, salvage_session
+from stand.recording.salvage import Salvaged, salvage_session
 from stand.recording.session import Session
 from stand.recording.trim import trim
 from stand.recording.verify import verify
@@ -36,6 +36,7 @@ from stand.session_text import (
     info_json,
     info_lines,
     list_row,
+    salvage_line,
     table_lines,
     verify_json,
     verify_lines,
@@ -166,7 +167,7 @@ def salvage(
         with _progress_of("salvage", sum(sizes.values()), sum(sizes.values())) as report:
             for path, size_bytes in sizes.items():
                 for salvaged in salvage_session(path):
-                    typer.echo(one_line(_salvage_line(path, salvaged)))
+                    typer.echo(one_line(salvage_line(salvaged)))
                     done.append(salvaged)
                 done_bytes += size_bytes
                 report(done_bytes, one_line(path.name))
@@ -174,16 +175,6 @@ def salvage(
             typer.echo("nothing to salvage")
         if any(salvaged.kept for salvaged in done):
             raise typer.Exit(FAILED)
-
-
-def _salvage_line(directory: Path, salvaged: Salvaged) -> str:
-    source = f"{directory.name}/{salvaged.source.relative_to(directory)}"
-    if salvaged.reason == BEING_RECORDED:
-        return f"{source}: left alone, it is being recorded"
-    outcome = f"{salvaged.messages} messages in {salvaged.path.name}" if salvaged.path else "nothing could be recovered"
-    lost = f", {salvaged.lost_bytes} bytes lost" if salvaged.lost_bytes else ""
-    kept = f", the original is kept as {salvaged.kept.name}" if salvaged.kept else ""
-    return f"{source}: {outcome}{lost}{kept} ({salvaged.reason})"
 
 
 @app.command("replay")

@@ -15,6 +15,7 @@ from stand.hub import Event, StepState
 from stand.recording.instants import date_time, duration
 from stand.recording.inventory import State
 from stand.recording.overview import Frames, Glance, Overview, Step, Temperature
+from stand.recording.salvage import BEING_RECORDED, Salvaged
 from stand.recording.utc import utc_text
 from stand.recording.verify import Verification
 from stand.usage import one_line
@@ -258,3 +259,14 @@ def table_lines(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
     widths = [max(len(line[column]) for line in lines) for column in range(len(LIST_COLUMNS))]
     for line in lines:
         yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
+
+
+def salvage_line(salvaged: Salvaged) -> str:
+    """What became of a segment, which is named with its session."""
+    source = "/".join(salvaged.source.absolute().parts[-3:])
+    if salvaged.reason == BEING_RECORDED:
+        return f"{source}: left alone, it is being recorded"
+    outcome = f"{salvaged.messages} messages in {salvaged.path.name}" if salvaged.path else "nothing could be recovered"
+    lost = f", {salvaged.lost_bytes} bytes lost" if salvaged.lost_bytes else ""
+    kept = f", the original is kept as {salvaged.kept.name}" if salvaged.kept else ""
+    return f"{source}: {outcome}{lost}{kept} ({salvaged.reason})"

@@ -16,10 +16,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from stand.recording.block import Block, chunk_writer
-from stand.recording.layout import FINISHED
+from stand.recording.layout import FINISHED, TEMPORARY
 from stand.recording.sink import CommitSink, sync_folder
-
-TEMPORARY = f"{FINISHED}.tmp"
 
 
 def merge_chunks(source: Path, target: Path, compression: CompressionType) -> None:

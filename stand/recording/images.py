@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drivers.interface import Frame, SessionError
 from stand.recording.messages import timestamp
 from stand.recording.png import ImageArray, decode_png, encode_png
+from stand.recording.raw import encode_raw
 
 CAMERA_IMAGE = "/camera/image"
 
@@ -39,28 +40,16 @@ def encode_image(frame: Frame, encoding: ImageEncoding) -> bytes:
     ValueError when the image is not uint8 or uint16 of shape (height, width), its windows are not within it, or it
     has windows and is to be raw, which has no place to say so.
     """
+    if encoding == "raw":
+        return encode_raw(frame)
     image = frame.image
     if image.ndim != 2 or image.size == 0 or image.dtype.name not in GREY_TYPES:
         raise ValueError(f"an image is uint8 or uint16 of shape (height, width), not {image.dtype} {image.shape}")
-    if encoding != "raw":
-        return CompressedImage(
-            timestamp=timestamp(frame.time_ns),
-            frame_id=frame.channel,
-            data=encode_png(image, frame.windows),
-            format="png",
-        ).SerializeToString()
-    if frame.windows is not None:
-        raise ValueError("a raw image cannot say which windows of it are real: record it as png")
-    height, width = image.shape
-    name = "mono8" if image.itemsize == 1 else "mono16"
-    return RawImage(
+    return CompressedImage(
         timestamp=timestamp(frame.time_ns),
         frame_id=frame.channel,
-        width=width,
-        height=height,
-        encoding=name,
-        step=width * image.itemsize,
-        data=image.astype(RAW_DTYPE[name], copy=False).tobytes(),
+        data=encode_png(image, frame.windows),
+        format="png",
     ).SerializeToString()
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from stand.recording.layout import FINISHED, FRAMES, TELEMETRY, UNFINISHED
-from stand.recording.session import DAMAGED
+from stand.recording.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
 
 
 class State(StrEnum):

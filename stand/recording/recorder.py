@@ -25,7 +25,6 @@ from stand.hub import Event, Hub, Item
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.losses import Losses
-from stand.recording.raw import encode_raw
 from stand.recording.segment import SeriesForm, Topic
 from stand.recording.series import Series
 from stand.recording.settings import USUAL, RecordingSettings, SessionInfo
@@ -144,8 +143,7 @@ class Recorder:
         self._telemetry_series.open(self._clock.now_ns())
 
     def _encode_alone(self, frame: Frame) -> bytes:
-        encoding = self._settings.frame_encoding
-        return encode_raw(frame) if encoding == "raw" else encode_image(frame, encoding)
+        return encode_image(frame, self._settings.frame_encoding)
 
     async def run(self) -> None:
         """Record until cancelled."""

@@ -25,7 +25,16 @@ from mcap.writer import CompressionType, Writer
 
 from drivers.interface import SessionError
 from stand.recording.block import CHUNK_BYTES
-from stand.recording.layout import FINISHED, FRAMES, SEGMENT_METADATA, SESSION_METADATA, TELEMETRY, UNFINISHED
+from stand.recording.layout import (
+    DAMAGED,
+    FINISHED,
+    FRAMES,
+    SEGMENT_METADATA,
+    SESSION_METADATA,
+    TELEMETRY,
+    TEMPORARY,
+    UNFINISHED,
+)
 from stand.recording.opening import Opening, opening_of, segments_of
 from stand.recording.records import DAMAGE
 from stand.recording.segment_check import check_segment
@@ -34,8 +43,6 @@ from stand.recording.walk import Source, StoredMessage, Survey, stored_messages,
 
 SALVAGE_METADATA = "salvage"
 BEING_RECORDED = "is being recorded"
-COPY = FINISHED + ".tmp"
-DAMAGED = FINISHED + ".damaged"
 COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}
 
 
@@ -68,13 +75,13 @@ def salvage_session(directory: Path) -> list[Salvaged]:
 def salvage_unfinished(root: Path) -> list[Salvaged]:
     """Finish the unfinished segments of every session below `root`, without a look at the finished ones. SessionError
     as above."""
-    left = {path.parent for pattern in (UNFINISHED, COPY) for path in root.glob(f"*/*/*{pattern}")}
+    left = {path.parent for pattern in (UNFINISHED, TEMPORARY) for path in root.glob(f"*/*/*{pattern}")}
     folders = [folder for folder in sorted(left, reverse=True) if folder.name in COMPRESSION]  # telemetry is first
     return [done for folder in folders for done in _salvage_folder(folder, finished_too=False)]
 
 
 def _salvage_folder(folder: Path, finished_too: bool) -> Iterator[Salvaged]:
-    for copy in folder.glob(f"*{COPY}"):
+    for copy in folder.glob(f"*{TEMPORARY}"):
         _remove_left_over(copy)
     for number in sorted({int(path.name.partition(".")[0]) for path in segments_of(folder)}):
         yield from _salvage_number(folder / f"{number:04d}{FINISHED}", finished_too)
@@ -243,7 +250,7 @@ def _write_copy(original: _Original) -> None:
 
 
 def _copy_path(original: _Original) -> Path:
-    return original.finished.with_name(original.finished.name.replace(FINISHED, COPY))
+    return original.finished.with_name(original.finished.name.replace(FINISHED, TEMPORARY))
 
 
 def _write(file: BinaryIO, original: _Original) -> None:
