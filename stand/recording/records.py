@@ -121,7 +121,7 @@ def read_head(path: Path) -> Head:
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
         head = _head(path, file)
-        if len(head.attachments) != summary.attachment_count:
+        if len(head.attachments) != summary.statistics.attachment_count:
             raise ValueError("its attachments are not those its index tells of")
         return head
 
@@ -173,7 +173,7 @@ def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterato
             for number, offset, end in _message_places(chunk, topics):
                 counts[number] += 1
                 yield _message(topics[number], chunk, offset, end)
-        if counts != {number: summary.message_counts.get(number, 0) for number in topics}:
+        if counts != {number: summary.statistics.channel_message_counts.get(number, 0) for number in topics}:
             raise ValueError("it does not hold the messages its index tells of")
 
 
@@ -243,8 +243,8 @@ def _message(topic: str, chunk: memoryview, offset: int, end: int) -> Message:
 def message_span(path: Path) -> MessageSpan:
     """How many messages a segment has and when, from its statistics alone."""
     with reading(path), path.open("rb") as file:
-        summary = _open(path, file)
-        return MessageSpan(summary.message_count, summary.first_ns, summary.last_ns)
+        statistics = _open(path, file).statistics
+        return MessageSpan(statistics.message_count, statistics.message_start_time, statistics.message_end_time)
 
 
 def frame_places(path: Path) -> list[FramePlace]:
@@ -256,7 +256,7 @@ def frame_places(path: Path) -> list[FramePlace]:
         for chunk in summary.chunks():
             (number,) = chunk.channels
             places.append(FramePlace(path, chunk, number, channels[number][1]))
-        if summary.message_count != len(places):
+        if summary.statistics.message_count != len(places):
             raise ValueError("its chunks are not one frame each")
         return places
 

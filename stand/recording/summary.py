@@ -40,15 +40,22 @@ class ChunkPlace(NamedTuple):
     channels: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a segment's index tells; `message_counts` are by channel id, the log times 0 when there is no message."""
+class Statistics(NamedTuple):
+    """What a segment holds, in the format's own names: the counts of a channel's messages are by its id, the times are
+    log times in ns, 0 when there is no message."""
 
     message_count: int
     attachment_count: int
-    first_ns: int
-    last_ns: int
-    message_counts: dict[int, int]
+    message_start_time: int
+    message_end_time: int
+    channel_message_counts: dict[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a segment's index tells."""
+
+    statistics: Statistics
     _content: memoryview
 
     def channels(self) -> dict[int, tuple[Channel, str]]:
@@ -76,11 +83,12 @@ class Summary:
 def read_summary(file: BinaryIO, size_bytes: int) -> Summary:
     """The summary of a finished segment of that size; ValueError, struct.error or EOFError when it is damaged."""
     content = _summary_bytes(file, size_bytes)
-    statistics = next((record for opcode, record in records(content) if opcode == Opcode.STATISTICS), None)
-    if statistics is None:
+    record = next((record for opcode, record in records(content) if opcode == Opcode.STATISTICS), None)
+    if record is None:
         raise ValueError("the index has no statistics")
-    count, _, _, attachments, _, _, first_ns, last_ns, map_bytes = _STATISTICS.unpack_from(statistics)
-    return Summary(count, attachments, first_ns, last_ns, _map(statistics, _STATISTICS.size, map_bytes), content)
+    count, _, _, attachments, _, _, first_ns, last_ns, map_bytes = _STATISTICS.unpack_from(record)
+    counts = _map(record, _STATISTICS.size, map_bytes)
+    return Summary(Statistics(count, attachments, first_ns, last_ns, counts), content)
 
 
 def _map(record: memoryview, begin: int, size_bytes: int) -> dict[int, int]:
