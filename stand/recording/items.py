@@ -82,9 +82,9 @@ def describes_frame(channel: Channel) -> bool:
     return channel.topic == messages.CAMERA_META
 
 
-def description_of(message: Message) -> tuple[Message, messages.FrameMeta]:
-    """The message, for its time and sequence, and the description in it."""
-    return message, messages.decode_frame_meta(message.data)
+def description_of(message: Message) -> tuple[int, messages.FrameMeta]:
+    """Time and content of a frame's description; SessionError when it is none."""
+    return message.time_ns, messages.decode_frame_meta(message.data)
 
 
 def stands_for_item(channel: Channel) -> bool:

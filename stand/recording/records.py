@@ -13,7 +13,7 @@ from collections.abc import Callable, Container, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import zstandard
 from mcap.exceptions import McapError
@@ -25,7 +25,7 @@ from drivers.interface import SessionError
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
 from stand.recording.layout import SESSION_METADATA
 from stand.recording.messages import CLASSES
-from stand.recording.summary import CRC, RECORD, ChunkPlace, Summary, check_crc, read_summary, records, stream
+from stand.recording.summary import CRC, RECORD, ChunkPlace, Summary, check_crc, read_summary, stream
 
 # What reading damaged bytes raises; CRC and Unicode errors are ValueErrors.
 DAMAGE = (
@@ -40,6 +40,7 @@ DAMAGE = (
     MemoryError,
 )
 CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; whoever claims more is damaged
+_FRAME_HEAD_BYTES = 1 << 14  # schema, channel and what precedes the image; 3 KiB in the first chunk, 90 bytes in others
 INFLATED_LIMIT_BYTES = 1 << 26  # only telemetry is compressed, and its chunks are 1 MiB and a message
 SCHEMAS = {
     CAMERA_IMAGE: {image.DESCRIPTOR.full_name for image in IMAGE_CLASS.values()},
@@ -189,19 +190,41 @@ def _channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
 
 def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
     """The records of the chunk at that place, their CRC checked."""
-    if place.length > CHUNK_LIMIT_BYTES or place.offset + place.length > os.fstat(file.fileno()).st_size:
-        raise ValueError(f"a chunk of {place.length} bytes at {place.offset}")
-    file.seek(place.offset)
-    ((opcode, chunk),) = records(memoryview(file.read(place.length)))
-    if opcode != Opcode.CHUNK:
+    data = memoryview(_read(file, place.offset, place.length))
+    head = _chunk_head(data, place)
+    content = _uncompressed(head.compression, data[head.end :], head.size_bytes)
+    check_crc(content, head.crc)
+    return content
+
+
+def _read(file: BinaryIO, offset: int, length: int) -> bytes:
+    """So many bytes from there; ValueError when there are fewer, before memory is taken for them."""
+    if length > CHUNK_LIMIT_BYTES or offset + length > os.fstat(file.fileno()).st_size:
+        raise ValueError(f"{length} bytes at {offset} are not in the file")
+    file.seek(offset)
+    return file.read(length)
+
+
+class _ChunkHead(NamedTuple):
+    """A chunk's record before its content: what it says of it, and where it ends."""
+
+    size_bytes: int
+    crc: int
+    compression: bytes
+    end: int
+
+
+def _chunk_head(data: bytes | memoryview, place: ChunkPlace) -> _ChunkHead:
+    """The head of the chunk that begins `data`; ValueError when it is not the one that the index tells of."""
+    opcode, length = RECORD.unpack_from(data)
+    if opcode != Opcode.CHUNK or length != place.length - RECORD.size:
         raise ValueError("the index does not point to a chunk")
-    first_ns, last_ns, size, crc, name_bytes = _CHUNK.unpack_from(chunk)
+    first_ns, last_ns, size_bytes, crc, name_bytes = _CHUNK.unpack_from(data, RECORD.size)
     if (first_ns, last_ns) != (place.first_ns, place.last_ns):
         raise ValueError("the index points to another chunk")
-    name_end = _CHUNK.size + name_bytes
-    data = _uncompressed(bytes(chunk[_CHUNK.size : name_end]), chunk[name_end + _DATA_LENGTH.size :], size)
-    check_crc(data, crc)
-    return data
+    name_begin = RECORD.size + _CHUNK.size
+    name = bytes(data[name_begin : name_begin + name_bytes])
+    return _ChunkHead(size_bytes, crc, name, name_begin + name_bytes + _DATA_LENGTH.size)
 
 
 def _uncompressed(compression: bytes, data: memoryview, size: int) -> memoryview:
@@ -262,11 +285,33 @@ def frame_places(path: Path) -> list[FramePlace]:
 
 
 def read_frame(place: FramePlace) -> Message:
-    """The image message at its place."""
-    with reading(place.path), place.path.open("rb") as file:
-        chunk = _chunk(file, place.chunk)
-        ((_, offset, end),) = _message_places(chunk, (place.channel,))
-        message = _message(CAMERA_IMAGE, chunk, offset, end)
-        if message.time_ns != place.time_ns:
-            raise ValueError("the index tells another time")
-        return message
+    """The image message at its place: the last record of its chunk, behind at most its schema and channel.
+
+    It is read by itself, because new memory for 5 MB costs more than all else that is done here.
+    """
+    chunk = place.chunk
+    with reading(place.path), place.path.open("rb", buffering=0) as file:
+        data = _read(file, chunk.offset, min(chunk.length, _FRAME_HEAD_BYTES))
+        head = _chunk_head(data, chunk)
+        if head.compression or head.end + head.size_bytes != chunk.length:
+            raise ValueError("a frame's chunk is compressed or has another size")
+        begin = _image_record(data, head.end)
+        _, length, number = _MESSAGE_START.unpack_from(data, begin)
+        sequence, time_ns, _ = _MESSAGE_REST.unpack_from(data, begin + _MESSAGE_START.size)
+        begin += _MESSAGE_BYTES
+        if length != chunk.length - begin + _MESSAGE_BYTES - RECORD.size:
+            raise ValueError("a frame's chunk holds more than the frame")
+        image = _read(file, chunk.offset + begin, chunk.length - begin)
+        check_crc(image, head.crc, data[head.end : begin])
+        if (number, time_ns) != (place.channel, place.time_ns):
+            raise ValueError("the index tells of another frame")
+        return Message(CAMERA_IMAGE, sequence, time_ns, image)
+
+
+def _image_record(data: bytes, offset: int) -> int:
+    """Where the first message record is, of the records from `offset` on."""
+    opcode, length = RECORD.unpack_from(data, offset)
+    while opcode != Opcode.MESSAGE:
+        offset += RECORD.size + length
+        opcode, length = RECORD.unpack_from(data, offset)
+    return offset

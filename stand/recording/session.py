@@ -7,7 +7,7 @@ wrong with a session is a SessionError with a sentence.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from itertools import accumulate, chain, pairwise
 from operator import attrgetter
@@ -69,7 +69,7 @@ class Session:
         self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
         self._all_columns_read = False
         self._places_of: dict[Path, list[FramePlace]] = {}
-        self._metas_of: dict[Path, dict[tuple[int, int], messages.FrameMeta]] = {}
+        self._metas_of: dict[Path, dict[tuple[int, int], bytes]] = {}
 
     @classmethod
     def open(cls, path: Path) -> Session:
@@ -197,7 +197,7 @@ class Session:
     @property
     def frame_metas(self) -> list[tuple[int, messages.FrameMeta]]:
         """(time_ns, description) of every frame in order of publication, also of those whose image was lost."""
-        return [(message.time_ns, meta) for message, meta in self._decoded(describes_frame, description_of)]
+        return list(self._decoded(describes_frame, description_of))
 
     def _image(self, place: FramePlace) -> RecordedImage:
         message = read_frame(place)
@@ -210,17 +210,20 @@ class Session:
             if span.first_ns <= time_ns <= span.last_ns:
                 found = self._metas_in(path).get((time_ns, sequence))
                 if found is not None:
-                    return found
+                    with naming(path):
+                        return messages.decode_frame_meta(found)
         return None
 
     @cached_property
     def _telemetry_spans(self) -> list[tuple[Path, MessageSpan]]:
         return [(path, message_span(path)) for path in self._telemetry]
 
-    def _metas_in(self, segment: Path) -> dict[tuple[int, int], messages.FrameMeta]:
+    def _metas_in(self, segment: Path) -> dict[tuple[int, int], bytes]:
+        """(time, sequence) -> the description's message, not decoded."""
         if segment not in self._metas_of:
-            found = self._decoded(describes_frame, description_of, (segment,))
-            self._metas_of[segment] = {(message.time_ns, message.sequence): meta for message, meta in found}
+            self._check(segment)
+            found = telemetry_messages(segment, describes_frame)
+            self._metas_of[segment] = {(message.time_ns, message.sequence): message.data for message in found}
         return self._metas_of[segment]
 
     @cached_property
@@ -250,11 +253,9 @@ class Session:
             self._places_of[segment] = sorted(frame_places(segment), key=attrgetter("time_ns"))
         return self._places_of[segment]
 
-    def _decoded(
-        self, wanted: Callable[[Channel], bool], decode: Callable[[Message], T], segments: Iterable[Path] | None = None
-    ) -> Iterator[T]:
-        """The messages of the wanted channels in the order of the files (None: all of the telemetry), decoded."""
-        for path in self._telemetry if segments is None else segments:
+    def _decoded(self, wanted: Callable[[Channel], bool], decode: Callable[[Message], T]) -> Iterator[T]:
+        """The telemetry of the wanted channels in the order of the files, each message decoded."""
+        for path in self._telemetry:
             self._check(path)
             for message in telemetry_messages(path, wanted):
                 try:

@@ -128,9 +128,9 @@ def records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         offset += length
 
 
-def check_crc(data: bytes | memoryview, crc: int) -> None:
-    """ValueError when `data` is not what the CRC was made of."""
-    if zlib.crc32(data) != crc:
+def check_crc(data: bytes | memoryview, crc: int, before: bytes = b"") -> None:
+    """ValueError when `before` and `data` are not what the CRC was made of."""
+    if zlib.crc32(data, zlib.crc32(before)) != crc:
         raise ValueError("a CRC is wrong")
 
 

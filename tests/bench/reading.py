@@ -1,0 +1,213 @@
+"""What it costs to look into a session: one frame, or all temperatures, of 1 GB, of 5 GB and of a night.
+
+The sessions are written by the recorder's own series: raw frames of 5 MP at 2 per second in segments of 1 GB, telemetry
+of seven devices each second; the night is 16 h of telemetry alone. The one of 1 GB is the first segment of the other.
+The peer does the same with mcap's own reader, CRCs checked as ours are. All files are in the page cache.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from numpy.typing import NDArray
+
+from drivers.clock import NS_PER_S
+from drivers.interface import Frame, Reading
+from stand.hub import Batch
+from stand.recording import messages
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
+from stand.recording.session import Session
+from stand.recording.telemetry import TelemetryEncoder
+from tests.bench.figures import Figure, absolute, in_turns, milliseconds, progress, side_by_side
+
+ROUNDS = 50
+START_NS = 1_767_290_400 * NS_PER_S
+FRAME_PERIOD_NS = NS_PER_S // 2
+HEIGHT_px, WIDTH_px = 2048, 2448
+FRAMES_PER_SEGMENT = 200  # 1.0 GB
+SEGMENTS = 5
+NIGHT_s = 16 * 3600
+DEVICES = {
+    "thermometers": "thermometers",
+    "regulator": "regulator",
+    "relays": "relays",
+    "camera": "camera",
+    "linear": "axis",
+    "rotary": "axis",
+    "flap": "flap",
+}
+TEMPERATURES = tuple(f"thermometers.{place}" for place in messages.THERMOMETERS)
+TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in messages.THERMOMETERS)
+METADATA = {"session_id": "bench"}
+ATTACHMENTS = {"config.yaml": "a: 1\n" * 400}
+
+
+def figures(directory: Path) -> list[Figure]:
+    """ms for a random frame and for all temperatures, each beside mcap's reader, and how both grow with the size."""
+    small, large, night = (directory / name for name in ("1GB", "5GB", "night"))
+    try:
+        _write_sessions(small, large, night)
+        return [*_frame_figures(small, large), *_temperature_figures(small, large, night)]
+    finally:
+        for session in (small, large, night):
+            shutil.rmtree(session, ignore_errors=True)
+
+
+def _write_sessions(small: Path, large: Path, night: Path) -> None:
+    progress("reading, 5 GB of frames are written")
+    _write_frames(large)
+    _write_telemetry(large, SEGMENTS * FRAMES_PER_SEGMENT // 2)
+    (small / FRAMES).mkdir(parents=True)
+    os.link(large / FRAMES / "0000.mcap", small / FRAMES / "0000.mcap")
+    _write_telemetry(small, FRAMES_PER_SEGMENT // 2)
+    progress("reading, 16 h of telemetry are written")
+    _write_telemetry(night, NIGHT_s)
+
+
+def _series(folder: Path, topics: tuple[Topic, ...], compression: CompressionType, segment_bytes: int) -> Series:
+    folder.mkdir(parents=True)
+    form = SeriesForm(folder.name, topics, compression, METADATA, ATTACHMENTS, segment_bytes, 600 * NS_PER_S)
+    return Series(folder, form)
+
+
+def _write_frames(session: Path) -> None:
+    topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS["raw"]),)
+    size = FRAMES_PER_SEGMENT * HEIGHT_px * WIDTH_px
+    series = _series(session / FRAMES, topics, CompressionType.NONE, size)
+    noise = np.random.default_rng(1).integers(0, 256, (HEIGHT_px + 100, WIDTH_px), np.uint8)
+    for number in range(SEGMENTS * FRAMES_PER_SEGMENT):
+        frame = _frame(number, noise[number % 100 :][:HEIGHT_px])
+        series.commit([Record(CAMERA_IMAGE, frame.time_ns, encode_image(frame, "raw"), number)], frame.time_ns)
+    series.finish()
+
+
+def _frame(number: int, image: NDArray[np.uint8]) -> Frame:
+    time_ns = START_NS + number * FRAME_PERIOD_NS
+    return Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, number, time_ns)
+
+
+def _write_telemetry(session: Path, duration_s: int) -> None:
+    encoder = TelemetryEncoder(DEVICES)
+    series = _series(session / TELEMETRY, encoder.topics(), CompressionType.ZSTD, 1_000_000_000)
+    image = np.zeros((1, 1), np.uint8)
+    for begin in range(0, duration_s, 60):
+        records = [
+            record
+            for second in range(begin, min(begin + 60, duration_s))
+            for item in (*_batches(second), _frame(2 * second, image), _frame(2 * second + 1, image))
+            for record in encoder.encode(item)
+        ]
+        series.commit(records, START_NS + begin * NS_PER_S)
+    series.finish()
+
+
+def _batches(second: int) -> Iterator[Batch]:
+    for index, (device, kind) in enumerate(DEVICES.items()):
+        time_ns = START_NS + second * NS_PER_S + index
+        values = random.Random(second * len(DEVICES) + index)
+        readings = [
+            Reading(f"{device}.{quantity.name}", round(values.gauss(20, 1), 2), quantity.unit, time_ns)
+            for quantity in messages.KINDS[kind].quantities
+            if (device, quantity.unit) not in {("linear", "deg"), ("rotary", "mm")}
+        ]
+        yield Batch(device, time_ns, tuple(readings))
+
+
+def _frame_figures(small: Path, large: Path) -> list[Figure]:
+    progress("reading, random frames")
+    with ExitStack() as files:
+        readers = [make_reader(files.enter_context(path.open("rb")), validate_crcs=True) for path in _frames(large)]
+        opened = Session.open(large)
+        fresh = {path: _random(_fresh_frame, path) for path in (small, large)}
+        own, other = in_turns(fresh[large], _random(_peer_frame, large), ROUNDS)
+        own_open, other_open = in_turns(
+            lambda: milliseconds(lambda: opened.frame(_numbers.randrange(opened.frame_count))),
+            lambda: milliseconds(lambda: _frame_of(readers, _numbers.randrange(opened.frame_count))),
+            ROUNDS,
+        )
+        in_large, in_small = in_turns(fresh[large], fresh[small], ROUNDS)
+    return [
+        side_by_side("reading, 5 GB: open, random 5 MP frame", "ms", "mcap make_reader, CRCs", own, other),
+        side_by_side("reading, 5 GB open: random 5 MP frame", "ms", "the same, readers open", own_open, other_open),
+        side_by_side("reading, open, random frame, 5 GB", "ms", "ours, 1 GB", in_large, in_small),
+    ]
+
+
+_numbers = random.Random(7)
+
+
+def _random(read: Callable[[Path, int], object], session: Path) -> Callable[[], float]:
+    """A measurement: `read` one frame of the session at random, ms."""
+    count = FRAMES_PER_SEGMENT * len(_frames(session))
+    return lambda: milliseconds(lambda: read(session, _numbers.randrange(count)))
+
+
+def _frames(session: Path) -> list[Path]:
+    return sorted((session / FRAMES).iterdir())
+
+
+def _fresh_frame(session: Path, number: int) -> object:
+    return Session.open(session).frame(number)
+
+
+def _peer_frame(session: Path, number: int) -> object:
+    """The segment is known to the peer, the meaning of the frame's description spared."""
+    with _frames(session)[number // FRAMES_PER_SEGMENT].open("rb") as file:
+        return _frame_of([make_reader(file, validate_crcs=True)], number)
+
+
+def _frame_of(readers: list[Any], number: int) -> NDArray[np.uint8]:
+    time_ns = START_NS + number * FRAME_PERIOD_NS
+    reader = readers[number // FRAMES_PER_SEGMENT % len(readers)]
+    ((_, _, message),) = reader.iter_messages([CAMERA_IMAGE], starting_at=time_ns, ending_before=time_ns + 1)
+    return np.frombuffer(RawImage.FromString(message.data).data, np.uint8).reshape(HEIGHT_px, WIDTH_px)
+
+
+def _temperature_figures(small: Path, large: Path, night: Path) -> list[Figure]:
+    progress("reading, temperatures")
+    found = [
+        side_by_side(
+            f"reading, {what}: open, all temperatures",
+            "ms",
+            "mcap make_reader, CRCs, protobuf",
+            *in_turns(_timed(_own_temperatures, path), _timed(_peer_temperatures, path), rounds),
+        )
+        for what, path, rounds in (("5 GB", large, 20), ("16 h", night, 5))
+    ]
+    return [*found, absolute("reading, 5 GB: open", "ms", [_timed(Session.open, large)() for _ in range(ROUNDS)])]
+
+
+def _timed(read: Callable[[Path], object], session: Path) -> Callable[[], float]:
+    return lambda: milliseconds(lambda: read(session))
+
+
+def _own_temperatures(session: Path) -> list[NDArray[np.float64]]:
+    opened = Session.open(session)
+    return [opened.readings(channel)[1] for channel in TEMPERATURES]
+
+
+def _peer_temperatures(session: Path) -> list[NDArray[np.float64]]:
+    rows = [row for path in sorted((session / TELEMETRY).iterdir()) for row in _peer_rows(path)]
+    return list(np.array(rows).T)
+
+
+def _peer_rows(path: Path) -> Iterable[list[float]]:
+    topic = messages.KINDS["thermometers"].topic
+    parse = messages.CLASSES[topic].FromString
+    with path.open("rb") as file:
+        for _, _, message in make_reader(file, validate_crcs=True).iter_messages([topic]):
+            decoded = parse(message.data)
+            yield [getattr(decoded, name) for name in TEMPERATURE_FIELDS]
