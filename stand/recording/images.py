@@ -72,7 +72,8 @@ def _from_raw(raw: RawImage) -> ImageArray:
     if dtype is None:
         raise SessionError(f"a recorded image has the encoding {raw.encoding!r}; mono8 and mono16 are known")
     row_bytes = raw.width * dtype.itemsize
-    if not raw.data or raw.step != row_bytes or len(raw.data) != row_bytes * raw.height:
-        raise SessionError(f"a raw image of {raw.width} x {raw.height} px has {len(raw.data)} bytes")
-    pixels = np.frombuffer(raw.data, dtype).reshape(raw.height, raw.width)
+    data = raw.data  # protobuf copies it at every access
+    if not data or raw.step != row_bytes or len(data) != row_bytes * raw.height:
+        raise SessionError(f"a raw image of {raw.width} x {raw.height} px has {len(data)} bytes")
+    pixels = np.frombuffer(data, dtype).reshape(raw.height, raw.width)
     return cast(ImageArray, pixels.astype(dtype.newbyteorder("="), copy=False))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Mapping
+
 FRAMES = "frames"
 TELEMETRY = "telemetry"
 FINISHED = ".mcap"
@@ -11,3 +14,20 @@ DAMAGED = ".mcap.damaged"  # the original of a segment from which a salvage coul
 SESSION_METADATA = "session"
 SEGMENT_METADATA = "segment"
 DEVICES = "devices"  # key of a channel's metadata: the names of the devices on its topic, with commas between
+SESSION_CRC = "session_crc32"
+
+
+def segment_metadata(series: str, number: int, session: Mapping[str, str]) -> dict[str, str]:
+    """The record `segment`: its place in the session, and a CRC of `session`, for MCAP gives metadata none."""
+    previous = f"{number - 1:04d}" if number else ""
+    return {"series": series, "number": f"{number:04d}", "previous": previous, SESSION_CRC: _crc_text(session)}
+
+
+def contradicts(segment: Mapping[str, str], session: Mapping[str, str]) -> bool:
+    """Whether the two records of one segment do not belong together: one of them is damaged."""
+    return segment.get(SESSION_CRC, _crc_text(session)) != _crc_text(session)
+
+
+def _crc_text(session: Mapping[str, str]) -> str:
+    text = "".join(f"{key}\0{value}\0" for key, value in sorted(session.items()))
+    return f"{zlib.crc32(text.encode()):08x}"

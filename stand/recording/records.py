@@ -23,7 +23,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from drivers.interface import SessionError
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
-from stand.recording.layout import SESSION_METADATA
+from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
 from stand.recording.messages import CLASSES
 from stand.recording.summary import CRC, RECORD, ChunkPlace, Summary, check_crc, read_summary, stream
 
@@ -142,7 +142,7 @@ def _open(path: Path, file: BinaryIO) -> Summary:
 
 def _head(path: Path, file: BinaryIO) -> Head:
     size = path.stat().st_size
-    session: dict[str, str] | None = None
+    found: dict[str, dict[str, str]] = {}
     attachments: dict[str, str] = {}
     while True:
         opcode, length = RECORD.unpack(file.read(RECORD.size))
@@ -155,9 +155,12 @@ def _head(path: Path, file: BinaryIO) -> Head:
             attachments[attachment.name] = attachment.data.decode()
         elif opcode == Opcode.METADATA:
             metadata = Metadata.read(stream(content))
-            session = metadata.metadata if metadata.name == SESSION_METADATA else session
+            found[metadata.name] = metadata.metadata
+    session = found.get(SESSION_METADATA)
     if session is None:
         raise SessionError(f"{path}: not a segment of a thermostand session")
+    if contradicts(found.get(SEGMENT_METADATA, {}), session):
+        raise ValueError("the session's metadata do not fit their CRC")
     return Head(session, attachments)
 
 

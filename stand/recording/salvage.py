@@ -34,6 +34,7 @@ from stand.recording.layout import (
     TELEMETRY,
     TEMPORARY,
     UNFINISHED,
+    segment_metadata,
 )
 from stand.recording.opening import Opening, opening_of, segments_of
 from stand.recording.records import DAMAGE
@@ -278,11 +279,9 @@ def _write_opening(writer: Writer, original: _Original) -> Mapping[int, int]:
             attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
         )
     number = int(original.finished.name.partition(".")[0])
-    previous = f"{number - 1:04d}" if number else ""
     writer.add_metadata(SESSION_METADATA, dict(opening.session))
-    writer.add_metadata(
-        SEGMENT_METADATA, {"series": original.path.parent.name, "number": f"{number:04d}", "previous": previous}
-    )
+    place = segment_metadata(original.path.parent.name, number, opening.session)
+    writer.add_metadata(SEGMENT_METADATA, place)
     writer.add_metadata(SALVAGE_METADATA, _salvage_metadata(original))
     schemas = {
         schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)

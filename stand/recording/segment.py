@@ -27,7 +27,7 @@ from mcap_protobuf.schema import register_schema
 
 from stand.recording.block import Block, chunk_writer
 from stand.recording.compaction import merge_chunks
-from stand.recording.layout import DEVICES, FINISHED, SEGMENT_METADATA, SESSION_METADATA, UNFINISHED
+from stand.recording.layout import DEVICES, FINISHED, SEGMENT_METADATA, SESSION_METADATA, UNFINISHED, segment_metadata
 from stand.recording.records import DAMAGE
 from stand.recording.sink import CommitSink, sync_folder
 from stand.recording.space import disk_space
@@ -102,11 +102,9 @@ class Segment:
         for name, text in self._form.attachments.items():
             media_type = "application/yaml" if name.endswith(".yaml") else "text/plain"
             self._writer.add_attachment(0, self.begun_ns, name, media_type, text.encode())
-        previous = f"{number - 1:04d}" if number else ""
-        self._writer.add_metadata(SESSION_METADATA, dict(self._form.session))
-        self._writer.add_metadata(
-            SEGMENT_METADATA, {"series": self._form.name, "number": f"{number:04d}", "previous": previous}
-        )
+        session = self._form.session
+        self._writer.add_metadata(SESSION_METADATA, dict(session))
+        self._writer.add_metadata(SEGMENT_METADATA, segment_metadata(self._form.name, number, session))
         return {topic.name: self._register(topic) for topic in self._form.topics}
 
     def _register(self, topic: Topic) -> int:

@@ -20,7 +20,15 @@ from stand.recording.gaps import FRAMES_DROPPED, silences, told_blocks
 from stand.recording.images import CAMERA_IMAGE
 from stand.recording.instants import date_time
 from stand.recording.inventory import SegmentFile, State, inventory
-from stand.recording.layout import FRAMES, SEGMENT_METADATA, SESSION_METADATA, TELEMETRY
+from stand.recording.layout import (
+    FRAMES,
+    SEGMENT_METADATA,
+    SESSION_CRC,
+    SESSION_METADATA,
+    TELEMETRY,
+    contradicts,
+    segment_metadata,
+)
 from stand.recording.records import Message
 from stand.recording.salvage import SALVAGE_METADATA
 from stand.recording.segment_check import Damage, SegmentCheck, check_segment
@@ -202,9 +210,11 @@ def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
             continue  # a finding already
         if _entries(metadata.get(SESSION_METADATA)) != sessions.most_common(1)[0][0]:
             yield _error("tells of another session than the other segments", file.name)
-        previous = f"{file.number - 1:04d}" if file.number else ""
-        place = {"series": file.series, "number": f"{file.number:04d}", "previous": previous}
-        if metadata.get(SEGMENT_METADATA) != place:
+        segment, session = metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})
+        if contradicts(segment, session):
+            yield _error("its metadata do not fit their CRC", file.name)
+        place = segment_metadata(file.series, file.number, session)
+        if segment.keys() - place.keys() or any(segment.get(key) != place[key] for key in place.keys() - {SESSION_CRC}):
             yield _error("tells of another place in the session than its name does", file.name)
         if (salvage := metadata.get(SALVAGE_METADATA)) is not None:
             yield _note(f"was salvaged ({', '.join(f'{key}: {text}' for key, text in salvage.items())})", file.name)

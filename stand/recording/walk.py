@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Footer, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from stand.recording.layout import SESSION_METADATA
+from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
 from stand.recording.proof import (
     CRC,
     MESSAGE,
@@ -221,6 +221,9 @@ class _Walk:
                 if found.chunks and not found.is_opening_whole:
                     self._forget_attached()
                 found.session = entries
+            case Metadata(name=name, metadata=entries) if name == SEGMENT_METADATA:
+                if found.session is not None and contradicts(entries, found.session):
+                    found.session = None
             case Attachment() as attachment:
                 found.attachments[attachment.name] = attachment
             case DataEnd():

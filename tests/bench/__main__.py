@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 
-from tests.bench import camera, markers, modbus, recorder, simulator, virtual_time, ximc
+from tests.bench import camera, codec, line_rate, markers, modbus, reading, recorder, simulator, virtual_time, ximc
 from tests.bench.figures import Figure, progress, table
 
 BENCHMARKS = {
@@ -18,7 +18,10 @@ BENCHMARKS = {
     "modbus": modbus.figures,
     "ximc": ximc.figures,
     "camera": camera.figures,
+    "codec": codec.figures,
     "recorder": recorder.figures,
+    "line_rate": line_rate.figures,
+    "reading": reading.figures,
     "markers": markers.figures,
     "simulator": simulator.figures,
 }

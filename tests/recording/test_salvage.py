@@ -132,7 +132,8 @@ def test_a_copy_says_from_what_it_was_made_and_reads_like_a_recording(damaged):
         "lost_bytes": "0",
         "damaged_places": "0",
     }
-    assert metadata_of(done.path, "segment") == {"series": "frames", "number": "0001", "previous": "0000"}
+    place = {"series": "frames", "number": "0001", "previous": "0000"}
+    assert metadata_of(done.path, "segment").items() > place.items()
     session = Session.open(folder.parent)
     assert (session.metadata, session.attachment("config.yaml")) == (METADATA, ATTACHMENTS["config.yaml"])
     assert session.frame_count == 24 + 23

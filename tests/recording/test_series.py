@@ -10,6 +10,7 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 
+from stand.recording.layout import segment_metadata
 from stand.recording.messages import CLASSES, EVENT, LOG
 from stand.recording.segment import Record, SeriesForm, Topic
 from stand.recording.series import Series, next_number
@@ -100,7 +101,7 @@ def test_a_finished_segment_has_few_large_chunks_with_everything_in_its_place(tm
         assert {found.name: found.data.decode() for found in reader.iter_attachments()} == ATTACHMENTS
         metadata = {found.name: found.metadata for found in reader.iter_metadata()}
         assert metadata["session"] == SESSION
-        assert metadata["segment"] == {"series": "telemetry", "number": "0000", "previous": ""}
+        assert metadata["segment"] == segment_metadata("telemetry", 0, metadata["session"])
         summary = reader.get_summary()
     assert summary.statistics.message_count == 600 * RECORDS_PER_COMMIT
     assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 5
