@@ -266,7 +266,7 @@ class RecordingConfig(Document):
     directory: Annotated[Path, AfterValidator(_printable)] = Path("sessions")
     frame_encoding: Literal["png", "raw", "roi"] = "png"
     whole_every_s: float = Field(default=60.0, gt=0, le=86400)
-    telemetry_commit_s: float = Field(default=1.0, gt=0, le=300)
+    telemetry_commit_s: float = Field(default=1.0, gt=0, le=1)
     stop_frames_below_GB: float = Field(default=2.0, ge=0, le=1000)
     alert_below_percent: float = Field(default=10.0, ge=0, le=100)
 

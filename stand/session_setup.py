@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -14,12 +13,13 @@ from compensation.target import Target
 from compensation.windows import marker_windows
 from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.documents import parse_document
-from drivers.interface import ConfigError, Frame
+from drivers.interface import ConfigError
 from stand.assembly import Assembly
 from stand.config import StandConfig
 from stand.recipe import Recipe
 from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.recording.roi import RoiEncoder
+from stand.recording.settings import VIRTUAL_COMMIT_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,14 +62,18 @@ def recorder_of(order: Order, directory: Path, assembly: Assembly) -> Recorder:
     }
     settings = RecordingSettings(
         config.recording.frame_encoding,
-        config.recording.telemetry_commit_s,
+        VIRTUAL_COMMIT_S if isinstance(clock, VirtualClock) else config.recording.telemetry_commit_s,
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
-    return Recorder(directory, info, attachments, _kinds(config), assembly.hub, clock, settings, _partial_frames(order))
+    encode = _partial_frames(order)
+    recorder = Recorder(directory, info, attachments, _kinds(config), assembly.hub, clock, settings, encode)
+    if encode is not None:
+        encode.tell = partial(recorder.warn, "search_failed")
+    return recorder
 
 
-def _partial_frames(order: Order) -> Callable[[Frame], bytes] | None:
+def _partial_frames(order: Order) -> RoiEncoder | None:
     """For `roi`: the encoder that keeps the surroundings of the target's markers."""
     recording = order.config.recording
     if recording.frame_encoding != "roi":

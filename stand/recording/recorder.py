@@ -151,6 +151,7 @@ class Recorder:
             tasks.create_task(self._report_on_ticks())  # by itself: it has to tell of a disk that holds up the others
             tasks.create_task(self._save_telemetry_on_ticks())
             tasks.create_task(self._record_frames())
+            tasks.create_task(self._close_old_frames_on_ticks())
 
     async def flushed(self) -> None:
         """Return when everything published before the call is on the disk or counted as lost. Only while `run` runs;
@@ -195,6 +196,10 @@ class Recorder:
         if not is_complete:
             raise SessionError(f"{self.directory}: {self._telemetry_series.troubles.pop()}")
 
+    def warn(self, kind: str, text: str) -> None:
+        """An event of this kind with the next report; from any thread."""
+        self._notices.append(Notice("warning", kind, text))
+
     def _receive(self, item: Item) -> None:
         """The hub's subscriber: enqueue, or count what does not fit."""
         if not self._taking:
@@ -227,6 +232,13 @@ class Recorder:
         while True:
             due_ns = await self._next_tick(due_ns)
             await self._save_telemetry()
+
+    async def _close_old_frames_on_ticks(self) -> None:
+        """A soak is long: its last frames are not left unfinished, nor their reserve taken, until the next ones."""
+        due_ns = self._clock.now_ns()
+        while True:
+            due_ns = await self._next_tick(due_ns)
+            await self._frame_lane.call(self._image_series.finish_full, due_ns)
 
     async def _report_on_ticks(self) -> None:
         due_ns = self._clock.now_ns()

@@ -45,6 +45,7 @@ class RoiEncoder:
     """
 
     def __init__(self, find_windows: FindWindows, whole_every_s: float = 60.0) -> None:
+        self.tell: Callable[[str], None] = lambda text: None  # of a search that failed; whoever records listens
         self._find_windows = find_windows
         self._whole_every_ns = seconds_ns(whole_every_s)
         self._whole: _Whole | None = None
@@ -56,7 +57,6 @@ class RoiEncoder:
             return encode_image(frame, "roi")
         whole = self._whole
         if whole is None or not self._holds(whole, frame):
-            self._whole = None  # stays so when the search fails
             data = encode_image(frame, "roi")
             self._whole = self._searched(frame)
             return data
@@ -78,9 +78,16 @@ class RoiEncoder:
             channel=frame.channel,
             shape=image.shape,
             dtype=image.dtype,
-            windows=self._find_windows(image),
+            windows=self._windows_in(image),
             fill_DN=int(np.median(image[::FILL_STEP_px, ::FILL_STEP_px])),
         )
+
+    def _windows_in(self, image: ImageArray) -> Windows | None:
+        try:
+            return self._find_windows(image)
+        except Exception as error:  # noqa: BLE001 - the frames stay whole, and that is never wrong
+            self.tell(f"frames are recorded whole: the search for markers failed ({type(error).__name__}: {error})")
+            return None
 
 
 def _partial(frame: Frame, windows: Windows, fill_DN: int) -> Frame:

@@ -35,7 +35,7 @@ class SessionInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSettings:
-    """How to record. `telemetry_commit_s` is on the stand's clock: on a virtual one a long period (60) costs nothing
+    """How to record. `telemetry_commit_s` is on the stand's clock: on a virtual one VIRTUAL_COMMIT_S costs nothing
     that a real night would lose and spares tens of thousands of disk syncs. A segment is closed at the first commit
     after it has `segment_bytes` or `segment_s`, whichever is first.
 
@@ -52,3 +52,4 @@ class RecordingSettings:
 
 
 USUAL = RecordingSettings()
+VIRTUAL_COMMIT_S = 60.0  # between commits on a virtual clock: well under a second of the host's

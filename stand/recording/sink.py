@@ -30,7 +30,7 @@ class CommitSink:
         self._reserve_bytes = reserve_bytes
         self.committed_bytes = 0
         try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._fd, fcntl.LOCK_EX)  # whoever looks at the new file meanwhile lets go at once
             _reserve(self._fd, reserve_bytes)
         except OSError:
             self.close()

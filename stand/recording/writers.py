@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import cv2
-
 from drivers.interface import Frame
 from stand.hub import Item
 from stand.recording.images import CAMERA_IMAGE
@@ -49,8 +47,10 @@ class ImageWriter:
         try:
             record = Record(CAMERA_IMAGE, frame.time_ns, self._encode(frame), frame.block_id & SEQUENCE_MASK)
             self._series.commit([record], frame.time_ns)
-        except (OSError, ValueError, cv2.error) as error:
+        except OSError as error:
             return str(error)
+        except Exception as error:  # noqa: BLE001 - whatever an encoder makes of one frame, the night goes on
+            return f"{type(error).__name__}: {error}"
         return None
 
 

@@ -355,7 +355,18 @@ async def test_a_frame_that_cannot_be_encoded_is_lost_and_the_next_one_is_not(tm
     session = Session.open(tmp_path / "s")
     assert [got.block_id for got in session.frames()] == [0, 2]
     (event,) = session.events()
-    assert event.text == "frames lost: 1 (block 1 of step capture-1), 1 in all; no marker in sight"
+    assert event.text == "frames lost: 1 (block 1 of step capture-1), 1 in all; ValueError: no marker in sight"
+
+
+async def test_frames_are_finished_in_time_also_when_no_more_come(tmp_path):
+    recorder, clock, hub, tasks = await start(tmp_path / "s", replace(SETTINGS, segment_s=10.0))
+    hub.publish(frame(START_NS, 0))
+    await recorder.flushed()
+    assert [path.name for path in (tmp_path / "s" / "frames").iterdir()] == ["0000.mcap.part"]
+    await clock.sleep_until(START_NS + 12 * NS_PER_S)
+    assert [path.name for path in (tmp_path / "s" / "frames").iterdir()] == ["0000.mcap"]
+    await stop(tasks)
+    await recorder.finish()
 
 
 async def test_on_a_nearly_full_disk_not_even_the_first_frame_is_taken(tmp_path):
