@@ -11,7 +11,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 Measurement = Callable[[], float]
 
@@ -29,6 +29,27 @@ class Figure:
     peer: str = ""
     peer_value: float = math.nan
     ratios: tuple[float, float, float] | None = None
+    goal: str = ""
+
+
+def at_most(limit: float, figure: Figure) -> Figure:
+    """The figure with its goal: its value is not above `limit`."""
+    return replace(figure, goal=f"<= {limit:g} {_verdict(figure.value <= limit)}")
+
+
+def at_least(limit: float, figure: Figure) -> Figure:
+    """The figure with its goal: its value is not below `limit`."""
+    return replace(figure, goal=f">= {limit:g} {_verdict(figure.value >= limit)}")
+
+
+def ratio_at_least(limit: float, figure: Figure) -> Figure:
+    """The figure with its goal: the median of its ratios is not below `limit`."""
+    ratio = math.nan if figure.ratios is None else figure.ratios[1]
+    return replace(figure, goal=f"ratio >= {limit:g} {_verdict(ratio >= limit)}")
+
+
+def _verdict(is_met: bool) -> str:
+    return "met" if is_met else "MISSED"
 
 
 def absolute(what: str, unit: str, values: Sequence[float]) -> Figure:
@@ -85,9 +106,9 @@ def progress(text: str) -> None:
 
 def table(figures: Sequence[Figure]) -> str:
     """All figures, aligned; ratio is ours over the peer's, with the quartiles behind it."""
-    rows = [("measured", "ours", "peer's", "unit", "ratio", "quartiles", "peer or limit"), *map(_row, figures)]
+    rows = [("measured", "ours", "peer's", "unit", "ratio", "quartiles", "goal", "peer or limit"), *map(_row, figures)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    aligned = (str.ljust, str.rjust, str.rjust, str.ljust, str.rjust, str.rjust, str.ljust)
+    aligned = (str.ljust, str.rjust, str.rjust, str.ljust, str.rjust, str.rjust, str.ljust, str.ljust)
     lines = [
         "  ".join(align(cell, width) for align, cell, width in zip(aligned, row, widths, strict=True)) for row in rows
     ]
@@ -97,7 +118,7 @@ def table(figures: Sequence[Figure]) -> str:
 
 def _row(figure: Figure) -> tuple[str, ...]:
     if figure.ratios is None:
-        return (figure.what, _number(figure.value), "", figure.unit, "", "", figure.peer)
+        return (figure.what, _number(figure.value), "", figure.unit, "", "", figure.goal, figure.peer)
     low, middle, high = figure.ratios
     quartiles = f"{low:.2g}..{high:.2g}"
     return (
@@ -107,6 +128,7 @@ def _row(figure: Figure) -> tuple[str, ...]:
         figure.unit,
         f"{middle:.3g}",
         quartiles,
+        figure.goal,
         figure.peer,
     )
 
