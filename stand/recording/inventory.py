@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import re
 from dataclasses import dataclass
 from enum import StrEnum
@@ -48,24 +49,38 @@ def inventory(directory: Path) -> tuple[SegmentFile, ...]:
 
 
 def _of_series(folder: Path) -> list[SegmentFile]:
-    files: list[SegmentFile] = []
     try:
-        for path in folder.iterdir():
-            if (name := _NAME.fullmatch(path.name)) is not None and path.is_file():
-                state = _STATE[name[2]]
-                if state is State.UNFINISHED and _is_locked(path):
-                    state = State.RECORDING
-                files.append(SegmentFile(path, folder.name, int(name[1]), state, path.stat().st_size))
-    except OSError:  # no such folder, or a file that was finished under our eyes
-        pass
+        paths = list(folder.iterdir())
+    except OSError:  # no such folder
+        return []
+    files = [file for path in paths if (file := _segment_file(path)) is not None]
     return sorted(files, key=lambda file: (file.number, file.path.name))
 
 
+def _segment_file(path: Path) -> SegmentFile | None:
+    """The segment at `path`; None when it is none, or was given another name under our eyes."""
+    name = _NAME.fullmatch(path.name)
+    try:
+        if name is None or not path.is_file():
+            return None
+        state = _STATE[name[2]]
+        if state is State.UNFINISHED and _is_locked(path):
+            state = State.RECORDING
+        return SegmentFile(path, path.parent.name, int(name[1]), state, path.stat().st_size)
+    except FileNotFoundError:
+        return None
+
+
 def _is_locked(path: Path) -> bool:
-    """A living recorder holds its file locked."""
-    with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
+    """A living recorder holds its file locked. Our own lock is shared and gone at once: nobody waits for it."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except PermissionError:  # whoever recorded it was another user; a living one cannot be told from a dead one
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
     return False

@@ -1,5 +1,8 @@
+import fcntl
 import math
+import os
 import shutil
+import threading
 
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from drivers.clock import NS_PER_S
 from drivers.interface import ConfigError, Frame, Reading, SessionError, bad_reading
 from stand.hub import Batch, Event, StepMark, StepState
 from stand.recording.instants import date_time, duration, parse_instant
-from stand.recording.inventory import State
+from stand.recording.inventory import State, inventory
 from stand.recording.overview import glance, overview
 
 from .recorded import ATTACHMENTS, START_NS, record
@@ -127,6 +130,48 @@ async def test_what_a_salvage_kept_and_what_is_no_segment(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
     (session / "frames" / "notes.txt").write_text("a cloudy night")
     assert glance(session).state == "1 kept damaged"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+async def test_a_segment_that_may_not_be_opened_hides_no_other(session):
+    before = glance(session)
+    part = session / "telemetry" / "0009.mcap.part"
+    part.write_bytes(b"")
+    part.chmod(0)
+    assert glance(session).state == "1 unfinished"
+    assert [file for file in inventory(session) if file.path != part] == list(before.files)
+
+
+def test_a_segment_that_is_given_another_name_meanwhile_hides_no_other(tmp_path):
+    folder = tmp_path / "telemetry"
+    folder.mkdir()
+    (folder / "0000.mcap").write_bytes(b"")
+    part = folder / "0001.mcap.part"
+    part.write_bytes(b"")
+    stop = threading.Event()
+
+    def rename():
+        while not stop.is_set():
+            part.rename(folder / "being-named")
+            (folder / "being-named").rename(part)
+
+    renaming = threading.Thread(target=rename)
+    renaming.start()
+    try:
+        seen = [[file.name for file in inventory(tmp_path)] for _ in range(2000)]
+    finally:
+        stop.set()
+        renaming.join()
+    assert all(names[:1] == ["telemetry/0000.mcap"] for names in seen)
+
+
+async def test_a_look_leaves_no_lock(session):
+    part = session / "telemetry" / "0009.mcap.part"
+    part.write_bytes(b"")
+    assert inventory(session)
+    with part.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        assert [entry.state for entry in inventory(session) if entry.path == part] == [State.RECORDING]
 
 
 def test_a_folder_without_segments_is_no_session(tmp_path):
