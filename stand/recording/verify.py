@@ -26,7 +26,6 @@ from stand.recording.layout import (
     SESSION_CRC,
     SESSION_METADATA,
     TELEMETRY,
-    contradicts,
     segment_metadata,
 )
 from stand.recording.records import Message
@@ -74,8 +73,9 @@ class Verification:
 
 @dataclass
 class _Read:
-    """What the finished segments hold, by their names."""
+    """What the finished ones of `files` hold, their checks by their names."""
 
+    files: tuple[SegmentFile, ...]
     contents: Contents = field(default_factory=Contents)
     images: Counter[FrameKey] = field(default_factory=Counter[FrameKey])
     checks: dict[str, SegmentCheck] = field(default_factory=dict[str, SegmentCheck])
@@ -101,9 +101,9 @@ class _Read:
         salvaged segment and before the next one, or right behind the last segment of a run without an end."""
         checks = [check for name, check in self.checks.items() if name.startswith(f"{series}/")]
         is_ended = any(event.kind == RUN_END for event in self.contents.events)
-        late_ns = TORN_NS if series == TELEMETRY else 0  # a description is written after what happened meanwhile
+        late_ns = _late_ns(series)
         next_ns = [*(check.first_ns for check in checks[1:]), inf]
-        for check, end_ns in zip(checks, next_ns, strict=True):
+        for check, end_ns in zip(checks, next_ns, strict=False):  # without any check there is no next either
             if SALVAGE_METADATA in check.metadata:
                 torn_ns = end_ns
             elif end_ns == inf and not is_ended:
@@ -113,6 +113,31 @@ class _Read:
             if check.last_ns - late_ns < time_ns < torn_ns:
                 return True
         return False
+
+    def unread(self, series: str) -> list[tuple[float, float]]:
+        """Between which instants the series goes on in segments that were not read: from the end of one that was to
+        the begin of the next. A recorder at work may be about to write what comes behind the last one."""
+        stretches: list[tuple[float, float]] = []
+        begin_ns, is_open, number = -inf, False, -1
+        for file in self.files:
+            check = self.checks.get(file.name)
+            if file.series != series or (check is None and file.number == number):
+                continue  # what was left beside a finished segment of the same number counts for nothing
+            if check is None:
+                is_open |= file.state is not State.DAMAGED
+                continue
+            number = file.number
+            if check.messages:
+                stretches += [(begin_ns, check.first_ns)] if is_open else []
+                begin_ns, is_open = check.last_ns - _late_ns(series), False
+        if is_open or any(file.state is State.RECORDING for file in self.files):
+            stretches.append((begin_ns, inf))
+        return stretches
+
+
+def _late_ns(series: str) -> int:
+    """How long before the end of a segment something may have been that is in the next one."""
+    return TORN_NS if series == TELEMETRY else 0  # a description is written after what happened meanwhile
 
 
 def _no_report(done_bytes: float, text: str) -> None:
@@ -128,7 +153,7 @@ def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Ver
     if not files:
         raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
     finished = [file for file in files if file.state is State.FINISHED]
-    read = _Read()
+    read = _Read(files)
     done_bytes = 0
     for file in finished:
         read.checks[file.name] = _checked(file, read, report, done_bytes)
@@ -211,8 +236,6 @@ def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
         if _entries(metadata.get(SESSION_METADATA)) != sessions.most_common(1)[0][0]:
             yield _error("tells of another session than the other segments", file.name)
         segment, session = metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})
-        if contradicts(segment, session):
-            yield _error("its metadata do not fit their CRC", file.name)
         place = segment_metadata(file.series, file.number, session)
         if segment.keys() - place.keys() or any(segment.get(key) != place[key] for key in place.keys() - {SESSION_CRC}):
             yield _error("tells of another place in the session than its name does", file.name)
@@ -225,12 +248,12 @@ def _entries(metadata: dict[str, str] | None) -> tuple[tuple[str, str], ...]:
 
 
 def _frames_against_descriptions(read: _Read) -> Iterator[Finding]:
-    """Every image has its description in the telemetry and the other way round."""
+    """Every image has its description in the telemetry and the other way round; what was not read may have it."""
     described = Counter(key for key, _ in read.contents.metas)
     block_ids = {key: meta.block_id for key, meta in read.contents.metas}
     told = told_blocks(read.contents.events)
-    bare = [key for key in read.images - described if not read.is_damaged_at(TELEMETRY, key[0])]
-    gone = [key for key in described - read.images if not read.is_damaged_at(FRAMES, key[0])]
+    bare = _without_a_reason(read.images - described, TELEMETRY, read)
+    gone = _without_a_reason(described - read.images, FRAMES, read)
     bare_torn = [key for key in bare if read.is_torn_at(TELEMETRY, key[0])]
     gone_told = [key for key in gone if any(block_ids[key] in blocks for blocks in told)]
     gone_torn = [key for key in gone if key not in gone_told and read.is_torn_at(FRAMES, key[0])]
@@ -238,7 +261,17 @@ def _frames_against_descriptions(read: _Read) -> Iterator[Finding]:
     yield from _frames(_error, set(gone) - {*gone_told, *gone_torn}, "missing, though described in the telemetry")
     yield from _frames(_note, gone_told, "described but lost by the recorder, as its events say")
     yield from _frames(_note, bare_torn, "without a description, which was lost when the recorder was killed")
-    yield from _frames(_note, gone_torn, "described but were lost when the recorder was killed")
+    yield from _frames(_note, gone_torn, "described but lost when the recorder was killed")
+
+
+def _without_a_reason(keys: Iterable[FrameKey], series: str, read: _Read) -> list[FrameKey]:
+    """Those that no finding about a segment of `series` explains."""
+    unread = read.unread(series)
+    return [
+        key
+        for key in keys
+        if not read.is_damaged_at(series, key[0]) and not any(begin < key[0] < end for begin, end in unread)
+    ]
 
 
 def _frames(kind: Callable[[str], Finding], keys: Collection[FrameKey], what: str) -> Iterator[Finding]:

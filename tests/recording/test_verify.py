@@ -124,7 +124,7 @@ def tear(path, chunk):
     ("series", "text"),
     [
         ("telemetry", "without a description, which was lost when the recorder was killed"),
-        ("frames", "described but were lost when the recorder was killed"),
+        ("frames", "described but lost when the recorder was killed"),
     ],
 )
 async def test_the_end_that_a_kill_cost_is_a_note_once_the_session_is_salvaged(session, series, text):
@@ -194,6 +194,65 @@ async def test_a_segment_that_is_being_recorded_is_no_error(session):
         assert errors(session) == []
         assert notes(session) == [f"note: frames/{part.name}: is being recorded now and was not read"]
         assert [str(entry.state) for entry in inventory(session)].count("recording") == 1
+
+
+def as_left(path):
+    """The segment as a killed recorder leaves it, with everything in it."""
+    return path.rename(path.with_name(f"{path.name}.part"))
+
+
+def not_finished(parts):
+    text = "is not finished; `stand session salvage` recovers what is in it"
+    return [f"error: {path.parent.name}/{path.name}: {text}" for path in sorted(parts)]
+
+
+async def test_a_session_whose_frames_are_all_unfinished_is_not_finished_and_nothing_else(session):
+    parts = [as_left(path) for path in (session / "frames").iterdir()]
+    assert errors(session) == not_finished(parts)
+    assert notes(session) == []
+
+
+@pytest.mark.parametrize("series", ["telemetry", "frames"])
+@pytest.mark.parametrize("number", [0, 1, 2])
+async def test_what_is_in_a_segment_that_was_not_read_is_not_called_missing(session, series, number):
+    part = as_left(session / series / f"{number:04d}.mcap")
+    assert errors(session) == not_finished([part])
+    assert notes(session) == []
+
+
+async def test_frames_before_the_segments_that_were_read_are_missing_although_one_behind_them_is_unfinished(session):
+    as_left(max((session / "frames").iterdir()))
+    (session / "frames" / "0000.mcap").unlink()
+    (text,) = (error for error in errors(session) if "described" in error)
+    assert text.startswith("error: 4 frames are missing, though described in the telemetry: blocks 100 to 103")
+
+
+async def test_an_unfinished_segment_beside_the_same_one_finished_excuses_nothing(session):
+    path = max((session / "frames").iterdir())
+    shutil.copy(path, path.with_name(f"{path.name}.part"))
+    before = errors(session)
+    (session / "frames" / "0001.mcap").unlink()
+    assert len(errors(session)) == len(before) + 2  # the segment, and its frames
+
+
+async def test_a_session_that_is_being_recorded_has_no_error_at_any_time(tmp_path):
+    found = []
+
+    def items(time_ns, index):
+        found.extend(map(str, verify(tmp_path / "s").findings))
+        yield from second(time_ns, index)
+
+    await recorded(tmp_path / "s", items)
+    assert len(found) >= SECONDS
+    assert {text.partition(".mcap.part: ")[2] for text in found} == {"is being recorded now and was not read"}
+    assert verify(tmp_path / "s").findings == ()
+
+
+async def test_a_session_without_telemetry_is_told_so(session):
+    shutil.rmtree(session / "telemetry")
+    missing, frames = errors(session)
+    assert missing == "error: telemetry: is missing"
+    assert frames.startswith("error: 12 frames are without a description in the telemetry: blocks 100 to 111")
 
 
 async def test_a_segment_of_another_place_is_told(session):
