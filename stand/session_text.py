@@ -12,11 +12,10 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from stand.hub import Event, StepState
-from stand.recording.instants import date_time, duration
+from stand.recording.instants import date_time, duration, utc_text
 from stand.recording.inventory import State
 from stand.recording.overview import Frames, Glance, Overview, Step, Temperature
 from stand.recording.salvage import BEING_RECORDED, Salvaged
-from stand.recording.utc import utc_text
 from stand.recording.verify import Verification
 from stand.usage import one_line
 

@@ -28,7 +28,6 @@ from stand.hub import Batch
 from stand.recording import messages
 from stand.recording.folder import new_folder
 from stand.recording.images import decode_image
-from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.png import SIGNATURE, encode_png
 from stand.recording.records import Message, telemetry_messages
 from stand.recording.session import RecordedImage, Session
@@ -69,8 +68,8 @@ def export(
     """
     if telemetry is not None:
         check_format(telemetry)
-    series = [name for name, wanted in ((TELEMETRY, telemetry is not None), (FRAMES, frames)) if wanted]
-    work = _Work(session, series, report)
+    read = (*(session.telemetry_segments if telemetry is not None else ()), *(session.frame_segments if frames else ()))
+    work = _Work(read, report)
     with new_folder(out) as folder:
         _write_facts(session, folder)
         if telemetry is not None:
@@ -82,9 +81,8 @@ def export(
 class _Work:
     """How far the export is, by the bytes of the segments it reads."""
 
-    def __init__(self, session: Session, series: Sequence[str], report: Callable[[float, str], None]) -> None:
-        sizes = [path.stat().st_size for path in session.segments if path.parent.name in series]
-        self._total_bytes = max(1, sum(sizes))
+    def __init__(self, segments: Sequence[Path], report: Callable[[float, str], None]) -> None:
+        self._total_bytes = max(1, sum(path.stat().st_size for path in segments))
         self._done_bytes = 0
         self._report = report
 
@@ -134,9 +132,7 @@ def _write_telemetry(session: Session, folder: Path, table_format: TableFormat, 
     folder.mkdir()
     tables: dict[str, Table] = {}
     with ExitStack() as stack:
-        for path in session.segments:
-            if path.parent.name != TELEMETRY:
-                continue
+        for path in session.telemetry_segments:
             for message in telemetry_messages(path, lambda channel: channel.topic in _COLUMNS):
                 if message.topic not in tables:
                     name = message.topic.strip("/").replace("/", "_")

@@ -18,6 +18,11 @@ def date_time(time_ns: int) -> str:
     return f"{_datetime(time_ns):%Y-%m-%d %H:%M:%S}"
 
 
+def utc_text(time_ns: int) -> str:
+    """ISO 8601 to the ns, which datetime does not have: `2026-01-01T18:00:00.123456789Z`."""
+    return f"{_datetime(time_ns):%Y-%m-%dT%H:%M:%S}.{time_ns % NS_PER_S:09d}Z"
+
+
 def _datetime(time_ns: int) -> datetime:
     return _EPOCH + timedelta(microseconds=time_ns // _NS_PER_US)
 

@@ -20,17 +20,15 @@ from drivers.lane import Lane
 from stand.hub import Hub, Item
 from stand.recording.folder import new_folder
 from stand.recording.images import IMAGE_CLASS, ImageEncoding
-from stand.recording.layout import FRAMES
 from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.recording.records import frame_places
 from stand.recording.session import Session
+from stand.recording.settings import VIRTUAL_COMMIT_S
 from stand.recording.topics import recorded_devices
 
 # Items read at once, at most one frame among them: few enough to keep memory flat, enough to make the hand-over to the
 # reading thread cheap.
 PORTION_ITEMS = 256
-# In virtual time a commit each second would be a disk sync for every second of the night, and save nothing.
-VIRTUAL_COMMIT_S = 60.0
 
 
 class ReplayClock:
@@ -140,6 +138,5 @@ def _info(metadata: Mapping[str, str]) -> SessionInfo:
 def _encoding(session: Session) -> ImageEncoding:
     """Raw when all frames were; a PNG takes every other, also one of which only windows are real."""
     raw = IMAGE_CLASS["raw"].DESCRIPTOR.full_name
-    frames = (path for path in session.segments if path.parent.name == FRAMES)
-    schemas = {place.schema for path in frames for place in frame_places(path)}
+    schemas = {place.schema for path in session.frame_segments for place in frame_places(path)}
     return "raw" if schemas == {raw} else "png"

@@ -95,6 +95,16 @@ class Session:
         """The finished segments, those of the telemetry first."""
         return (*self._telemetry, *self._frames)
 
+    @property
+    def telemetry_segments(self) -> tuple[Path, ...]:
+        """The finished segments of the telemetry, in order."""
+        return tuple(self._telemetry)
+
+    @property
+    def frame_segments(self) -> tuple[Path, ...]:
+        """The finished segments with the images, in order."""
+        return tuple(self._frames)
+
     def channels(self) -> list[str]:
         """The channels that have readings, sorted."""
         return sorted(self._all_columns())

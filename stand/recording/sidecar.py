@@ -9,10 +9,10 @@ import numpy as np
 
 from drivers.clock import NS_PER_S
 from stand.recording import messages
+from stand.recording.instants import utc_text
 from stand.recording.session import RecordedImage, Session
 from stand.recording.tables import Cell, Column
 from stand.recording.topics import recorded_devices
-from stand.recording.utc import utc_text
 
 SIDECAR_COLUMNS = (
     Column("file", "text"),

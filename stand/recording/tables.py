@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from drivers.interface import SessionError
-from stand.recording.utc import utc_text
+from stand.recording.instants import utc_text
 
 TableFormat = Literal["csv", "parquet"]
 Cell = int | float | str | None

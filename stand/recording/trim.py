@@ -19,6 +19,7 @@ from stand.hub import Event, StepMark, StepState
 from stand.recording import messages
 from stand.recording.folder import new_folder
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
+from stand.recording.instants import utc_text
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.recorder import RecordingSettings
 from stand.recording.records import FramePlace, frame_places, read_frame, telemetry_messages
@@ -26,7 +27,6 @@ from stand.recording.segment import Record, SeriesForm, Topic
 from stand.recording.series import Series
 from stand.recording.session import Session
 from stand.recording.topics import recorded_topics
-from stand.recording.utc import utc_text
 
 TRIMMED = "session.trimmed"  # kind of the event that says where a session was cut from
 # Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
@@ -57,18 +57,14 @@ def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     return out
 
 
-def _segments(session: Session, series: str) -> Iterator[Path]:
-    return (path for path in session.segments if path.parent.name == series)
-
-
 def _places(session: Session) -> Iterator[FramePlace]:
     """The frames in the order of the recording."""
-    for path in _segments(session, FRAMES):
+    for path in session.frame_segments:
         yield from frame_places(path)
 
 
 def _telemetry(session: Session) -> Iterator[Record]:
-    for path in _segments(session, TELEMETRY):
+    for path in session.telemetry_segments:
         for message in telemetry_messages(path, lambda channel: True):
             yield Record(message.topic, message.time_ns, message.data, message.sequence)
 

@@ -16,12 +16,12 @@ from drivers.interface import Reading, SessionError, bad_reading
 from stand.hub import Batch
 from stand.recording.export import export
 from stand.recording.images import CAMERA_IMAGE
+from stand.recording.instants import utc_text
 from stand.recording.layout import FRAMES
 from stand.recording.segment import Record, SeriesForm, Topic
 from stand.recording.series import Series
 from stand.recording.session import Session
 from stand.recording.tables import GROUP_ROWS, Column, ParquetTable
-from stand.recording.utc import utc_text
 from tests.recording.recorded import ATTACHMENTS, INFO, MS, START_NS, frame, half_second, record
 
 # channel of the session -> table and column of the export
