@@ -314,6 +314,8 @@ def _reason(original: _Original) -> str:
         reasons.append(f"{places} of {found.lost_bytes} bytes, the first at byte {found.damages[0].begin}")
     if found.torn_bytes:
         reasons.append(f"a block of {found.torn_bytes} bytes was being written at its end")
+    if found.is_session_wrong:
+        reasons.append("its metadata do not fit their CRC")
     if original.opening is None:
         reasons.append("no segment tells which session it belongs to")
     elif original.unknown:

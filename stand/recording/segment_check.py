@@ -3,7 +3,8 @@
 Only the index, the content of chunks and the attachments have CRCs. The rest stands in the file a second time: where
 each record is and how long, a chunk's own fields and each metadata's name in the index, the message indexes in the
 messages, the counts in the walk. Only text has no second telling: the name of the writer's library in the header,
-which nothing reads, and what metadata says, which stand/recording/verify.py compares between segments.
+which nothing reads, and what metadata says but for the record `session`, which has a CRC in the record `segment`;
+stand/recording/verify.py compares them between segments.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
 from stand.recording.records import CHUNK_LIMIT_BYTES, DAMAGE, Message
 from stand.recording.summary import CRC, RECORD, records, stream
 
@@ -158,6 +160,9 @@ class _Walk:
             self._part(place, end, self._record)
             report(end)
         self._part(places[-1], self._index.begin, self._data_end)
+        metadata = self._check.metadata
+        if contradicts(metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})):
+            self._check.damages.append(Damage("the session's metadata do not fit their CRC"))
         if not self._check.damages:
             self._compare()
 

@@ -95,12 +95,14 @@ class StoredMessage(NamedTuple):
 class Survey:
     """What of a segment proves itself.
 
-    `session`: the metadata record of that name, None when it is gone. `is_opening_whole`: nothing is damaged before
-    the first chunk. `messages`: how many there are, by channel number. `damages`: the places that are damaged; neither
-    `torn_bytes` at the end of the file, where a block was being written, nor a damaged index is among them.
+    `session`: the metadata record of that name, None when it is gone or (`is_session_wrong`) does not fit its CRC.
+    `is_opening_whole`: nothing is damaged before the first chunk. `messages`: how many there are, by channel number.
+    `damages`: the places that are damaged; neither `torn_bytes` at the end of the file, where a block was being
+    written, nor a damaged index is among them.
     """
 
     session: dict[str, str] | None = None
+    is_session_wrong: bool = False
     attachments: dict[str, Attachment] = field(default_factory=dict[str, Attachment])
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
@@ -223,7 +225,7 @@ class _Walk:
                 found.session = entries
             case Metadata(name=name, metadata=entries) if name == SEGMENT_METADATA:
                 if found.session is not None and contradicts(entries, found.session):
-                    found.session = None
+                    found.session, found.is_session_wrong = None, True
             case Attachment() as attachment:
                 found.attachments[attachment.name] = attachment
             case DataEnd():

@@ -11,10 +11,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from drivers.interface import SessionError
-from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.layout import FRAMES, TELEMETRY, segment_metadata
 from stand.recording.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
 from stand.recording.session import Session
 from stand.recording.sink import CommitSink
+from stand.recording.verify import Severity, verify
 from tests.recording.damage import (
     ATTACHMENTS,
     DAMAGES,
@@ -221,6 +222,22 @@ def test_metadata_is_voted_on(damaged):
     (done,) = salvage_session(folder.parent)
     assert metadata_of(done.path, "session") == METADATA
     assert read_segment(done.path) == written.messages
+
+
+@pytest.mark.parametrize("series", SERIES)
+@pytest.mark.parametrize("record", ["session", "segment"])
+def test_a_flipped_letter_in_the_metadata_of_a_finished_segment_is_repaired(damaged, series, record):
+    crc = segment_metadata(series, 0, METADATA)["session_crc32"].encode()
+    damage = {"session": (b"night-1", b"night-3"), "segment": (crc, crc[:-1] + b"g")}[record]
+    folder, path, written = damaged(series, lambda data: data.replace(*damage, 1), "finished")
+    salvaged = {done.source: done for done in salvage_session(folder.parent)}
+    done = salvaged[path]
+    assert (done.path, done.kept, done.lost_bytes) == (path, folder / "0000.mcap.damaged", 0)
+    assert done.reason == "its metadata do not fit their CRC"
+    assert read_segment(path) == written.messages
+    assert Session.open(folder.parent).metadata == METADATA
+    errors = [finding.where for finding in verify(folder.parent).findings if finding.severity is Severity.ERROR]
+    assert [where for where in errors if where] == [f"{series}/0000.mcap.damaged"]  # "": the night lacks frames
 
 
 def test_metadata_with_the_zeros_of_a_lost_block_is_no_metadata(tmp_path):
