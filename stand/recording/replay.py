@@ -90,9 +90,8 @@ async def replay_and_record(
 
     speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
     has the same metadata (the session's id, too), attachments, devices and items: nothing in it tells of the replay,
-    because it is the same session in other segments. SessionError when it has no items, cannot be read or written, or
-    when frames were lost, as to a disk that is slower than `speed`: the copy is then complete but for them, and its
-    events say why.
+    because it is the same session in other segments. SessionError when it has no items, or cannot be read or written
+    whole, as on a disk that is slower than `speed`; `out` then does not appear.
     """
     first = next(session.items(), None)
     if first is None:
@@ -100,7 +99,7 @@ async def replay_and_record(
     clock = VirtualClock(first.time_ns) if speed is None else ReplayClock(first.time_ns, speed)
     hub = Hub()
     watch(hub)
-    settings = RecordingSettings(_encoding(session), VIRTUAL_COMMIT_S if speed is None else speed)
+    settings = _settings(session, VIRTUAL_COMMIT_S if speed is None else speed)
     with new_folder(out) as folder:
         recorder = Recorder(
             folder, _info(session.metadata), session.attachments, recorded_devices(session), hub, clock, settings
@@ -111,8 +110,10 @@ async def replay_and_record(
             await _beside(replay(session, hub, clock), background)
         finally:
             await recorder.finish()
-    if recorder.frames_lost:
-        raise SessionError(f"{out}: complete, but {recorder.frames_lost} frames were lost; its events say why")
+        if recorder.frames_lost:
+            raise SessionError(
+                f"{out}: {recorder.frames_lost} frames could not be written; is the disk full or too slow?"
+            )
     return out
 
 
@@ -133,6 +134,13 @@ def _info(metadata: Mapping[str, str]) -> SessionInfo:
     """The inverse of SessionInfo.metadata; a field the session does not tell is ""."""
     known: dict[str, Any] = {field.name: metadata.get(field.name, "") for field in fields(SessionInfo)}
     return SessionInfo(**{**known, "simulated": known["simulated"] == "true"})
+
+
+def _settings(session: Session, commit_s: float) -> RecordingSettings:
+    """Without the rules of a stand for a nearly full disk: a copy may fill it, and says nothing of it."""
+    return RecordingSettings(
+        _encoding(session), telemetry_commit_s=commit_s, stop_frames_below_bytes=0, alert_below_fraction=0.0
+    )
 
 
 def _encoding(session: Session) -> ImageEncoding:

@@ -1,4 +1,5 @@
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from stand.hub import Batch, Hub
 from stand.recording.replay import ReplayClock, replay, replay_and_record
 from stand.recording.session import Session
 from stand.recording.topics import recorded_devices, recorded_topics
+from tests.recording.disks import tmpfs
 from tests.recording.recorded import (
     ATTACHMENTS,
     DEVICES,
@@ -171,3 +173,26 @@ async def test_a_session_without_items_cannot_be_replayed(tmp_path):
     await record(tmp_path / "s", 0)
     with pytest.raises(SessionError, match="holds nothing that could be replayed"):
         await replay_and_record(Session.open(tmp_path / "s"), tmp_path / "r", None)
+
+
+async def test_a_copy_on_a_disk_that_is_nearly_full_is_the_same_session(tmp_path):
+    await record(tmp_path / "s")
+    session = Session.open(tmp_path / "s")
+    with tmpfs(tmp_path / "disk", "24m") as disk:
+        (disk / "ballast").write_bytes(bytes(22_000_000))
+        copy = Session.open(await replay_and_record(session, disk / "r", None))
+        assert telemetry(copy) == telemetry(session)
+        assert images(copy) == images(session)
+
+
+async def test_a_copy_that_would_lack_frames_does_not_appear(tmp_path):
+    def items(time_ns, index):
+        for item in half_second(time_ns, index):
+            yield replace(item, image=np.zeros((400, 500), np.uint8)) if isinstance(item, Frame) else item
+
+    await record(tmp_path / "s", items=items, encoding="raw")
+    with tmpfs(tmp_path / "disk", "24m") as disk:
+        (disk / "ballast").write_bytes(bytes(24 * 2**20 - 1_600_000))
+        with pytest.raises(SessionError, match=r"r: \d frames could not be written; is the disk full or too slow"):
+            await replay_and_record(Session.open(tmp_path / "s"), disk / "r", None)
+        assert [path.name for path in disk.iterdir()] == ["ballast"]
