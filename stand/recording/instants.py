@@ -10,6 +10,7 @@ from drivers.interface import ConfigError
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NS_PER_US = 1000
+_LAST_NS = (datetime.max.replace(tzinfo=UTC) - _EPOCH) // timedelta(microseconds=1) * _NS_PER_US
 _OFFSET = re.compile(r"\+(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
 
 
@@ -36,11 +37,18 @@ def duration(length_ns: int) -> str:
 
 def parse_instant(text: str, begin_ns: int) -> int:
     """ns since the epoch, from an ISO time (UTC when it names no zone) or from `+90`, `+1h30m`, `+2m5.5s` after
-    `begin_ns`; ConfigError when it is neither."""
+    `begin_ns`; ConfigError when it is neither, or no year has it that an instant can be written in."""
+    time_ns = _parsed(text, begin_ns)
+    if not 0 <= time_ns <= _LAST_NS:
+        raise ConfigError(f"{text}: is not between the years 1970 and 9999")
+    return time_ns
+
+
+def _parsed(text: str, begin_ns: int) -> int:
     offset = _OFFSET.fullmatch(text)
     if offset is not None and any(offset.groups()):
         hours, minutes, seconds = (float(group or 0) for group in offset.groups())
-        return begin_ns + round((3600 * hours + 60 * minutes + seconds) * NS_PER_S)
+        return begin_ns + round(min((3600 * hours + 60 * minutes + seconds) * NS_PER_S, _LAST_NS + 1))
     try:
         instant = datetime.fromisoformat(text)
     except ValueError as error:

@@ -10,7 +10,7 @@ import pytest
 from drivers.clock import NS_PER_S
 from drivers.interface import ConfigError, Frame, Reading, SessionError, bad_reading
 from stand.hub import Batch, Event, StepMark, StepState
-from stand.recording.instants import date_time, duration, parse_instant
+from stand.recording.instants import date_time, duration, parse_instant, utc_text
 from stand.recording.inventory import State, inventory
 from stand.recording.overview import glance, overview
 
@@ -200,6 +200,20 @@ def test_an_instant_is_a_time_in_utc_or_counts_from_the_beginning(text, after_be
 def test_what_is_no_time_says_what_would_be(text):
     with pytest.raises(ConfigError, match=r"expected a time such as 2026-01-01T18:30:00, \+1h30m or step:12"):
         parse_instant(text, 0)
+
+
+@pytest.mark.parametrize(
+    "text", ["+99999999h", f"+{'9' * 400}h", "1969-12-31T23:59:59", "0001-01-01T00:00+14:00", "9999-12-31T23:00-14:00"]
+)
+def test_a_time_that_no_recording_has_is_refused(text):
+    with pytest.raises(ConfigError, match=": is not between the years 1970 and 9999$"):
+        parse_instant(text, START_NS)
+
+
+def test_the_last_second_of_the_calendar_is_a_time():
+    last_ns = parse_instant("9999-12-31T23:59:59.999999Z", START_NS)
+    assert utc_text(last_ns) == "9999-12-31T23:59:59.999999000Z"
+    assert parse_instant("1970-01-01", START_NS) == 0
 
 
 def test_instants_and_durations_as_people_write_them():
