@@ -17,13 +17,14 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import ConfigError
+from drivers.interface import ConfigError, SessionError
 from stand.exit_codes import FAILED, one_line_errors
 from stand.hub import Event, Hub, Item, StepMark
 from stand.progress import Report, progress
 from stand.recording.export import export
 from stand.recording.instants import date_time, parse_instant
 from stand.recording.inventory import State, inventory
+from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.overview import Glance, glance, overview
 from stand.recording.replay import ReplayClock, replay, replay_and_record
 from stand.recording.salvage import Salvaged, salvage_session
@@ -83,7 +84,7 @@ def list_sessions(
 def _sessions_in(directory: Path) -> list[Path]:
     """`directory` itself when it is a session, else those in it; ConfigError when there is no such folder."""
     if not directory.is_dir():
-        raise ConfigError(f"{directory}: no such folder")
+        raise ConfigError(f"{directory}: {'is a file, not a folder' if directory.exists() else 'no such folder'}")
     if inventory(directory):
         return [directory]
     return [path for path in sorted(directory.iterdir()) if path.is_dir() and inventory(path)]
@@ -116,9 +117,34 @@ def info(directory: SessionArgument, as_json: JsonOption = False) -> None:
 
 def _session_in(directory: Path) -> Path:
     """`directory`; ConfigError when it is no session."""
-    if not inventory(directory):
-        raise ConfigError(f"{directory}: not a session; `stand session list` shows those in a folder")
-    return directory
+    if inventory(directory):
+        return directory
+    if _sessions_in(directory):
+        raise ConfigError(f"{directory}: is a folder of sessions; `stand session list {directory}` shows them")
+    raise ConfigError(f"{directory}: not a session; `stand session list` shows those in a folder")
+
+
+@contextmanager
+def _session_to_use(directory: Path) -> Generator[Session]:
+    """The session in `directory` for a command that takes all of it. SessionError when segments of it would be left
+    out because they are not finished; what is being recorded is left out with a warning. Damage that the command meets
+    becomes a sentence that says what helps."""
+    files = inventory(_session_in(directory))
+    help_text = f"`stand session salvage {directory}`"
+    left = [file.name for file in files if file.state is State.UNFINISHED]
+    growing = [file.name for file in files if file.state is State.RECORDING]
+    if left:
+        are = "is" if len(left) == 1 else f"and {len(left) - 1} more are"
+        raise SessionError(f"{directory}: {left[0]} {are} not finished and would be left out; {help_text} first")
+    if growing:
+        warning = f"warning: {directory}: is being recorded; without what is not finished yet: {', '.join(growing)}"
+        typer.echo(one_line(warning), err=True)
+    try:
+        yield Session.open(directory)
+    except SessionError as error:
+        if str(error).startswith((str(directory / TELEMETRY), str(directory / FRAMES))):
+            raise SessionError(f"{error}; {help_text} recovers what is sound") from error
+        raise
 
 
 @app.command("verify")
@@ -190,10 +216,9 @@ def replay_session(
     with one_line_errors():
         times = _speed(speed)
         if record is not None:
-            _check_new(record)
+            _check_new(record, directory)
         seen = glance(_session_in(directory))
-        session = Session.open(directory)
-        with _replay_progress(seen) as watch:
+        with _session_to_use(directory) as session, _replay_progress(seen) as watch:
             if record is None:
                 asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
             else:
@@ -209,7 +234,10 @@ def _speed(text: str) -> float | None:
     raise ConfigError(f"--speed {text}: expected max or a number from 0.001 to 1000000")
 
 
-def _check_new(out: Path) -> None:
+def _check_new(out: Path, session: Path) -> None:
+    """ConfigError when `out` cannot become a folder beside `session`."""
+    if out.resolve().is_relative_to(session.resolve()) and out.resolve() != session.resolve():
+        raise ConfigError(f"{out}: is inside the session; choose a place outside of it")
     if out.exists():
         raise ConfigError(f"{out}: exists already; choose another name or move it away")
 
@@ -259,11 +287,11 @@ def export_session(
     Example: stand session export sessions/20260101T180000Z-thermal-cycle --out night --format parquet
     """
     with one_line_errors():
-        _check_new(out)
+        _check_new(out, directory)
         size_bytes = glance(_session_in(directory)).size_bytes
-        with _progress_of("export", 1.0, size_bytes) as report:
+        with _session_to_use(directory) as session, _progress_of("export", 1.0, size_bytes) as report:
             tables = table_format if telemetry else None
-            export(Session.open(directory), out, frames=frames, telemetry=tables, report=report)
+            export(session, out, frames=frames, telemetry=tables, report=report)
         typer.echo(out)
 
 
@@ -281,14 +309,21 @@ def trim_session(
     Example: stand session trim sessions/20260101T180000Z-thermal-cycle --out part --from step:12 --to +5h
     """
     with one_line_errors():
-        _check_new(out)
+        _check_new(out, directory)
         seen = glance(_session_in(directory))
-        session = Session.open(directory)
-        begin_ns = _instant(begin, session, seen)
-        end_ns = (seen.end_ns or 0) + 1 if end is None else _instant(end, session, seen)
-        if end_ns <= begin_ns:
-            raise ConfigError(f"--to {end} is not after --from {begin}")
-        typer.echo(trim(session, out, begin_ns, end_ns))
+        with _session_to_use(directory) as session:
+            typer.echo(trim(session, out, *_range(begin, end, session, seen)))
+
+
+def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple[int, int]:
+    """From when up to when; ConfigError when that is not a time, or none."""
+    begin_ns = _instant(begin, session, seen)
+    if seen.end_ns is not None and begin_ns > seen.end_ns:
+        raise ConfigError(f"--from {begin} is after the session's end ({date_time(seen.end_ns)} UTC)")
+    end_ns = (seen.end_ns or 0) + 1 if end is None else _instant(end, session, seen)
+    if end_ns <= begin_ns:
+        raise ConfigError(f"--to {end} is not after --from {begin}")
+    return begin_ns, end_ns
 
 
 def _instant(text: str, session: Session, seen: Glance) -> int:

@@ -29,7 +29,7 @@ from stand.recording import messages
 from stand.recording.folder import new_folder
 from stand.recording.images import decode_image
 from stand.recording.png import SIGNATURE, encode_png
-from stand.recording.records import Message, telemetry_messages
+from stand.recording.records import Message, naming, telemetry_messages
 from stand.recording.session import RecordedImage, Session
 from stand.recording.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
 from stand.recording.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format
@@ -234,8 +234,9 @@ def _png(image: RecordedImage) -> bytes:
         try:
             data = CompressedImage.FromString(image.data).data
         except DecodeError as error:
-            raise SessionError(f"an image message cannot be read ({error})") from error
+            raise SessionError(f"{image.path}: an image message cannot be read ({error})") from error
         if data.startswith(SIGNATURE):
             return data
-    decoded = decode_image(image.schema, image.data)
+    with naming(image.path):
+        decoded = decode_image(image.schema, image.data)
     return encode_png(decoded.pixels, decoded.windows)

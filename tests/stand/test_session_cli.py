@@ -1,4 +1,5 @@
 import asyncio
+import fcntl
 import json
 import os
 import shutil
@@ -86,6 +87,17 @@ def test_the_list_as_json(session: Path):
 def test_a_folder_without_sessions_and_no_folder(tmp_path: Path):
     assert "no sessions there" in ask("list", tmp_path).stderr
     assert "no such folder" in refused("list", tmp_path / "nowhere")
+    (tmp_path / "night.mcap").write_bytes(b"")
+    assert "night.mcap: is a file, not a folder" in refused("list", tmp_path / "night.mcap")
+
+
+def test_a_folder_of_sessions_is_no_session_and_says_which_command_shows_them(session: Path):
+    for command in ("info", "verify"):
+        line = refused(command, session.parent)
+        assert (
+            line
+            == f"error: {session.parent}: is a folder of sessions; `stand session list {session.parent}` shows them"
+        )
 
 
 def test_info_tells_a_person_what_was_recorded(session: Path):
@@ -235,7 +247,9 @@ def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):
         (("--from", "noon"), "noon: expected a time such as"),
         (("--from", "step:77"), "step:77: the session has no step 77"),
         (("--from", "+3s", "--to", "+1s"), "--to +1s is not after --from +3s"),
-        (("--from", "+1h"), "is not after --from +1h"),
+        (("--from", "+1h"), "--from +1h is after the session's end (2026-01-01 18:00:05 UTC)"),
+        (("--to", "+99999999h"), "+99999999h: is not between the years 1970 and 9999"),
+        (("--from", "+9999999999999999999999h"), "h: is not between the years 1970 and 9999"),
     ],
 )
 def test_trim_refuses_times_that_are_none(session: Path, tmp_path: Path, times: tuple[str, ...], sentence: str):
@@ -247,6 +261,57 @@ def test_trim_refuses_times_that_are_none(session: Path, tmp_path: Path, times: 
 def test_what_is_no_session_is_refused(tmp_path: Path, command: str):
     (line,) = ask(command, tmp_path / "nowhere", status=2).stderr.splitlines()
     assert line.startswith(f"error: {tmp_path / 'nowhere'}: ")
+
+
+USES = [("export", "--out"), ("trim", "--out"), ("replay", "--record")]
+
+
+@pytest.mark.parametrize(("command", "option"), USES)
+def test_what_was_not_finished_is_not_left_out_in_silence(session: Path, tmp_path: Path, command: str, option: str):
+    path = session / "frames" / "0001.mcap"
+    path.rename(path.with_name("0001.mcap.part"))
+    (line,) = ask(command, session, option, tmp_path / "new", status=1).stderr.splitlines()
+    assert line == (
+        f"error: {session}: frames/0001.mcap.part is not finished and would be left out; "
+        f"`stand session salvage {session}` first"
+    )
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(("command", "option"), USES)
+def test_of_a_session_being_recorded_what_is_finished_is_used(session: Path, tmp_path: Path, command: str, option: str):
+    path = session / "frames" / "0002.mcap"
+    part = path.rename(path.with_name("0002.mcap.part"))
+    speed = ("--speed", "max") if command == "replay" else ()
+    with part.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        result = ask(command, session, option, tmp_path / "new", *speed)
+    warning = f"warning: {session}: is being recorded; without what is not finished yet: frames/0002.mcap.part"
+    assert warning in result.stderr.splitlines()
+    assert (tmp_path / "new").is_dir()
+
+
+@pytest.mark.parametrize(("command", "option"), USES)
+@pytest.mark.parametrize("series", ["frames", "telemetry"])
+def test_who_meets_damage_is_told_that_a_salvage_helps(
+    session: Path, tmp_path: Path, series: str, command: str, option: str
+):
+    path = session / series / "0000.mcap"
+    data = bytearray(path.read_bytes())
+    data[len(data) * 2 // 5] ^= 1
+    path.write_bytes(data)
+    speed = ("--speed", "max") if command == "replay" else ()
+    line = ask(command, session, option, tmp_path / "new", *speed, status=1).stderr.splitlines()[-1]
+    assert line.startswith(f"error: {path}: ")
+    assert line.endswith(f"; `stand session salvage {session}` recovers what is sound")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(("command", "option"), USES)
+def test_nothing_is_made_inside_a_session(session: Path, command: str, option: str):
+    out = session / "frames" / ".." / "part"
+    assert refused(command, session, option, out).endswith("part: is inside the session; choose a place outside of it")
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("arguments", [("export", "--out"), ("trim", "--out"), ("replay", "--record")])
