@@ -27,6 +27,7 @@ from stand.recording.proof import (
     OPCODES,
     RECORD,
     RECORD_LIMIT_BYTES,
+    Claim,
     Contents,
     check_chunk_lengths,
     check_crc,
@@ -39,6 +40,7 @@ from stand.recording.proof import (
 from stand.recording.records import DAMAGE
 
 WINDOW_BYTES = 4 << 20
+FIRST_BLOCK_BYTES = 1 << 14  # the opening of a segment, or its first block of a second's telemetry with the schemas
 
 _FOOTER_BYTES = RECORD.size + 20
 
@@ -147,6 +149,7 @@ class _Walk:
     def __init__(self, source: Source) -> None:
         self.found = Survey()
         self._source = source
+        self._blocks = _Blocks()
         self._index_begin: int | None = None
         self._sound_attachments: dict[str, Attachment] = {}  # those before the first damage
 
@@ -202,7 +205,7 @@ class _Walk:
     def _note_gap(self, gap: Gap) -> None:
         if gap.begin == self._index_begin and gap.end == self._source.size:
             return
-        if gap.end == self._source.size and _is_torn(self._source, gap):
+        if gap.end == self._source.size and self._blocks.is_torn(self._source, gap):
             self.found.torn_bytes = gap.end - gap.begin
         else:
             if not self.found.damages:
@@ -218,6 +221,7 @@ class _Walk:
                 found.schemas.update({schema.id: schema for schema in schemas})
                 found.channels.update({channel.id: channel for channel in channels})
                 found.messages.update(messages)
+                self._blocks.note(record.begin, record.end, messages)
                 found.chunks.append(ChunkPlace(record.begin + RECORD.size, record.end - record.begin - RECORD.size))
             case Metadata(name=name, metadata=entries) if name == SESSION_METADATA:
                 if found.chunks and not found.is_opening_whole:
@@ -262,17 +266,55 @@ class _Walk:
         return True
 
 
-def _is_torn(source: Source, gap: Gap) -> bool:
-    """Whether the end of the file is what an interrupted write leaves: the beginning of one record, then zeros or
-    nothing. What a whole block held was acknowledged; a block that is cut or zero at its end never was."""
-    written_end = _last_written(source, gap)
-    head = source.read(gap.begin, min(RECORD.size, written_end - gap.begin))
-    if gap.begin == 0:
-        return MCAP0_MAGIC.startswith(head)
-    if len(head) < RECORD.size:
-        return not head or head[0] in OPCODES
-    claim = claim_of(head)
-    return claim is not None and written_end < gap.begin + RECORD.size + claim.length
+class _Blocks:
+    """How long the blocks are that were written at once: a chunk and the message indexes behind it."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._end = 0  # of the last one
+        self._largest_bytes = FIRST_BLOCK_BYTES
+        self._largest_index_bytes = _index_bytes(Counter((0,)))
+
+    def note(self, begin: int, chunk_end: int, messages: Counter[int]) -> None:
+        """The block of the sound chunk [begin, chunk_end)."""
+        self._count += 1
+        index_bytes = _index_bytes(messages)
+        self._end = chunk_end + index_bytes
+        known_bytes = self._largest_bytes if self._count > 2 else 0  # the first is longer, for it holds the schemas
+        self._largest_bytes = max(known_bytes, self._end - begin)
+        self._largest_index_bytes = max(self._largest_index_bytes, index_bytes)
+
+    def is_torn(self, source: Source, gap: Gap) -> bool:
+        """Whether the end of the file is what one interrupted write leaves: the beginning of a block, then zeros or
+        nothing, and no more than a block. What a whole block held was acknowledged; a block that is cut or zero at its
+        end never was."""
+        written_end = _last_written(source, gap)
+        head = source.read(gap.begin, RECORD.size)
+        claim = claim_of(head)
+        head = head[: written_end - gap.begin]
+        if gap.begin == 0:
+            is_begun = MCAP0_MAGIC.startswith(head)
+        elif len(head) < RECORD.size:
+            is_begun = not head or head[0] in OPCODES
+        else:
+            is_begun = claim is not None and written_end < gap.begin + RECORD.size + claim.length
+        if gap.begin < self._end:
+            return is_begun and gap.end <= self._end
+        # Of a head that ends in zeros nobody knows whether they are the length's own.
+        block_bytes = self._largest_bytes if len(head) < RECORD.size else 0
+        if claim is not None:
+            block_bytes = max(block_bytes, self._claimed_bytes(claim))
+        return is_begun and gap.end <= gap.begin + block_bytes
+
+    def _claimed_bytes(self, claim: Claim) -> int:
+        """The size of the block that begins with that record."""
+        rest_bytes = self._largest_index_bytes if claim.opcode == Opcode.CHUNK else FIRST_BLOCK_BYTES
+        return RECORD.size + claim.length + rest_bytes
+
+
+def _index_bytes(messages: Counter[int]) -> int:
+    """The size of the message indexes behind a chunk with so many messages of each channel."""
+    return sum(RECORD.size + 6 + 16 * count for count in messages.values())
 
 
 def _last_written(source: Source, gap: Gap) -> int:
