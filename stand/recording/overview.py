@@ -14,7 +14,7 @@ import numpy as np
 from drivers.interface import SessionError
 from stand.hub import Event, StepMark, StepState
 from stand.recording.contents import RUN_END, Channel, Contents
-from stand.recording.gaps import Silence, silences
+from stand.recording.gaps import Silence, silences, told_blocks
 from stand.recording.images import decode_image
 from stand.recording.inventory import SegmentFile, State, inventory
 from stand.recording.layout import FRAMES, TELEMETRY
@@ -58,7 +58,9 @@ class Glance:
         if self.troubles:
             return f"damaged: {self.troubles[0]}"
         told = {State.UNFINISHED: "unfinished", State.RECORDING: "being recorded", State.DAMAGED: "kept damaged"}
-        parts = [f"{count} {text}" for state, text in told.items() if (count := self.count(state))]
+        has_telemetry = any(file.series == TELEMETRY and file.state is not State.DAMAGED for file in self.files)
+        parts = [] if has_telemetry else ["telemetry missing"]
+        parts += [f"{count} {text}" for state, text in told.items() if (count := self.count(state))]
         return ", ".join(parts) or "complete"
 
 
@@ -146,7 +148,8 @@ class Temperature:
 @dataclass(frozen=True, slots=True)
 class Frames:
     """The images. `pixels`: those of the first, as in `2448 x 2048 px, 8 bit`; schema and pixels are "" without any.
-    described: descriptions in the telemetry. dropped: frames that camera, wire or recorder lost, as recorded."""
+    described: descriptions in the telemetry. dropped: frames that the camera or its wire lost, as the descriptions say.
+    lost_by_recorder: frames of which its events say so."""
 
     count: int
     size_bytes: int
@@ -156,6 +159,7 @@ class Frames:
     last_ns: int | None
     described: int
     dropped: int
+    lost_by_recorder: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,8 +241,7 @@ def _steps(contents: Contents) -> Iterator[Step]:
 def _frames(seen: Glance, read: _Reading) -> Frames:
     size_bytes = sum(file.size_bytes for file in seen.files if file.series == FRAMES)
     times_ns = [place.time_ns for place in read.places]
-    lost = Counter(key for key, _ in read.contents.metas)
-    dropped = sum(meta.dropped for _, meta in read.contents.metas)
+    contents = read.contents
     return Frames(
         len(times_ns),
         size_bytes,
@@ -246,8 +249,9 @@ def _frames(seen: Glance, read: _Reading) -> Frames:
         _pixels(read),
         min(times_ns, default=None),
         max(times_ns, default=None),
-        lost.total(),
-        dropped,
+        len(contents.metas),
+        sum(meta.dropped for _, meta in contents.metas),
+        sum(map(len, told_blocks(contents.events))),
     )
 
 

@@ -126,6 +126,30 @@ async def test_a_recording_without_a_finished_segment_still_tells_what_it_is(ses
     assert overview(session).steps == ()
 
 
+async def test_a_session_without_telemetry_is_not_complete(session):
+    for path in (session / "telemetry").iterdir():
+        path.rename(path.with_name(f"{path.name}.damaged"))
+    kept = len(list((session / "telemetry").iterdir()))
+    assert glance(session).state == f"telemetry missing, {kept} kept damaged"
+    shutil.rmtree(session / "telemetry")
+    assert glance(session).state == "telemetry missing"
+    assert overview(session).frames.count == 5
+
+
+async def test_frames_that_the_recorder_lost_are_counted_apart_from_those_that_never_came(tmp_path):
+    def items(time_ns, index):
+        yield from second(time_ns, index)
+        if index == 8:
+            yield Event(
+                time_ns, "error", "frames_dropped", "frames lost: 3 (blocks 4 to 5, 7 of step capture), 3 in all"
+            )
+            yield Event(time_ns, "error", "frames_dropped", "frames lost: 1 (block 9 of step capture), 4 in all; slow")
+
+    await record(tmp_path / "s", SECONDS, items=items, period_ns=NS_PER_S)
+    frames = overview(tmp_path / "s").frames
+    assert (frames.described, frames.dropped, frames.lost_by_recorder) == (5, 3, 4)
+
+
 async def test_what_a_salvage_kept_and_what_is_no_segment(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
     (session / "frames" / "notes.txt").write_text("a cloudy night")
@@ -206,7 +230,7 @@ def test_what_is_no_time_says_what_would_be(text):
     "text", ["+99999999h", f"+{'9' * 400}h", "1969-12-31T23:59:59", "0001-01-01T00:00+14:00", "9999-12-31T23:00-14:00"]
 )
 def test_a_time_that_no_recording_has_is_refused(text):
-    with pytest.raises(ConfigError, match=": is not between the years 1970 and 9999$"):
+    with pytest.raises(ConfigError, match=r": is not between the years 1970 and 9999$"):
         parse_instant(text, START_NS)
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from stand.hub import Event
 from stand.recording.session import Session
 from stand.session_cli import app
-from tests.recording.recorded import START_NS, item_key, record
+from tests.recording.recorded import START_NS, half_second, item_key, record
 
 runner = CliRunner()
 COUNT = 12  # half seconds, a frame each
@@ -123,6 +124,18 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
         "2026-01-01 18:00:02 warning: half second 4, 5 µm",
     ):
         assert fact in said
+
+
+def test_info_tells_what_the_recorder_lost(tmp_path: Path):
+    def items(time_ns: int, index: int):
+        yield from half_second(time_ns, index)
+        yield Event(
+            time_ns, "error", "frames_dropped", f"frames lost: 1 (block {index} of step a), {index} in all; full"
+        )
+
+    asyncio.run(record(tmp_path / "s", 3, items=items))
+    said = " ".join(ask("info", tmp_path / "s").stdout.split())
+    assert "; 1 lost by the camera or its wire; 3 lost by the recorder from" in said
 
 
 def test_info_as_json_has_everything_and_no_nan(session: Path):
