@@ -7,11 +7,15 @@ that the recording itself tells of: silence of a device, frames the camera or a 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import inf
 from pathlib import Path
+
+from mcap.records import DataEnd
+from mcap.records import Message as StoredMessage
+from mcap.stream_reader import StreamReader
 
 from drivers.clock import NS_PER_S
 from drivers.interface import SessionError
@@ -21,6 +25,7 @@ from stand.recording.images import CAMERA_IMAGE
 from stand.recording.instants import date_time
 from stand.recording.inventory import SegmentFile, State, inventory
 from stand.recording.layout import (
+    FINISHED,
     FRAMES,
     SEGMENT_METADATA,
     SESSION_CRC,
@@ -28,7 +33,7 @@ from stand.recording.layout import (
     TELEMETRY,
     segment_metadata,
 )
-from stand.recording.records import Message
+from stand.recording.records import DAMAGE, Message
 from stand.recording.salvage import SALVAGE_METADATA
 from stand.recording.segment_check import Damage, SegmentCheck, check_segment
 
@@ -159,7 +164,7 @@ def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Ver
         read.checks[file.name] = _checked(file, read, report, done_bytes)
         done_bytes += file.size_bytes
     findings = (
-        *_not_finished(files),
+        *_not_finished(files, read.checks),
         *_missing(files),
         *_damaged(read),
         *_metadata(finished, read),
@@ -185,17 +190,40 @@ def _checked(file: SegmentFile, read: _Read, report: Callable[[float, str], None
     return check
 
 
-def _not_finished(files: Iterable[SegmentFile]) -> Iterator[Finding]:
+def _not_finished(files: Iterable[SegmentFile], checks: Mapping[str, SegmentCheck]) -> Iterator[Finding]:
     for file in files:
         match file.state:
             case State.UNFINISHED:
                 yield _error("is not finished; `stand session salvage` recovers what is in it", file.name)
+            case State.DAMAGED if _is_recovered(file, checks.get(f"{file.series}/{file.number:04d}{FINISHED}")):
+                yield _note(
+                    "a salvage recovered every message and kept the original because it was finished and damaged; "
+                    "remove it when it is not needed",
+                    file.name,
+                )
             case State.DAMAGED:
                 yield _error("is what a salvage kept of a segment because it could not recover all of it", file.name)
             case State.RECORDING:
                 yield _note("is being recorded now and was not read", file.name)
             case State.FINISHED:
                 pass
+
+
+def _is_recovered(kept: SegmentFile, salvaged: SegmentCheck | None) -> bool:
+    """Whether the salvaged segment has every message of the original: its salvage lost no byte, and both have as many.
+    The original must go on to the end of its data; of one that was cut short nobody knows how many it had."""
+    if salvaged is None or salvaged.metadata.get(SALVAGE_METADATA, {}).get("lost_bytes") != "0":
+        return False
+    messages = 0
+    try:
+        with kept.path.open("rb") as file:
+            for record in StreamReader(file, validate_crcs=True, record_size_limit=kept.size_bytes).records:
+                if isinstance(record, DataEnd):
+                    return messages == salvaged.messages
+                messages += isinstance(record, StoredMessage)
+    except DAMAGE:
+        pass
+    return False
 
 
 def _error(text: str, where: str = "") -> Finding:

@@ -186,6 +186,48 @@ async def test_what_a_recorder_or_a_salvage_left_is_told(session):
     assert any(text.startswith("error: frames/0000.mcap.damaged: is what a salvage kept") for text in found)
 
 
+def with_a_damaged_index(path):
+    """A bit of what the index tells of the whole is wrong."""
+    data = bytearray(path.read_bytes())
+    data[-40] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", ["telemetry/0001.mcap", "frames/0000.mcap"])
+async def test_an_original_from_which_everything_was_recovered_is_a_note(session, name):
+    with_a_damaged_index(session / name)
+    assert errors(session)
+    salvage_session(session)
+    assert errors(session) == []
+    assert notes(session)[0] == (
+        f"note: {name}.damaged: a salvage recovered every message and kept the original because it was finished and "
+        "damaged; remove it when it is not needed"
+    )
+
+
+async def test_an_original_from_which_something_is_lost_stays_an_error(session):
+    path = session / "frames" / "0001.mcap"
+    data = bytearray(path.read_bytes())
+    data[data.index(b"IDAT") + 20] ^= 1
+    path.write_bytes(data)
+    salvage_session(session)
+    with_a_damaged_index(path)
+    salvage_session(session)  # it recovers all that the first one did
+    kept, frame_lost = errors(session)
+    assert kept.startswith("error: frames/0001.mcap.damaged: is what a salvage kept")
+    assert frame_lost.startswith("error: 1 frame is missing")
+    assert notes(session)[0].startswith("note: frames/0001.2.mcap.damaged: a salvage recovered every message")
+
+
+async def test_an_original_that_was_cut_short_stays_an_error(session):
+    path = session / "telemetry" / "0001.mcap"
+    with path.open("rb") as file:
+        chunk = SeekingReader(file).get_summary().chunk_indexes[-1]
+    path.write_bytes(path.read_bytes()[: chunk.chunk_start_offset])  # what is left of it is sound
+    salvage_session(session)
+    assert any(error.startswith("error: telemetry/0001.mcap.damaged: is what") for error in errors(session))
+
+
 async def test_a_segment_that_is_being_recorded_is_no_error(session):
     part = session / "frames" / f"{len(list((session / 'frames').iterdir())):04d}.mcap.part"
     part.write_bytes(b"")
