@@ -1,0 +1,100 @@
+"""The one gate before everything a run does: a set of reasons to wait. It is open when there is none."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from enum import StrEnum
+
+Listener = Callable[[str, bool], None]
+
+# Who may hold a run; whoever sets a reason clears it, and nobody else's.
+OPERATOR = "operator"  # a pause; the chamber keeps its set-point
+INTERLOCK = "interlock"  # the guard has made the chamber safe; only an operator clears it
+CAMERA_LOST = "camera_lost"  # until it answers again
+DISK_LOW = "disk_low"  # until frames can be recorded again
+NOT_RECORDED = "not_recorded"  # until the disk takes telemetry again
+
+
+class Gate:
+    """Awaited before each action, and within dwells and captures. Reasons are independent: none clears another."""
+
+    def __init__(self) -> None:
+        self._reasons: set[str] = set()
+        self._open, self._closed = asyncio.Event(), asyncio.Event()
+        self._open.set()
+        self._listeners: list[Listener] = []
+
+    @property
+    def reasons(self) -> frozenset[str]:
+        """What holds the run now."""
+        return frozenset(self._reasons)
+
+    def subscribe(self, listener: Listener) -> None:
+        """Call `listener(reason, held)` at once when a reason appears (held) or goes."""
+        self._listeners.append(listener)
+
+    def hold(self, reason: str) -> None:
+        """Close the gate for `reason`; nothing happens when it holds already."""
+        if reason not in self._reasons:
+            self._reasons.add(reason)
+            self._open.clear()
+            self._closed.set()
+            self._tell(reason, True)
+
+    def clear(self, reason: str) -> None:
+        """Take `reason` back; the gate opens with the last one."""
+        if reason in self._reasons:
+            self._reasons.discard(reason)
+            if not self._reasons:
+                self._closed.clear()
+                self._open.set()
+            self._tell(reason, False)
+
+    async def passed(self) -> None:
+        """Return when the gate is open."""
+        while self._reasons:  # it may have closed again before we came to run
+            await self._open.wait()
+
+    async def closed(self) -> None:
+        """Return when the gate has closed, be it for a moment."""
+        await self._closed.wait()
+
+    def _tell(self, reason: str, held: bool) -> None:
+        for listener in self._listeners:
+            listener(reason, held)
+
+
+class Phase(StrEnum):
+    """Where a run is."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    HELD = "held"
+    ABORTING = "aborting"
+    ENDED = "ended"
+
+
+class Turn(StrEnum):
+    """What moves a run from phase to phase."""
+
+    START = "start"
+    HOLD = "hold"
+    RELEASE = "release"
+    STOP = "stop"
+    END = "end"
+
+
+# What is not in a row changes nothing: a run that is being aborted cannot be held, one that has ended stays so.
+_NEXT: dict[Phase, dict[Turn, Phase]] = {
+    Phase.IDLE: {Turn.START: Phase.RUNNING, Turn.STOP: Phase.ABORTING, Turn.END: Phase.ENDED},
+    Phase.RUNNING: {Turn.HOLD: Phase.HELD, Turn.STOP: Phase.ABORTING, Turn.END: Phase.ENDED},
+    Phase.HELD: {Turn.RELEASE: Phase.RUNNING, Turn.STOP: Phase.ABORTING, Turn.END: Phase.ENDED},
+    Phase.ABORTING: {Turn.END: Phase.ENDED},
+    Phase.ENDED: {},
+}
+
+
+def next_phase(phase: Phase, turn: Turn) -> Phase:
+    """The phase after `turn`."""
+    return _NEXT[phase].get(turn, phase)

@@ -1,0 +1,256 @@
+"""What a run has done, durable: `journal.jsonl` in the session's folder, from which a killed run goes on.
+
+Append-only, one entry a line: the CRC-32 of the rest in 8 hex digits, a space, a JSON object, a newline. A line is
+on the disk (fdatasync) when `write` returns. A reader goes as far as the first line that is not whole; what follows
+it was never acknowledged, and is cut off before anything is appended.
+
+    Begun     the run, its plan and the texts it was made of; the first line and no other
+    Step      a step was started, done or failed
+    Dwell     what a soak has earned so far
+    Held      a reason to wait appeared or went
+    Gap       nothing ran between two instants
+    Cleared   an operator has seen to what had tripped
+    Ended     complete, tripped, interrupted by the operator, or failed
+
+Instants are ns on the stand's clock, so a run in virtual time has the same journal each time.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import zlib
+from asyncio import Task, create_task, gather
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+from drivers.clock import Clock
+from drivers.interface import SessionError
+from drivers.lane import Lane
+from stand.recording.sink import sync_folder
+
+JOURNAL_NAME = "journal.jsonl"
+_CRC_DIGITS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """run: the session's name. plan: hash of the steps' ids. texts: hash of each attached text by its name.
+    seed: of the simulated laboratory, None when it was the configured one."""
+
+    time_ns: int
+    run: str
+    plan: str
+    texts: dict[str, str]
+    seed: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of the plan; "done" is written when all it has recorded is on the disk."""
+
+    time_ns: int
+    step_id: str
+    state: Literal["started", "done", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Dwell:
+    """A soak has earned `earned_s` of its duration; also after its end, when it has to be earned anew."""
+
+    time_ns: int
+    step_id: str
+    earned_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """`reason` holds the run from now on, or (`held` false) does not any more."""
+
+    time_ns: int
+    reason: str
+    held: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Nothing was recorded, and nobody watched the stand, between these instants."""
+
+    from_ns: int
+    time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Cleared:
+    """An operator has seen to what had tripped."""
+
+    time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How the run ended, and why."""
+
+    time_ns: int
+    status: Literal["complete", "tripped", "interrupted", "failed"]
+    text: str
+
+
+Entry = Begun | Step | Dwell | Held | Gap | Cleared | Ended
+_ENTRIES: dict[str, type[Entry]] = {kind.__name__: kind for kind in (Begun, Step, Dwell, Held, Gap, Cleared, Ended)}
+
+
+def encode_line(entry: Entry) -> bytes:
+    """The entry as a line."""
+    text = json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def read_lines(data: bytes) -> tuple[list[Entry], int]:
+    """The entries before the first line that is not whole, and how many bytes they are.
+
+    SessionError when a whole line holds an entry that is not known here.
+    """
+    entries: list[Entry] = []
+    size_bytes = 0
+    for line in data.splitlines(keepends=True):
+        if not _is_whole(line):
+            break
+        entries.append(_decoded(line[_CRC_DIGITS + 1 :]))
+        size_bytes += len(line)
+    return entries, size_bytes
+
+
+def _is_whole(line: bytes) -> bool:
+    crc, _, text = line.removesuffix(b"\n").partition(b" ")
+    return line.endswith(b"\n") and crc == b"%08x" % zlib.crc32(text)
+
+
+def _decoded(text: bytes) -> Entry:
+    try:
+        fields = cast("dict[str, object]", json.loads(text))
+        kind = _ENTRIES[cast("str", fields.pop("entry"))]
+        return kind(**fields)  # pyright: ignore[reportArgumentType] - a CRC vouches for what was written here
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({text[:80]!r})") from error
+
+
+class Journal:
+    """The journal of one session, locked (flock) while it is open: one daemon per session.
+
+    Lines that the disk refuses are kept and written with the next one; `trouble` is told when that begins.
+    """
+
+    def __init__(self, path: Path, fd: int, size_bytes: int) -> None:
+        self.path = path
+        self._fd = fd
+        self._size_bytes = size_bytes
+        self._waiting: list[bytes] = []
+        self._failing = False
+        self._notes: set[Task[None]] = set()
+        self._lane: Lane | None = None
+        self._trouble: Callable[[str], None] = _ignored
+
+    @classmethod
+    def create(cls, directory: Path) -> Journal:
+        """A new, empty journal in a session's folder; SessionError when there is one, or the disk refuses."""
+        path = directory / JOURNAL_NAME
+        try:
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            sync_folder(directory)
+        except OSError as error:
+            raise SessionError(f"{path}: no journal can be begun here ({error.strerror})") from error
+        return cls(path, fd, 0)
+
+    @classmethod
+    def open(cls, directory: Path) -> tuple[Journal, list[Entry]]:
+        """The journal of a session and its entries; a torn tail is cut off.
+
+        SessionError when there is none, or when a daemon is running this session.
+        """
+        path = directory / JOURNAL_NAME
+        try:
+            fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
+        try:
+            entries, size_bytes = _opened(fd)
+        except BaseException as error:
+            os.close(fd)
+            if isinstance(error, BlockingIOError):
+                raise SessionError(f"{directory}: a daemon is running this session already") from error
+            if isinstance(error, OSError):
+                raise SessionError(f"{path}: cannot be read ({error.strerror})") from error
+            raise
+        return cls(path, fd, size_bytes), entries
+
+    def start(self, clock: Clock, trouble: Callable[[str], None]) -> None:
+        """Before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence."""
+        self._lane = Lane("journal", clock)
+        self._trouble = trouble
+
+    async def write(self, *entries: Entry) -> None:
+        """The entries on the disk, or kept for the next time."""
+        if self._lane is None:
+            raise ValueError("a journal is started before it is written")
+        self._waiting.extend(map(encode_line, entries))
+        failure = await self._lane.call(self._commit)
+        if failure is not None and not self._failing:
+            self._trouble(f"{self.path.name} cannot be written ({failure.strerror}); its entries wait in memory")
+        self._failing = failure is not None
+
+    def note(self, entry: Entry) -> None:
+        """As `write`, without waiting for the disk."""
+        task = create_task(self.write(entry))
+        self._notes.add(task)
+        task.add_done_callback(self._notes.discard)
+
+    async def close(self) -> None:
+        """Let go of the session, after all notes; may be called twice."""
+        await gather(*self._notes)
+        if self._lane is not None:
+            self._lane.close()
+            self._lane = None
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def _commit(self) -> OSError | None:
+        """In the lane's thread: what waits on the disk; on OSError the file is as it was."""
+        count = len(self._waiting)
+        if not count:
+            return None
+        data = b"".join(self._waiting[:count])
+        try:
+            if os.pwrite(self._fd, data, self._size_bytes) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a part of it fitted
+            os.fdatasync(self._fd)
+        except OSError as error:
+            with suppress(OSError):
+                os.ftruncate(self._fd, self._size_bytes)
+            return error
+        self._size_bytes += len(data)
+        del self._waiting[:count]
+        return None
+
+
+def _opened(fd: int) -> tuple[list[Entry], int]:
+    """Lock, read, and cut off what was not acknowledged; OSError, SessionError."""
+    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with open(fd, "rb", closefd=False) as file:
+        data = file.read()
+    entries, size_bytes = read_lines(data)
+    if size_bytes < len(data):
+        os.ftruncate(fd, size_bytes)
+        os.fsync(fd)
+    return entries, size_bytes
+
+
+def _ignored(text: str) -> None:
+    """Before `start` there is nothing to tell."""

@@ -1,0 +1,164 @@
+"""The journal: what was acknowledged is read again, whatever follows it in the file."""
+
+import asyncio
+import resource
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.clock import WallClock
+from drivers.interface import SessionError
+from stand.journal import (
+    JOURNAL_NAME,
+    Begun,
+    Cleared,
+    Dwell,
+    Ended,
+    Gap,
+    Held,
+    Journal,
+    Step,
+    encode_line,
+    read_lines,
+)
+
+ENTRIES = [
+    Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),
+    Step(2, "a1", "started"),
+    Dwell(3, "a1", 60.0),
+    Held(4, "operator", True),
+    Held(5, "operator", False),
+    Gap(5, 8),
+    Cleared(8),
+    Step(9, "a1", "done"),
+    Ended(10, "interrupted", "stopped by the operator: “✓”\n"),
+]
+
+times_ns = st.integers(0, 2**62)
+words = st.text(max_size=20)
+entries = st.one_of(
+    st.builds(Begun, times_ns, words, words, st.dictionaries(words, words, max_size=3), st.none() | st.integers(0)),
+    st.builds(Step, times_ns, words, st.sampled_from(["started", "done", "failed"])),
+    st.builds(Dwell, times_ns, words, st.floats(0, 1e6)),
+    st.builds(Held, times_ns, words, st.booleans()),
+    st.builds(Gap, times_ns, times_ns),
+    st.builds(Cleared, times_ns),
+    st.builds(Ended, times_ns, st.sampled_from(["complete", "failed"]), words),
+)
+
+
+async def write(journal: Journal, *written):
+    journal.start(WallClock(), pytest.fail)
+    for entry in written:
+        await journal.write(entry)
+    await journal.close()
+
+
+def new_journal(directory: Path, *written) -> Path:
+    asyncio.run(write(Journal.create(directory), *written))
+    return directory / JOURNAL_NAME
+
+
+def on_disk(directory: Path):
+    return read_lines((directory / JOURNAL_NAME).read_bytes())[0]
+
+
+@given(st.lists(entries, max_size=8))
+def test_every_entry_is_read_as_it_was_written(written):
+    data = b"".join(map(encode_line, written))
+    assert read_lines(data) == (written, len(data))
+    assert data.count(b"\n") == len(written)
+
+
+@given(st.lists(entries, max_size=6), st.data())
+def test_any_cut_gives_the_entries_before_it(written, data):
+    lines = [encode_line(entry) for entry in written]
+    whole = b"".join(lines)
+    cut = data.draw(st.integers(0, len(whole)))
+    found, size_bytes = read_lines(whole[:cut])
+    assert found == written[: len(found)]
+    assert size_bytes == sum(map(len, lines[: len(found)])) <= cut
+    assert len(found) == len(written) or cut < size_bytes + len(lines[len(found)])
+
+
+@given(st.lists(entries, max_size=6), st.data())
+def test_garbage_at_the_end_or_a_flipped_bit_gives_a_prefix(written, data):
+    whole = b"".join(map(encode_line, written))
+    assert read_lines(whole + data.draw(st.binary(max_size=200)))[0] == written
+    if whole:
+        damaged = bytearray(whole)
+        place = data.draw(st.integers(0, len(whole) - 1))
+        damaged[place] ^= 1 << data.draw(st.integers(0, 7))
+        found, _ = read_lines(bytes(damaged))
+        assert found == written[: len(found)]
+        assert len(found) <= whole[:place].count(b"\n")
+
+
+def test_a_torn_tail_is_cut_off_and_the_journal_goes_on_behind_the_last_whole_line(tmp_path):
+    path = new_journal(tmp_path, *ENTRIES[:3])
+    whole = path.read_bytes()
+    path.write_bytes(whole + encode_line(ENTRIES[3])[:-4])
+    journal, found = Journal.open(tmp_path)
+    assert found == ENTRIES[:3]
+    assert path.read_bytes() == whole
+    asyncio.run(write(journal, *ENTRIES[3:]))
+    assert on_disk(tmp_path) == ENTRIES
+
+
+def test_a_journal_that_is_open_is_refused_to_a_second_daemon(tmp_path):
+    journal = Journal.create(tmp_path)
+    with pytest.raises(SessionError, match="a daemon is running this session already"):
+        Journal.open(tmp_path)
+    asyncio.run(journal.close())
+    assert on_disk(tmp_path) == []
+
+
+def test_no_journal_and_a_second_one_are_refused_with_a_sentence(tmp_path):
+    with pytest.raises(SessionError, match=r"has no journal of a run \(.*\); begin a new run"):
+        Journal.open(tmp_path)
+    new_journal(tmp_path)
+    with pytest.raises(SessionError, match="no journal can be begun here"):
+        Journal.create(tmp_path)
+
+
+@pytest.mark.parametrize("line", [b'{"entry": "Teleported", "time_ns": 1}', b'{"entry": "Gap", "to": 1}', b"[]", b"x"])
+def test_a_whole_line_of_another_version_is_refused_with_a_sentence(tmp_path, line):
+    (tmp_path / JOURNAL_NAME).write_bytes(b"%08x %s\n" % (zlib.crc32(line), line))
+    with pytest.raises(SessionError, match="of another version of thermostand"):
+        Journal.open(tmp_path)
+    (tmp_path / JOURNAL_NAME).unlink()
+    new_journal(tmp_path)  # nothing stays locked or open
+
+
+async def test_entries_that_the_disk_refuses_are_written_with_the_next(tmp_path):
+    """The kernel refuses a file beyond a size, in the middle of a line, as a full disk would."""
+    told = []
+    journal = Journal.create(tmp_path)
+    journal.start(WallClock(), told.append)
+    await journal.write(ENTRIES[0])
+    size_bytes = (tmp_path / JOURNAL_NAME).stat().st_size
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes + 10, hard))
+    try:
+        await journal.write(ENTRIES[1])
+        await journal.write(ENTRIES[2])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert told == ["journal.jsonl cannot be written (No space left on device); its entries wait in memory"]
+    assert (tmp_path / JOURNAL_NAME).stat().st_size == size_bytes
+    await journal.write(ENTRIES[3])
+    await journal.close()
+    assert on_disk(tmp_path) == ENTRIES[:4]
+
+
+async def test_notes_are_on_the_disk_in_their_order_when_the_journal_is_closed(tmp_path):
+    journal = Journal.create(tmp_path)
+    journal.start(WallClock(), pytest.fail)
+    for entry in ENTRIES:
+        journal.note(entry)
+    await journal.close()
+    await journal.close()
+    assert on_disk(tmp_path) == ENTRIES
