@@ -118,7 +118,7 @@ class Axis:
             raise ValueError(f"{name}: no stage profile {settings.profile!r}, only {', '.join(PROFILES)}")
         self.name = name
         self._settings = settings
-        self._profile = PROFILES[settings.profile]
+        self.profile = PROFILES[settings.profile]
         self._clock = clock
         self._lane: Lane | None = None
         self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
@@ -146,7 +146,7 @@ class Axis:
         position = Reading(
             f"{self.name}.position",
             self._units(status.position),
-            self._profile.unit,
+            self.profile.unit,
             now_ns,
             Quality.STALE if status.doubt else Quality.GOOD,
             status.doubt,
@@ -182,7 +182,7 @@ class Axis:
         Refused outside the limits or when not homed; DeviceFault in an alarm or when the move fails.
         """
         low, high = self._settings.limits
-        unit = self._profile.unit
+        unit = self.profile.unit
         if not low <= position <= high:
             raise Refused(self.name, f"{position} {unit} is outside the limits {low}..{high} {unit}")
         stops = self._stops
@@ -190,7 +190,7 @@ class Axis:
         self._refuse_alarm(status)
         if not status.homed:
             raise Refused(self.name, "not homed; its positions mean nothing until it is")
-        target, below = self._microsteps(position), self._microsteps(position - self._profile.overshoot)
+        target, below = self._microsteps(position), self._microsteps(position - self.profile.overshoot)
         for stop in (below, target) if status.position > below else (target,):
             if stops != self._stops:
                 raise DeviceFault(self.name, f"stopped on the way to {position} {unit}")
@@ -247,10 +247,10 @@ class Axis:
             raise DeviceFault(self.name, f"{status.alarm}; it must be looked into before anything moves")
 
     def _units(self, position: int) -> float:
-        return position / _MICROSTEPS * self._profile.unit_per_step
+        return position / _MICROSTEPS * self.profile.unit_per_step
 
     def _microsteps(self, position: float) -> int:
-        return round(position / self._profile.unit_per_step * _MICROSTEPS)
+        return round(position / self.profile.unit_per_step * _MICROSTEPS)
 
     async def _call(self, function: Callable[..., Result], *args: object) -> Result:
         if self._lane is None:

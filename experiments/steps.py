@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -84,11 +85,59 @@ class PowerCamera:
     on: bool
 
 
-Step = StartChamber | SetTemperature | StopChamber | Soak | OpenFlap | CloseFlap | Capture | MoveTo | PowerCamera
+@dataclass(frozen=True, slots=True)
+class CoolDown:
+    """With the camera off, wait until it is within `band_K` of the chamber's air, at most `max_s`.
 
-# What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves.
+    Its excess is known from its last temperature before it was switched off and decays with `time_constant_s`, that of
+    its slowest part.
+    """
+
+    band_K: float
+    time_constant_s: float
+    max_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class CheckHome:
+    """Home the axis named `axis` again, record how far its scale had gone astray, and go back to where it stood."""
+
+    axis: str
+
+
+@dataclass(frozen=True, slots=True)
+class Prompt:
+    """Ask the operator to do what `text` says; skipped, with a note, when nobody attends."""
+
+    text: str
+
+
+Step = (
+    StartChamber
+    | SetTemperature
+    | StopChamber
+    | Soak
+    | OpenFlap
+    | CloseFlap
+    | Capture
+    | MoveTo
+    | PowerCamera
+    | CoolDown
+    | CheckHome
+    | Prompt
+)
+
+
+def is_setup(step: Step) -> bool:
+    """Whether the step brings about a state, to be restored after an interruption; the others are work, done once."""
+    return not isinstance(step, Soak | CoolDown | Capture | CheckHome | Prompt)
+
+
+# What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves, homing and back.
 _FLAP_S = 3.0
 _MOVE_S = 15.0
+_CHECK_HOME_S = 120.0
+_CAMERA_EXCESS_K = 20.0  # of a camera that has been on for an hour, over the air around it
 
 
 def estimate_s(step: Step, camera_boot_s: float) -> float:
@@ -104,7 +153,11 @@ def estimate_s(step: Step, camera_boot_s: float) -> float:
             return _MOVE_S
         case PowerCamera():
             return camera_boot_s if step.on else 0.0
-        case StartChamber() | SetTemperature() | StopChamber():
+        case CoolDown():
+            return min(step.max_s, step.time_constant_s * max(0.0, math.log(_CAMERA_EXCESS_K / step.band_K)))
+        case CheckHome():
+            return _CHECK_HOME_S
+        case StartChamber() | SetTemperature() | StopChamber() | Prompt():
             return 0.0
 
 

@@ -8,11 +8,14 @@ from collections.abc import Iterable
 from drivers.clock import Clock
 from experiments.steps import (
     Capture,
+    CheckHome,
     CloseFlap,
+    CoolDown,
     MoveTo,
     OpenFlap,
     PlannedStep,
     PowerCamera,
+    Prompt,
     SetTemperature,
     Soak,
     StartChamber,
@@ -64,6 +67,12 @@ class Scheduler:
                 await stand.move_to(axis, position)
             case PowerCamera(on):
                 await stand.power_camera(on=on)
+            case CoolDown(band_K, time_constant_s, max_s):
+                await stand.cool_down(band_K, time_constant_s, max_s)
+            case CheckHome(axis):
+                await stand.check_home(axis)
+            case Prompt(text):
+                await stand.prompt(text)
 
     def _mark(self, planned: PlannedStep, state: StepState) -> None:
         self._hub.publish(

@@ -14,9 +14,11 @@ from drivers.regulator import Regulator
 from drivers.relays import Relays
 from drivers.stage import Axis
 from drivers.thermometers import Thermometers
+from stand.camera_cooling import Cooling, cool_down, last_word
 from stand.compressor import CompressorLimits, CompressorState, decide
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
+from stand.stage_care import check_home, ready
 
 # Real seconds for all actuators together to reach their safe state; the dead-man relay drops by itself after that.
 _SAFE_LIMIT_S = 10.0
@@ -60,6 +62,8 @@ class Stand:
         self._compressor = CompressorState(running=False, since_ns=clock.now_ns())
         self._compressor_until_ns = 0  # when its timed-on relay drops unless renewed
         self._making_safe = asyncio.Lock()
+        self._commanded: dict[str, float] = {}  # axis -> mm or deg, where the plan put it last
+        self._cooling: Cooling | None = None  # the camera's last word before it was switched off
         self.unconfirmed: tuple[str, ...] = ()  # what the last make_safe could not confirm
 
     def latch(self, fault: Fault) -> None:
@@ -139,8 +143,11 @@ class Stand:
     async def capture(self, frames: int, interval_s: float, exposure_s: float, step_id: str) -> None:
         """`frames` images, one each `interval_s` by absolute deadlines; each published as soon as it is there.
 
+        Stages whose motors have been switched off meanwhile are first approached anew.
         Deadlines missed while a lost camera was opened anew are skipped, not made up for by a burst.
         """
+        self._check()
+        await ready(self.devices.axes, self._commanded, self._hub, self._clock)
         due_ns, interval_ns = self._clock.now_ns(), seconds_ns(interval_s)
         for _ in range(frames):
             await self._clock.sleep_until(due_ns)
@@ -161,24 +168,43 @@ class Stand:
 
     async def move_to(self, axis: str, position: float) -> None:
         """Move a stage (mm or deg), homing it first when it lost its scale."""
-        self._check()
-        if axis not in self.devices.axes:
-            raise ConfigError(
-                f"the plan moves axis {axis}, but this stand has {', '.join(self.devices.axes) or 'none'}"
-            )
-        stage = self.devices.axes[axis]
+        stage = self._axis(axis)
+        self._commanded.pop(axis, None)  # nobody knows where it stands when the move fails
         if not await stage.homed():
             await stage.home()
             self._check()
         await stage.move_to(position)
+        self._commanded[axis] = position
+
+    async def check_home(self, axis: str) -> None:
+        """Home a stage again, record how far its scale had gone astray, and go back to where the plan had put it."""
+        stage = self._axis(axis)
+        await check_home(stage, self._hub, self._clock)
+        self._check()
+        if axis in self._commanded:
+            await stage.move_to(self._commanded[axis])
+
+    async def prompt(self, text: str) -> None:
+        """Tell the operator what to do; nobody attends, so the run goes on and says so."""
+        self._check()
+        self._hub.publish(Event(self._clock.now_ns(), "info", "prompt", text))
+        self._hub.publish(Event(self._clock.now_ns(), "warning", "prompt_skipped", f"nobody attends; not done: {text}"))
+
+    async def cool_down(self, band_K: float, time_constant_s: float, max_s: float) -> None:
+        """Wait until the camera, which is off, should be within `band_K` of the air near it."""
+        self._check()
+        await cool_down(self._cooling, band_K, time_constant_s, max_s, self._hub, self._clock)
 
     async def power_camera(self, *, on: bool) -> None:
         """Switch the camera's supply; on: return when the camera is open and configured."""
         self._check()
         if not on:
+            # One that was off already has nothing new to say.
+            self._cooling = last_word(self._hub.latest("camera.temperature")) or self._cooling
             await self.devices.camera.close()
             await self.devices.relays.switch("camera_power", on=False)
             return
+        self._cooling = None
         await self.devices.relays.switch("camera_power", on=True)
         await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.camera_boot_s))
         await self._open_camera()
@@ -220,6 +246,14 @@ class Stand:
     def _compressor_is_off(self) -> None:
         if self._compressor.running:
             self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
+
+    def _axis(self, axis: str) -> Axis:
+        self._check()
+        if axis not in self.devices.axes:
+            raise ConfigError(
+                f"the plan moves axis {axis}, but this stand has {', '.join(self.devices.axes) or 'none'}"
+            )
+        return self.devices.axes[axis]
 
     def _check(self, chamber_degC: float | None = None) -> None:
         if self.fault is not None:
