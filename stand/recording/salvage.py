@@ -37,7 +37,6 @@ from stand.recording.layout import (
     segment_metadata,
 )
 from stand.recording.opening import Opening, opening_of, segments_of
-from stand.recording.records import DAMAGE
 from stand.recording.segment_check import check_segment
 from stand.recording.sink import sync_folder
 from stand.recording.walk import Source, StoredMessage, Survey, stored_messages, survey
@@ -115,7 +114,7 @@ def _refusing(path: Path) -> Generator[None]:
     """What the disk refuses inside becomes a SessionError that names the file."""
     try:
         yield
-    except DAMAGE as error:  # OSError; the rest only when the file changes under our hands
+    except OSError as error:
         raise SessionError(f"{path}: cannot be salvaged and is left as it was ({error})") from error
 
 
@@ -190,8 +189,8 @@ def _salvage_segment(path: Path) -> Salvaged:
 
 def _salvage_alone(original: _Original) -> Salvaged:
     if original.delivered or (original.opening is not None and _is_the_only_telemetry(original)):
-        _write_copy(original)
-        return _settle(original, original.finished, replace=True)
+        with _copy_of(original) as copy:
+            return _settle(original, original.finished, copy)
     return _settle(original, None)
 
 
@@ -212,8 +211,8 @@ def _salvage_beside(part: _Original) -> Salvaged:
     if ours <= theirs:
         return _settle(part, part.finished)
     if theirs < ours:
-        _write_copy(part)
-        return _settle(part, part.finished, replace=True)
+        with _copy_of(part) as copy:
+            return _settle(part, part.finished, copy)
     missing = (ours - theirs).total()
     kept = _keep(part)
     reason = f"holds {missing} messages that {part.finished.name} does not hold, and lacks some of that"
@@ -231,27 +230,34 @@ def _digests(original: _Original) -> Counter[bytes]:
     return digests
 
 
-def _write_copy(original: _Original) -> None:
-    """All that can be delivered, finished and on the disk as NNNN.mcap.tmp; removed again when the disk refuses."""
-    copy = _copy_path(original)
+@contextmanager
+def _copy_of(original: _Original) -> Generator[Path]:
+    """All that can be delivered, finished and on the disk as NNNN.mcap.tmp; it is locked until the block ends, and
+    removed again when the disk refuses."""
+    copy = original.finished.with_name(original.finished.name.replace(FINISHED, TEMPORARY))
     with suppress(OSError):
         os.truncate(original.path, original.source.size)  # gives back what a dead recorder had reserved behind its end
-    try:
-        with copy.open("xb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+    with _new_file(copy) as file:
+        try:
             _write(file, original)
             file.flush()
             os.fsync(file.fileno())
-    except FileExistsError:
-        raise
-    except BaseException:
-        with suppress(OSError):
-            copy.unlink()
-        raise
+            yield copy
+        except BaseException:
+            with suppress(OSError):
+                copy.unlink()
+            raise
 
 
-def _copy_path(original: _Original) -> Path:
-    return original.finished.with_name(original.finished.name.replace(FINISHED, TEMPORARY))
+def _new_file(path: Path) -> BinaryIO:
+    """A file that was not there, locked. Another salvage may take it for left over until it is: then there is another
+    one; FileExistsError when that is somebody else's."""
+    while True:
+        file = path.open("xb")
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if os.fstat(file.fileno()).st_nlink:
+            return file
+        file.close()
 
 
 def _write(file: BinaryIO, original: _Original) -> None:
@@ -325,13 +331,13 @@ def _reason(original: _Original) -> str:
     return "; ".join(reasons)
 
 
-def _settle(original: _Original, path: Path | None, replace: bool = False) -> Salvaged:
-    """Put the copy in its place (`replace`) and the original out of the way. Each step leaves a state from which a
-    salvage goes on."""
+def _settle(original: _Original, path: Path | None, copy: Path | None = None) -> Salvaged:
+    """Put the copy, if there is one, in its place and the original out of the way. Each step leaves a state from
+    which a salvage goes on."""
     folder = original.path.parent
     kept = None if original.is_all_there else _keep(original)
-    if replace:
-        os.replace(_copy_path(original), original.finished)
+    if copy is not None:
+        os.replace(copy, original.finished)
         sync_folder(folder)
     if original.path != path:
         original.path.unlink()

@@ -9,6 +9,7 @@ Memory is flat: one record at a time. Only OSError is raised, when the disk does
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections import Counter
@@ -128,8 +129,12 @@ def survey(source: Source, to_first_chunk: bool = False) -> Survey:
 
 
 def stored_messages(source: Source, place: ChunkPlace) -> Iterator[StoredMessage]:
-    """The messages of a sound chunk in their order; one of DAMAGE when it is not sound any more."""
-    for opcode, record in records_of(uncompressed(memoryview(source.read(*place)))):
+    """The messages of a sound chunk in their order; OSError when the disk does not give the same bytes again."""
+    try:
+        chunk = uncompressed(memoryview(source.read(*place)))
+    except DAMAGE as error:
+        raise OSError(errno.EIO, f"{os.strerror(errno.EIO)}: it reads differently each time") from error
+    for opcode, record in records_of(chunk):
         if opcode == Opcode.MESSAGE:
             channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(record)
             yield StoredMessage(channel, sequence, log_time_ns, publish_time_ns, bytes(record[MESSAGE.size :]))
