@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.interface import ConfigError
 from experiments.steps import (
     Capture,
+    CheckHome,
     MoveTo,
     PlannedStep,
     SetTemperature,
+    Soak,
     StartChamber,
     Step,
-    estimate_s,
     frames_of,
     kind_of,
     parameters_of,
 )
 from stand.config import StandConfig
+from stand.durations import Situation, axis_of, expect
+from stand.learned import Learned
+from stand.thermal_model import ChamberModel
 
 # Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
 # with its share of the index, committed every second.
@@ -26,17 +30,27 @@ _BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0, "roi": 0.074}
 _TELEMETRY_BYTES_PER_MESSAGE = 116.0
 _SENSOR_PX = (2448, 2048)
 
+_LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
 _LONGEST_S = 366 * 86400.0  # a longer plan is a slip of the keyboard, and its end soon beyond any calendar
 
 
 @dataclass(frozen=True, slots=True)
 class PricedStep:
-    """A step with its expected duration (s), frames and recorded bytes."""
+    """A step with its expected duration (s), frames and recorded bytes.
+
+    work, stated_s: what of the duration follows from the step, the rest being usual for this kind of work.
+    in_band_after_s: of a soak, when the chamber is expected at its set-point, s after the soak begins; None when it is
+    there already. warning: why a soak is too short, "" when it is not.
+    """
 
     planned: PlannedStep
     duration_s: float
     frames: int
     size_bytes: float
+    work: str
+    stated_s: float
+    in_band_after_s: float | None = None
+    warning: str = ""
 
     def as_json(self) -> dict[str, object]:
         """One entry of `stand plan --json`."""
@@ -48,30 +62,84 @@ class PricedStep:
             "duration_s": self.duration_s,
             "frames": self.frames,
             "bytes": round(self.size_bytes),
+            "in_band_after_s": self.in_band_after_s,
+            "warning": self.warning,
         }
 
 
-def price(plan: Iterable[PlannedStep], config: StandConfig) -> tuple[PricedStep, ...]:
+@dataclass(frozen=True, slots=True)
+class _Approach:
+    """The chamber on its way between two set-points, `age_s` after the step from one to the other."""
+
+    from_degC: float
+    to_degC: float
+    age_s: float
+
+    def after(self, step: Step, duration_s: float) -> _Approach:
+        """When the step is done; a new set-point is taken to find the air at the old one."""
+        if isinstance(step, StartChamber | SetTemperature):
+            return _Approach(self.to_degC, step.chamber_degC, 0.0)
+        return replace(self, age_s=self.age_s + duration_s)
+
+
+def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | None = None) -> tuple[PricedStep, ...]:
     """Every step priced; ConfigError naming the first step that goes outside the stand's limits, or saying that
     the whole would take more than a year."""
-    width_px = config.camera.width_px or _SENSOR_PX[0]
-    height_px = config.camera.height_px or _SENSOR_PX[1]
-    frame_px = width_px * height_px
-    polled = (config.regulator, config.relays, config.thermometers, config.flap, config.camera, *config.axes.values())
-    messages_per_s = sum(1.0 / device.poll_s for device in polled)
+    learned = learned or Learned()
+    frame_px = (config.camera.width_px or _SENSOR_PX[0]) * (config.camera.height_px or _SENSOR_PX[1])
+    telemetry_bytes_per_s = _messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
+    found, approach = Situation(), _Approach(_LABORATORY_degC, _LABORATORY_degC, 0.0)
     priced: list[PricedStep] = []
     for planned in plan:
         _check(planned, config)
-        duration_s, frames = estimate_s(planned.step, config.camera.boot_s), frames_of(planned.step)
-        size_bytes = (
-            frame_px * _image_bytes_per_px(planned.step, config)
-            + duration_s * messages_per_s * _TELEMETRY_BYTES_PER_MESSAGE
+        step = planned.step
+        expected = expect(step, found, config, learned.overheads_s)
+        duration_s = expected.duration_s
+        size_bytes = frame_px * _image_bytes_per_px(step, config) + duration_s * telemetry_bytes_per_s
+        in_band_after_s, warning = _arrival(step, approach, learned.chamber)
+        priced.append(
+            PricedStep(
+                planned,
+                duration_s,
+                frames_of(step),
+                size_bytes,
+                expected.work,
+                expected.stated_s,
+                in_band_after_s,
+                warning,
+            )
         )
-        priced.append(PricedStep(planned, duration_s, frames, size_bytes))
+        found, approach = found.after(step), approach.after(step, duration_s)
     total_s = sum(step.duration_s for step in priced)
     if total_s > _LONGEST_S:
         raise ConfigError(f"the plan takes {total_s / 86400:.0f} days; more than a year is refused")
     return tuple(priced)
+
+
+def _arrival(step: Step, approach: _Approach, chamber: ChamberModel) -> tuple[float | None, str]:
+    """Of a soak: s until the chamber is in its band (None: it is), and a warning when the camera cannot follow."""
+    arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s
+    settled_s = chamber.settled_s(approach.from_degC, approach.to_degC) - approach.age_s
+    if not isinstance(step, Soak):
+        return None, ""
+    warning = ""
+    if step.duration_s < settled_s:
+        spare_s = step.duration_s - arrives_s
+        warning = (
+            f"the dwell at {approach.to_degC:g} degC ends {_minutes(abs(spare_s))} "
+            f"{'before' if spare_s < 0 else 'after'} the chamber arrives; "
+            f"the camera needs {_minutes(settled_s - arrives_s)} to follow"
+        )
+    return (arrives_s if arrives_s > 0.0 else None), warning
+
+
+def _minutes(duration_s: float) -> str:
+    return f"{duration_s / 60:.0f} min"
+
+
+def _messages_per_s(config: StandConfig) -> float:
+    polled = (config.regulator, config.relays, config.thermometers, config.flap, config.camera, *config.axes.values())
+    return sum(1.0 / device.poll_s for device in polled)
 
 
 def _image_bytes_per_px(step: Step, config: StandConfig) -> float:
@@ -90,11 +158,12 @@ def _check(planned: PlannedStep, config: StandConfig) -> None:
         low, high = config.limits.chamber_degC
         if not low <= step.chamber_degC <= high:
             raise ConfigError(f"{where}: {step.chamber_degC} degC is outside limits.chamber_degC {low}..{high}")
-    if isinstance(step, MoveTo):
-        axis = next((axis for name, axis in config.axes.items() if name == step.axis), None)
-        if axis is None:
-            raise ConfigError(f"{where}: this stand has no axis {step.axis!r}, only {', '.join(config.axes) or 'none'}")
-        if not axis.limits[0] <= step.position <= axis.limits[1]:
+    if isinstance(step, MoveTo | CheckHome):
+        try:
+            axis = axis_of(config, step.axis)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+        if isinstance(step, MoveTo) and not axis.limits[0] <= step.position <= axis.limits[1]:
             raise ConfigError(
                 f"{where}: {step.position} {axis.unit} is outside the limits {axis.limits} of {step.axis}"
             )

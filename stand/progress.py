@@ -9,7 +9,8 @@ from datetime import timedelta
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from drivers.clock import NS_PER_S, WallClock
 
@@ -43,7 +44,7 @@ def _bar(title: str, total: float) -> Generator[Report]:
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
         TextColumn("left"),
-        TimeRemainingColumn(),
+        _WallTimeLeft(),
         TextColumn("{task.fields[now]}"),
     )
     with Progress(*columns, console=Console(stderr=True), transient=False) as bar:
@@ -54,6 +55,20 @@ def _bar(title: str, total: float) -> Generator[Report]:
 
         yield report
         bar.update(task, completed=max(total, 1e-9), now="")
+
+
+class _WallTimeLeft(ProgressColumn):
+    """As the plain lines have it, from the pace of the whole; Rich's own looks back 30 s and is blank in a soak."""
+
+    def render(self, task: Task) -> Text:
+        return Text(_left_text(task.elapsed or 0.0, task.percentage / 100.0), style="progress.remaining")
+
+
+def _left_text(elapsed_s: float, share: float) -> str:
+    """Wall time left at the pace so far; unknown before anything is done."""
+    if share <= 0.0:
+        return "-:--:--"
+    return str(timedelta(seconds=round(max(0.0, elapsed_s * (1.0 / share - 1.0)))))
 
 
 class _PlainLines:
@@ -71,5 +86,5 @@ class _PlainLines:
         while self._next <= share + 1e-9:
             self._next += _PLAIN_STEP
         elapsed_s = (self._clock.now_ns() - self._start_ns) / NS_PER_S
-        left = timedelta(seconds=round(max(0.0, elapsed_s * (1.0 / share - 1.0))))
+        left = _left_text(elapsed_s, share)
         print(f"{self._title}: {min(share, 1.0):4.0%}  {left} left  {text}", file=sys.stderr, flush=True)  # noqa: T201

@@ -1,0 +1,126 @@
+"""How long each step takes: what the recipe and physics state, and what that kind of work usually takes beyond it.
+
+A step's duration depends on what came before (a stage that is there already, a flap that is closed), so whoever asks
+walks the plan with the Situation that each step finds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from drivers.interface import ConfigError
+from drivers.stage import PROFILES
+from experiments.steps import CheckHome, CloseFlap, MoveTo, OpenFlap, Step, estimate_s, kind_of
+from stand.config import AxisConfig, StandConfig
+
+# Until recorded nights have shown better, s: a flap's travel with its confirmation, homing from near the switch.
+_FLAP_TRAVEL_S = 3.0
+_FLAP_AT_REST_S = 0.2
+_HOMING_S = 15.0
+_MOVE_CONFIRMED_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """A stage's speeds (full steps/s) and accelerations (full steps/s2)."""
+
+    speed: float
+    acceleration: float
+    deceleration: float
+    homing_speed: float
+
+    def move_s(self, steps: float) -> float:
+        """From rest to rest over so many full steps, s: a trapezoid of speed, a triangle when it is short."""
+        way = abs(steps)
+        slow = 1.0 / self.acceleration + 1.0 / self.deceleration  # s to start and stop, per step/s
+        speed = min(self.speed, math.sqrt(2.0 * way / slow))
+        return way / speed + speed * slow / 2.0 if speed > 0.0 else 0.0
+
+
+# libximc, python-profiles/STANDA: Speed, Accel, Decel, FastHome. A controller set otherwise shows in the overhead.
+_PACES = {"8MT160-300": Pace(1000.0, 2000.0, 4000.0, 500.0), "8MR151": Pace(2000.0, 2000.0, 5000.0, 100.0)}
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a step finds: the flap, and where each axis stands (mm or deg; one that is missing is not homed)."""
+
+    flap_open: bool = False
+    positions: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    def after(self, step: Step) -> Situation:
+        """What the step leaves behind."""
+        match step:
+            case OpenFlap():
+                return replace(self, flap_open=True)
+            case CloseFlap():
+                return replace(self, flap_open=False)
+            case MoveTo(axis, position):
+                return replace(self, positions=MappingProxyType({**self.positions, axis: position}))
+            case _:
+                return self
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """`stated_s` follows from the step and its situation; `overhead_s` is what `work` of this kind takes beyond it."""
+
+    work: str
+    stated_s: float
+    overhead_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """Together, s."""
+        return max(0.0, self.stated_s + self.overhead_s)
+
+
+def expect(
+    step: Step, found: Situation, config: StandConfig, overheads_s: Mapping[str, float] = MappingProxyType({})
+) -> Expectation:
+    """What the step takes in the situation it finds; `overheads_s` was learned, by kind of work."""
+    usual = _usual(step, found, config)
+    return replace(usual, overhead_s=overheads_s.get(usual.work, usual.overhead_s))
+
+
+def axis_of(config: StandConfig, name: str) -> AxisConfig:
+    """The stand's axis of that name; ConfigError when it has none."""
+    axis = next((axis for known, axis in config.axes.items() if known == name), None)
+    if axis is None:
+        raise ConfigError(f"this stand has no axis {name!r}, only {', '.join(config.axes) or 'none'}")
+    return axis
+
+
+def _usual(step: Step, found: Situation, config: StandConfig) -> Expectation:
+    match step:
+        case OpenFlap() | CloseFlap():
+            travels = found.flap_open is not isinstance(step, OpenFlap)
+            work = "flap travel" if travels else "flap at rest"
+            return Expectation(work, 0.0, _FLAP_TRAVEL_S if travels else _FLAP_AT_REST_S)
+        case MoveTo(axis, position):
+            stage = axis_of(config, axis)
+            if axis not in found.positions:
+                return Expectation(f"home and move {axis}", _move_s(stage, 0.0, position), _HOMING_S)
+            return Expectation(f"move {axis}", _move_s(stage, found.positions[axis], position), _MOVE_CONFIRMED_S)
+        case CheckHome(axis):
+            stage, position = axis_of(config, axis), found.positions.get(axis, 0.0)
+            return Expectation(
+                f"check home {axis}", _to_home_s(stage, position) + _move_s(stage, 0.0, position), _HOMING_S
+            )
+        case _:
+            return Expectation(kind_of(step), estimate_s(step, config.camera.boot_s), 0.0)
+
+
+def _move_s(axis: AxisConfig, begin: float, end: float) -> float:
+    """As the driver moves: when not from below, past the end first, then up to it."""
+    profile, pace = PROFILES[axis.profile], _PACES[axis.profile]
+    below = end - profile.overshoot
+    ways = (begin - below, profile.overshoot) if begin > below else (end - begin,)
+    return sum(pace.move_s(way / profile.unit_per_step) for way in ways)
+
+
+def _to_home_s(axis: AxisConfig, position: float) -> float:
+    return abs(position) / PROFILES[axis.profile].unit_per_step / _PACES[axis.profile].homing_speed

@@ -1,0 +1,82 @@
+"""The time left of a running plan, from its estimate and from what its steps have taken so far."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict, deque
+from collections.abc import Collection, Sequence
+from statistics import median
+
+from drivers.clock import NS_PER_S
+from stand.estimate import PricedStep
+from stand.hub import StepMark, StepState
+
+_REMEMBERED = 9  # measurements of a kind of work: the last ones count
+
+
+class Eta:
+    """Follows a run by its step marks and says how long it will still take on the stand's clock.
+
+    What work of a kind takes beyond what is stated is believed as estimated until the run has done such work once,
+    from then on as measured (the median). `done`: indices of steps that an earlier part of the run has done; steps
+    before the running one are never waited for.
+    """
+
+    def __init__(self, steps: Sequence[PricedStep], done: Collection[int] = ()) -> None:
+        self._steps = steps
+        self._waiting = {step.planned.index: step for step in steps if step.planned.index not in done}
+        self._first = min(self._waiting, default=0)
+        self._stated_s = sum(step.stated_s for step in self._waiting.values())
+        self._count = Counter(step.work for step in self._waiting.values())
+        self._overhead_s = {step.work: step.duration_s - step.stated_s for step in steps}
+        self._measured_s: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_REMEMBERED))
+        self._running: PricedStep | None = None
+        self._begun_ns = 0
+        self._held_since_ns: int | None = None
+        self._held_ns = 0  # of the running step
+
+    def mark(self, mark: StepMark) -> None:
+        """A step began or ended."""
+        if not 0 <= mark.index < len(self._steps):
+            return
+        if mark.state is StepState.STARTED:
+            self._begin(self._steps[mark.index], mark.time_ns)
+            return
+        running, self._running = self._running, None
+        if running is not None and mark.state is StepState.DONE:
+            measured_s = self._measured_s[running.work]
+            measured_s.append(self._progress_s(mark.time_ns) - running.stated_s)
+            self._overhead_s[running.work] = median(measured_s)
+
+    def hold(self, time_ns: int) -> None:
+        """The run is paused: the running step makes no progress."""
+        if self._held_since_ns is None:
+            self._held_since_ns = time_ns
+
+    def release(self, time_ns: int) -> None:
+        """The run goes on."""
+        if self._held_since_ns is not None:
+            self._held_ns += time_ns - self._held_since_ns
+            self._held_since_ns = None
+
+    def left_s(self, now_ns: int) -> float:
+        """From `now_ns` until the plan is done, s; a pause that is under way is taken to end now."""
+        left_s = self._stated_s + sum(count * self._overhead_s[work] for work, count in self._count.items())
+        if self._running is not None:
+            expected_s = self._running.stated_s + self._overhead_s[self._running.work]
+            left_s += max(0.0, expected_s - self._progress_s(now_ns))
+        return max(0.0, left_s)
+
+    def _begin(self, step: PricedStep, time_ns: int) -> None:
+        for index in range(self._first, step.planned.index + 1):
+            waiting = self._waiting.pop(index, None)
+            if waiting is not None:
+                self._stated_s -= waiting.stated_s
+                self._count[waiting.work] -= 1
+        self._first = max(self._first, step.planned.index + 1)
+        self._running, self._begun_ns, self._held_ns = step, time_ns, 0
+        if self._held_since_ns is not None:
+            self._held_since_ns = time_ns
+
+    def _progress_s(self, now_ns: int) -> float:
+        held_ns = self._held_ns + (0 if self._held_since_ns is None else now_ns - self._held_since_ns)
+        return (now_ns - self._begun_ns - held_ns) / NS_PER_S

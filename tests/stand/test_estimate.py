@@ -1,0 +1,238 @@
+"""What a plan is expected to take, and how that follows what steps really take."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import NS_PER_S, seconds_ns
+from drivers.interface import ConfigError
+from experiments.steps import (
+    Capture,
+    CheckHome,
+    CloseFlap,
+    MoveTo,
+    OpenFlap,
+    PlannedStep,
+    PowerCamera,
+    Role,
+    SetTemperature,
+    Soak,
+    StartChamber,
+    Step,
+    kind_of,
+    number_steps,
+    parameters_of,
+)
+from stand.config import StandConfig, load_config, packaged
+from stand.durations import Pace, Situation, expect
+from stand.estimate import PricedStep, price
+from stand.eta import Eta
+from stand.follow import Follow
+from stand.hub import Batch, Event, StepMark, StepState
+from stand.learned import LEARNED_FILE, Learned, learn, load_learned
+from stand.recording.session import Session
+from stand.thermal_model import ChamberModel, Response
+from tests.recording.recorded import record
+
+BEGIN_NS = 1_767_290_400 * NS_PER_S
+RESPONSE = Response(dead_s=0.0, rate_K_per_s=0.05, time_constant_s=100.0)
+CHAMBER = ChamberModel(heating=RESPONSE, cooling=RESPONSE, camera_time_constant_s=900.0)
+CAPTURE = Capture(3, 0.5, 0.1, Role.FIT, 31.0)
+
+
+@pytest.fixture(scope="module")
+def config() -> StandConfig:
+    return load_config(packaged("", "simulated"))
+
+
+def planned(*steps: Step) -> list[PlannedStep]:
+    return list(number_steps(steps))
+
+
+def marks(plan: Iterable[PlannedStep], durations_s: Iterable[float]) -> list[StepMark]:
+    """What a scheduler publishes when the steps take so long."""
+    found: list[StepMark] = []
+    now_ns = BEGIN_NS
+    for item, duration_s in zip(plan, durations_s, strict=True):
+        for state in (StepState.STARTED, StepState.DONE):
+            parameters = parameters_of(item.step)
+            found.append(StepMark(now_ns, item.step_id, item.index, kind_of(item.step), state, parameters))
+            now_ns += seconds_ns(duration_s) if state is StepState.STARTED else 0
+    return found
+
+
+@pytest.mark.parametrize(
+    ("steps", "duration_s"),
+    [
+        (0.0, 0.0),
+        (200.0, 0.5477),  # a triangle: 0.5 v (t1 + t2) with v = 730 steps/s
+        (375.0, 0.75),  # just reaches 1000 steps/s
+        (10_375.0, 10.75),
+        (-10_375.0, 10.75),
+    ],
+)
+def test_a_move_is_a_trapezoid_of_speed(steps: float, duration_s: float):
+    assert Pace(1000.0, 2000.0, 4000.0, 500.0).move_s(steps) == pytest.approx(duration_s, abs=1e-3)
+
+
+def test_a_move_is_priced_by_the_way_from_where_the_axis_stands(config: StandConfig):
+    plan = planned(MoveTo("linear", 0.0), MoveTo("linear", 100.0), MoveTo("linear", 50.0), CheckHome("linear"))
+    homing, up, down, check = (step.duration_s for step in price(plan, config))
+    assert homing > 10.0
+    assert up == pytest.approx(100 / 2.5, abs=1.0)
+    assert down == pytest.approx(50.5 / 2.5 + 0.6, abs=1.0)  # past it, then up
+    assert check == pytest.approx(15 + 50 / 1.25 + 50 / 2.5, abs=1.0)
+
+
+def test_a_flap_that_is_closed_already_takes_no_travel(config: StandConfig):
+    plan = planned(CloseFlap(), OpenFlap(), OpenFlap(), CloseFlap())
+    works = [step.work for step in price(plan, config)]
+    assert works == ["flap at rest", "flap travel", "flap at rest", "flap travel"]
+
+
+def test_what_was_learned_replaces_what_is_usual(config: StandConfig):
+    learned = Learned(overheads_s={"flap travel": 1.1, "PowerCamera": 2.5, "Capture": -5.0})
+    plan = planned(OpenFlap(), PowerCamera(on=True), CAPTURE, Soak(60.0))
+    durations_s = [step.duration_s for step in price(plan, config, learned)]
+    assert durations_s == pytest.approx([1.1, config.camera.boot_s + 2.5, 0.0, 60.0])
+
+
+def test_a_soak_says_when_the_chamber_arrives_and_whether_the_camera_can_follow(config: StandConfig):
+    plan = planned(StartChamber(24.0), Soak(600.0), SetTemperature(52.0), Soak(900.0), Soak(3000.0))
+    steps = price(plan, config, Learned(chamber=CHAMBER))
+    first, short, rest = (step for step in steps if kind_of(step.planned.step) == "Soak")
+    assert (first.in_band_after_s, first.warning) == (None, "")
+    arrives_s = CHAMBER.arrival_s(24.0, 52.0)
+    assert short.in_band_after_s == pytest.approx(arrives_s)
+    assert short.warning == (
+        "the dwell at 52 degC ends 3 min after the chamber arrives; the camera needs 30 min to follow"
+    )
+    assert (rest.in_band_after_s, rest.warning) == (None, "")  # it goes on with what the one before has left
+    assert json.loads(json.dumps(short.as_json()))["in_band_after_s"] == pytest.approx(arrives_s)
+
+
+def test_a_dwell_that_ends_before_the_chamber_arrives_says_so(config: StandConfig):
+    steps = price(planned(SetTemperature(10.0), Soak(300.0)), config, Learned(chamber=CHAMBER))
+    assert "the dwell at 10 degC ends 2 min before the chamber arrives" in steps[1].warning
+
+
+@pytest.mark.parametrize("step", [MoveTo("vertical", 1.0), CheckHome("vertical")])
+def test_an_axis_that_the_stand_lacks_is_refused(config: StandConfig, step: Step):
+    with pytest.raises(ConfigError, match=r"step 0 .*no axis 'vertical', only linear, rotary"):
+        price(planned(step), config)
+
+
+def eta_errors(steps: tuple[PricedStep, ...], plan: list[PlannedStep], durations_s: list[float]) -> list[float]:
+    """Time left less the truth, s, at each mark."""
+    eta, errors = Eta(steps), list[float]()
+    found = marks(plan, durations_s)
+    for mark in found:
+        eta.mark(mark)
+        errors.append(eta.left_s(mark.time_ns) - (found[-1].time_ns - mark.time_ns) / NS_PER_S)
+    return errors
+
+
+def test_the_time_left_is_corrected_by_what_steps_have_taken(config: StandConfig):
+    """The flap takes 1.1 s instead of 3, a capture 10 s more than is stated: known once each was done."""
+    cycle: tuple[Step, ...] = (SetTemperature(31.0), Soak(600.0), OpenFlap(), CAPTURE, CloseFlap())
+    plan = planned(*cycle * 4)
+    errors = eta_errors(price(plan, config), plan, [0.0, 600.0, 1.1, 11.1, 1.1] * 4)
+    assert errors[0] == pytest.approx(8 * 1.9 - 4 * 10.0)
+    assert errors[9:] == pytest.approx([0.0] * len(errors[9:]), abs=1e-6)
+
+
+def test_within_a_step_the_time_left_falls_with_the_clock_but_not_in_a_pause(config: StandConfig):
+    plan = planned(Soak(600.0), Soak(300.0))
+    eta = Eta(price(plan, config))
+    assert eta.left_s(BEGIN_NS) == 900.0
+    eta.mark(marks(plan, [600.0, 300.0])[0])
+    assert eta.left_s(BEGIN_NS + 100 * NS_PER_S) == 800.0
+    eta.hold(BEGIN_NS + 200 * NS_PER_S)
+    assert eta.left_s(BEGIN_NS + 5000 * NS_PER_S) == 700.0
+    eta.release(BEGIN_NS + 5000 * NS_PER_S)
+    assert eta.left_s(BEGIN_NS + 5100 * NS_PER_S) == 600.0
+    assert eta.left_s(BEGIN_NS + 9000 * NS_PER_S) == 300.0  # late: it may end any moment
+
+
+def test_steps_that_an_earlier_part_has_done_are_not_waited_for(config: StandConfig):
+    plan = planned(StartChamber(24.0), Soak(600.0), SetTemperature(31.0), Soak(300.0))
+    steps = price(plan, config)
+    eta = Eta(steps, done={1})
+    assert eta.left_s(BEGIN_NS) == 300.0
+    again, *_ = marks(plan[:1], [0.0])  # set-up is brought about again
+    eta.mark(again)
+    assert eta.left_s(BEGIN_NS) == 300.0
+    late = Eta(steps)
+    late.mark(marks(plan[3:], [300.0])[0])
+    assert late.left_s(BEGIN_NS) == 300.0
+
+
+def test_following_a_run_reports_the_share_done_the_time_left_and_what_is_wrong(config: StandConfig):
+    plan = planned(Soak(600.0), Soak(300.0))
+    reports: list[tuple[float, str]] = []
+    lines: list[str] = []
+    follow = Follow(price(plan, config), lambda done, text: reports.append((done, text)), lines.append)
+    follow(Event(BEGIN_NS, "info", "run.start", "recipe x"))
+    follow(Batch("regulator", BEGIN_NS, ()))  # nothing has begun
+    assert reports == []
+    for mark in marks(plan, [600.0, 300.0]):
+        follow(mark)
+    assert [done for done, _ in reports] == pytest.approx([0.0, 600.0, 600.0, 900.0])
+    assert reports[2][1] == "until 2026-01-01 18:15 UTC (0:05:00 of stand time); 2/2 Soak duration_s=300.0"
+    for second in range(3):
+        follow(Batch("regulator", BEGIN_NS + (900 + second) * NS_PER_S, ()))
+    assert len(reports) == 6
+    follow(Event(BEGIN_NS, "warning", "camera_lost", "no answer"))
+    assert lines == ["warning: 18:00:00 UTC no answer"]
+
+
+async def test_runs_teach_what_work_takes_and_the_median_counts(tmp_path: Path, config: StandConfig):
+    plan = planned(MoveTo("linear", 0.0), CloseFlap(), OpenFlap(), Soak(5.0), CAPTURE, CloseFlap())
+    for night, travel_s in enumerate((1.0, 1.2, 40.0)):
+        await recorded(tmp_path / f"night-{night}", config.name, plan, [8.0, 0.2, travel_s, 5.0, 1.5, travel_s])
+    await recorded(tmp_path / "night-other", "another-stand", plan, [9.0] * 6)
+    (tmp_path / "night-none").mkdir()
+    learned = learn(tmp_path, config)
+    assert learned.nights == ("night-0", "night-1", "night-2")
+    assert learned.overheads_s["flap travel"] == pytest.approx(1.2, abs=1e-3)
+    assert learned.overheads_s["flap at rest"] == pytest.approx(0.2, abs=1e-3)
+    assert learned.overheads_s["Capture"] == pytest.approx(0.4, abs=1e-3)
+    assert "home and move linear" in learned.overheads_s
+    assert load_learned(tmp_path) == learned
+    assert "3 runs, the last night-2" in str(learned)
+    assert [path.name for path in tmp_path.glob(f"{LEARNED_FILE}*")] == [LEARNED_FILE]
+
+
+async def recorded(directory: Path, stand: str, plan: list[PlannedStep], durations_s: list[float]) -> Session:
+    """A session of the stand of that name in which the steps took so long."""
+    waiting = marks(plan, durations_s)
+
+    def items(time_ns: int, index: int):
+        yield from (mark for mark in waiting if index <= (mark.time_ns - BEGIN_NS) / NS_PER_S < index + 1)
+
+    seconds = int(sum(durations_s)) + 2
+    await record(
+        directory, seconds, items, segment_s=1e6, period_ns=NS_PER_S, attachments={"config.yaml": f"name: {stand}\n"}
+    )
+    return Session.open(directory)
+
+
+@pytest.mark.parametrize("content", ["", "{", '{"overheads_s": {"x": "soon"}}', '{"chamber": {"unknown": 1}}'])
+def test_a_file_that_cannot_be_understood_is_no_reason_not_to_run(tmp_path: Path, content: str):
+    assert load_learned(tmp_path) == Learned()
+    (tmp_path / LEARNED_FILE).write_text(content)
+    assert load_learned(tmp_path) == Learned()
+
+
+def test_where_nothing_is_recorded_nothing_is_learned(tmp_path: Path, config: StandConfig):
+    assert learn(tmp_path, config) == Learned()
+    assert learn(tmp_path / "missing", config) == Learned()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_situation_is_what_the_steps_before_have_left(config: StandConfig):
+    found = Situation().after(MoveTo("linear", 3.0)).after(OpenFlap())
+    assert found == Situation(flap_open=True, positions={"linear": 3.0})
+    assert expect(OpenFlap(), found, config).work == "flap at rest"
