@@ -1,0 +1,76 @@
+"""The time left that a run shows, against the truth, over the wire in virtual time; and what a run teaches the next."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import NS_PER_S
+from stand.config import packaged
+from stand.estimate import price
+from stand.follow import Follow
+from stand.hub import Batch, Hub, Item, StepMark, StepState
+from stand.learned import learn
+from stand.recording.session import Session
+from stand.run import run_virtual
+from stand.session_setup import Order
+from tests.system.conftest import SHORT_RECIPE, require_aravis
+
+pytestmark = pytest.mark.usefixtures("_aravis")
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+async def followed(order: Order, out: Path) -> tuple[Path, list[tuple[int, float]]]:
+    """The session, and (instant, time left in s as it was shown then) each time something was published after the
+    first set-point was reached, that is after the first dwell at the reference."""
+    follow = Follow(price(order.recipe.plan(), order.config), lambda done, text: None, lambda line: None)
+    left: list[tuple[int, float]] = []
+
+    def watch(hub: Hub) -> None:
+        reached: list[Item] = []
+
+        def look(item: Item) -> None:
+            if isinstance(item, StepMark) and item.kind == "Soak" and item.state is StepState.DONE:
+                reached.append(item)
+            if reached and isinstance(item, Batch | StepMark):
+                left.append((item.time_ns, follow.eta.left_s(item.time_ns)))
+
+        hub.subscribe(follow)
+        hub.subscribe(look)
+
+    return await run_virtual(order, out, None, watch), left
+
+
+def worst_share(left: list[tuple[int, float]], session: Path) -> float:
+    """The largest error of the time left, as a share of the true one."""
+    end_ns = Session.open(session).steps()[-1].time_ns
+    truth = [(left_s, (end_ns - time_ns) / NS_PER_S) for time_ns, left_s in left if time_ns < end_ns]
+    return max(abs(left_s - true_s) / true_s for left_s, true_s in truth)
+
+
+async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order(SHORT_RECIPE.replace("dwell_s: 600", "dwell_s: 1500"))  # the first cooling takes more than 600 s
+    session, left = await followed(ordered, tmp_path)
+    assert len(left) > 100
+    assert worst_share(left, session) < 0.05
+
+    learned = learn(tmp_path, ordered.config)
+    steps = Session.open(session).steps()
+    truth_s = (steps[-1].time_ns - steps[0].time_ns) / NS_PER_S
+    plan = price(ordered.recipe.plan(), ordered.config, learned)
+    assert sum(step.duration_s for step in plan) == pytest.approx(truth_s, abs=0.5)
+    assert (learned.chamber.heating_ramps, learned.chamber.cooling_ramps) == (2, 1)
+    arrivals_s = [step.in_band_after_s for step in plan if step.planned.index > 6 and step.in_band_after_s is not None]
+    assert all(100 < arrival_s < 1500 for arrival_s in arrivals_s)
+    assert len(arrivals_s) == 3
+
+
+@pytest.mark.nightly
+async def test_the_time_left_is_true_over_the_whole_demo_night(tmp_path: Path, order: Callable[..., Order]):
+    session, left = await followed(order(packaged("recipes", "demo").read_text()), tmp_path)
+    assert len(left) > 10_000
+    assert worst_share(left, session) < 0.05
