@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.clock import NS_PER_S, QUIET_TURNS, FollowedClock, VirtualClock, WallClock, seconds_ns
-from drivers.lane import Lane
+from drivers.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
 
 
 async def driven(clock: VirtualClock, *work: object) -> None:
@@ -30,7 +29,6 @@ async def test_virtual_time_jumps_to_each_sleeper_in_order():
 
 async def test_virtual_time_stands_still_while_it_is_held():
     clock = VirtualClock(0)
-    lane = Lane("test", clock)
     release = asyncio.get_running_loop().create_future()
     times: list[int] = []
 
@@ -49,13 +47,12 @@ async def test_virtual_time_stands_still_while_it_is_held():
         release.set_result(None)
 
     await driven(clock, holder(), sleeper(), releaser())
-    lane.close()
     assert times == [0, NS_PER_S]
 
 
 async def test_a_chain_of_hand_overs_comes_to_rest_before_time_moves():
     clock = VirtualClock(0)
-    queues: list[asyncio.Queue[int]] = [asyncio.Queue() for _ in range(5)]
+    queues: list[asyncio.Queue[int]] = [asyncio.Queue() for _ in range(51)]
     arrived: list[int] = []
 
     async def relay(source: asyncio.Queue[int], target: asyncio.Queue[int]) -> None:
@@ -66,25 +63,20 @@ async def test_a_chain_of_hand_overs_comes_to_rest_before_time_moves():
         await queues[0].put(1)
 
     async def end() -> None:
-        await queues[4].get()
+        await queues[50].get()
         arrived.append(clock.now_ns())
 
-    async def other() -> None:
-        await clock.sleep_until(2 * NS_PER_S)
-
-    await driven(clock, start(), other(), end(), *(relay(queues[k], queues[k + 1]) for k in range(4)))
+    await driven(clock, start(), clock.sleep_until(2 * NS_PER_S), end(), *map(relay, queues, queues[1:]))
     assert arrived == [NS_PER_S]
 
 
-async def test_holds_that_come_and_go_between_two_looks_keep_time_still():
+async def test_time_stands_still_as_long_as_the_loop_has_anything_to_run():
     clock = VirtualClock(0)
     ended: list[int] = []
 
     async def busy() -> None:
         await clock.sleep_until(NS_PER_S)
-        for _ in range(4 * QUIET_TURNS):
-            with clock.hold():
-                pass
+        for _ in range(100):
             await asyncio.sleep(0)
         ended.append(clock.now_ns())
 
@@ -131,17 +123,6 @@ def test_sleepers_with_any_deadlines_wake_sorted_and_ties_keep_their_order(deadl
         return woken
 
     assert asyncio.run(run()) == sorted((deadline, number) for number, deadline in enumerate(deadlines))
-
-
-async def test_a_lane_runs_calls_in_order_and_passes_exceptions_on():
-    clock = VirtualClock(0)
-    lane = Lane("test", clock)
-    order: list[int] = []
-    await asyncio.gather(*(lane.call(order.append, number) for number in range(10)))
-    assert order == list(range(10))
-    with pytest.raises(ZeroDivisionError):
-        await lane.call(lambda: 1 // 0)
-    lane.close()
 
 
 async def test_the_wall_clock_never_goes_back_and_sleeps_to_a_deadline():
