@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import select
 import socket
 import termios
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from drivers.interface import ConfigError, Unreachable
 
 _CONNECT_S = 1.0
 _WRITE_S = 1.0  # a device that takes no bytes must not hold the caller
+_READ_SIZE = 4096
 
 
 class ByteLink(Protocol):
@@ -60,7 +62,7 @@ class _SerialLink:
         self._path = path
         try:
             self._port = serial.Serial(
-                path, settings.baud, stopbits=settings.stopbits, write_timeout=_WRITE_S, exclusive=True
+                path, settings.baud, stopbits=settings.stopbits, timeout=0, write_timeout=_WRITE_S, exclusive=True
             )
         except (OSError, termios.error) as error:
             raise Unreachable(device, f"cannot open {path}: {_why_closed(error)}") from error
@@ -73,9 +75,9 @@ class _SerialLink:
 
     def read(self, timeout_s: float) -> bytes:
         try:
-            self._port.timeout = timeout_s
-            first = self._port.read(1)
-            return first + self._port.read(self._port.in_waiting) if first else b""
+            if timeout_s > 0:  # waited for here, because pyserial sets the whole port anew for another time-out
+                select.select([self._port], [], [], timeout_s)
+            return self._port.read(_READ_SIZE)
         except (OSError, termios.error) as error:
             raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
 
@@ -112,7 +114,7 @@ class _TcpLink:
     def read(self, timeout_s: float) -> bytes:
         try:
             self._socket.settimeout(timeout_s)
-            data = self._socket.recv(4096)
+            data = self._socket.recv(_READ_SIZE)
         except (TimeoutError, BlockingIOError):
             return b""
         except OSError as error:

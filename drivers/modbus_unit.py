@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Iterable
 
 from drivers.bus import Bus
 from drivers.interface import DeviceError, DeviceFault, Refused
-from drivers.registers import Command, RegisterMap, Snapshot, decode, decode_blocks, encode, plan_blocks
+from drivers.registers import Block, Command, RegisterMap, Snapshot, decode, decode_blocks, encode, plan_blocks
 
 WRITE_TRIES = 2
 CONFIRM_LOOKS = 3  # a status bit may lag its command by a scan of the unit
@@ -20,12 +20,16 @@ class ModbusUnit:
         self.map = register_map
         self._bus = bus
         self._unit = register_map.transport.unit
+        self._plans: dict[tuple[str, ...], tuple[Block, ...]] = {}  # of the polls, which ask for the same every time
 
     async def snapshot(self, names: Iterable[str]) -> Snapshot:
         """Read the named points, in as few requests as possible."""
+        wanted = tuple(names)
+        if wanted not in self._plans:
+            self._plans[wanted] = plan_blocks(self.map, wanted)
         replies = {
             block: await self._bus.read(self.name, self._unit, block.space, block.address, block.count)
-            for block in plan_blocks(self.map, names)
+            for block in self._plans[wanted]
         }
         return decode_blocks(self.map, replies)
 

@@ -270,12 +270,13 @@ def decode_blocks(register_map: RegisterMap, replies: Mapping[Block, list[int]])
 
 def decode(point: Point, words: list[int]) -> Sample:
     """Raw words (0..65535, in order of address) as a value in the point's unit."""
-    ordered = words if point.word_order == "high_first" else words[::-1]
-    raw = int.from_bytes(b"".join(word.to_bytes(2, "big") for word in ordered), "big")
+    raw = 0
+    for word in words if point.word_order == "high_first" else reversed(words):
+        raw = raw << 16 | word
     for fault in point.faults:
         if raw == fault.raw:
             return Sample(raw, math.nan, fault.code)
-    number = raw if point.type == "bit" else struct.unpack(FORMATS[point.type], raw.to_bytes(2 * point.words, "big"))[0]
+    number = raw if point.type == "bit" else struct.unpack(FORMATS[point.type], raw.to_bytes(2 * len(words), "big"))[0]
     value = number * point.scale + point.offset
     if not math.isfinite(value):
         return Sample(raw, math.nan, "not a number")

@@ -38,13 +38,20 @@ class Frame:
     damage: Damage = Damage.NONE
 
 
+def _crc_of_byte(crc: int) -> int:
+    for _ in range(8):
+        crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc
+
+
+_CRC_OF_BYTE = tuple(_crc_of_byte(byte) for byte in range(256))
+
+
 def crc16(payload: bytes) -> int:
     """CRC-16/MODBUS: start 0xFFFF, reflected polynomial 0xA001. Over the payload only, never the letters."""
     crc = 0xFFFF
     for byte in payload:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ (0xA001 if crc & 1 else 0)
+        crc = crc >> 8 ^ _CRC_OF_BYTE[(crc ^ byte) & 0xFF]
     return crc
 
 

@@ -98,6 +98,8 @@ class FakeThermometers:
         self._seed = seed
         self._sensors = {number: places[name] for name, number in channels.items()}
         self._drifted_K: dict[int, float] = {}
+        self._drawn_ns = 0
+        self._drawn: dict[int, float] = {}  # noise at that time by channel, in units of its standard deviation
         self._register_offsets = [0] * CHANNELS
         self._engineering = False
         self._fault_bits = [False] * CHANNELS
@@ -139,10 +141,17 @@ class FakeThermometers:
             return float("inf")
         if channel in self.shorted_channels:
             return float("-inf")
-        draw = random.Random(f"{self._seed} {channel} {self._plant.now_ns}")
-        noise_K = draw.gauss(0.0, NOISY_K if channel == self.noisy_channel else NOISE_K)
+        noise_K = self._noise(channel) * (NOISY_K if channel == self.noisy_channel else NOISE_K)
         wrong_K = self.offset_K.get(channel, 0.0) + self._drifted_K.get(channel, 0.0)
         return self._sensors[channel]() + noise_K + wrong_K + _signed(self._register_offsets[channel]) / 10
+
+    def _noise(self, channel: int) -> float:
+        """Drawn once in a step of the plant: the values and the fault bits of a poll ask for it alike."""
+        if self._drawn_ns != self._plant.now_ns:
+            self._drawn_ns, self._drawn = self._plant.now_ns, {}
+        if channel not in self._drawn:
+            self._drawn[channel] = random.Random(f"{self._seed} {channel} {self._drawn_ns}").gauss(0.0, 1.0)
+        return self._drawn[channel]
 
     def _read_bits(self, address: int, count: int) -> list[bool]:
         """FC 02: a channel's bit is set when it is over or under its range or its wire is open."""
