@@ -23,8 +23,10 @@ from stand.compressor import CompressorLimits
 from stand.config import CameraConfig, StandConfig, packaged
 from stand.guard import Guard
 from stand.hub import Hub
-from stand.interlocks import Fault, safety_rules
+from stand.interlocks import Fault
+from stand.notify import Notifier
 from stand.poller import Poller
+from stand.rules import Announcements, watches
 from stand.stand import Devices, Limits, Stand
 
 
@@ -52,21 +54,15 @@ class Assembly:
         ]
         return tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
 
-    def guard(self, stop: Callable[[Fault], None]) -> Guard:
-        """The guard with the configured limits; it calls `stop` on a fault. The camera's own temperature may be missing
-        (it is switched off before a warm-up), so it is limited but not required."""
-        limits = self.config.guard
-        rules = safety_rules(
-            {
-                "regulator.pv": limits.max_air_degC,
-                "thermometers.air": limits.max_air_degC,
-                "thermometers.granite_inside": limits.max_granite_degC,
-                "camera.temperature": limits.max_camera_degC,
-            },
-            ("regulator.pv", "thermometers.air", "thermometers.granite_inside"),
-            limits.stale_after_s,
+    def guard(self, stop: Callable[[Fault], None], hold: Callable[[Fault], None] | None = None) -> Guard:
+        """The guard with the configured rules; on a fault it calls `stop`, or `hold` where waiting is enough."""
+        limits, announced = self.config.guard, Announcements()
+        self.hub.subscribe(announced.receive)
+        notifier = Notifier(limits.notify, limits.notify_limit_s, self.clock)
+        rules = watches(self.config, announced)
+        return Guard(
+            self.stand, rules, self.hub, self.clock, limits.period_s, limits.heater_renew_s, stop, hold, notifier
         )
-        return Guard(self.stand, rules, self.hub, self.clock, limits.period_s, limits.heater_renew_s, stop)
 
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
@@ -94,7 +90,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         flap=_flap(config, clock),
         camera=Camera("camera", camera_settings(config.camera), clock),
     )
-    compressor = CompressorLimits(**config.compressor.model_dump())
+    compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
     limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor)
     return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock))
 

@@ -4,13 +4,22 @@ The regulator's cooling period (at most 99 s) is far shorter than a compressor's
 read as a demand. Once started, the compressor keeps running and the heater trims the temperature, as in commercial
 climate chambers: that holds the air steady, where cycling at full stroke would swing it by kelvins. It stops when the
 regulator heats hard against it.
+
+What it did last is kept in a small file, so that a daemon that restarts, or crashes again and again, spares it as one
+that goes on: `restored` and `keep`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import json
+import os
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drivers.clock import seconds_ns
+from stand.recording.sink import sync_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,3 +59,42 @@ def decide(
     if wanted and rested and len(starts_ns) < limits.max_starts_per_h:
         return CompressorState(running=True, since_ns=now_ns, starts_ns=(*starts_ns, now_ns))
     return replace(state, starts_ns=starts_ns)
+
+
+class _Kept(BaseModel):
+    """The file's content."""
+
+    model_config = ConfigDict(strict=True)
+
+    running: bool
+    since_ns: int
+    starts_ns: list[int]
+
+
+def restored(path: Path | None, now_ns: int) -> CompressorState:
+    """What `path` keeps, for a compressor that is off now. When it was switched off is unknown, and so taken for just
+    now, when the file is missing or damaged, ends with a running compressor, or tells of the future."""
+    unknown = CompressorState(running=False, since_ns=now_ns)
+    if path is None:
+        return unknown
+    try:
+        kept = _Kept.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError):
+        return unknown
+    starts_ns = tuple(start_ns for start_ns in kept.starts_ns if start_ns <= now_ns)
+    is_known = not kept.running and kept.since_ns <= now_ns
+    return CompressorState(False, kept.since_ns if is_known else now_ns, starts_ns)
+
+
+def keep(path: Path | None, state: CompressorState) -> None:
+    """Write `state` to `path`, whole or not at all; it blocks for the disk. Raises OSError."""
+    if path is None:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.part")
+    with part.open("w", encoding="utf-8") as file:
+        json.dump(asdict(state), file)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+    sync_folder(path.parent)

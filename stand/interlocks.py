@@ -1,14 +1,17 @@
-"""The guard's rules: pure functions of the latest readings and the time."""
+"""The guard's rules that need the latest readings only, what a rule is, and how long one must object to be believed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
-from drivers.clock import NS_PER_S
+from drivers.clock import NS_PER_S, seconds_ns
 from drivers.interface import Quality, Reading
+
+_OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
+_AXIS_ALARM = "controller alarm"  # how drivers.stage begins the reason of a position in an alarm
 
 
 class Readings(Protocol):
@@ -23,26 +26,58 @@ class Readings(Protocol):
         ...
 
 
-Rule = Callable[[Readings, int], "Fault | None"]
+# abort: make safe and end the run. hold: make safe and wait for an operator. warn: say so.
+Action = Literal["abort", "hold", "warn"]
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Why the stand must be made safe."""
+    """What a rule objects to, and what has to be done about it."""
 
     rule: str
     text: str
+    action: Action = "abort"
+
+
+Rule = Callable[[Readings, int], Fault | None]
+
+
+@dataclass(slots=True)
+class Watch:
+    """A rule, how long it must object without a break before it counts (s), and what is then done."""
+
+    rule: Rule
+    grace_s: float = 0.0
+    action: Action = "abort"
+    since_ns: int | None = None
+
+    def check(self, readings: Readings, now_ns: int) -> Fault | None:
+        """The rule's fault once it has stood for the grace time."""
+        fault = self.rule(readings, now_ns)
+        if fault is None:
+            self.since_ns = None
+            return None
+        if self.since_ns is None:
+            self.since_ns = now_ns
+        if now_ns - self.since_ns < seconds_ns(self.grace_s):
+            return None
+        lasting = f", for {self.grace_s:g} s" if self.grace_s > 0 else ""
+        return replace(fault, text=fault.text + lasting, action=self.action)
+
+
+def value_of(readings: Readings, channel: str) -> float:
+    """The last value; NaN when it is BAD or was never read, and every comparison with that is false."""
+    reading = readings.latest(channel)
+    return math.nan if reading is None else reading.value
 
 
 def over_temperature(channel: str, max_degC: float) -> Rule:
     """`channel` reads above `max_degC`; a BAD or missing value is another rule's business."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        reading = readings.latest(channel)
-        if reading is not None and reading.value > max_degC:
-            return Fault(
-                "over_temperature", f"{channel} is {reading.value:.2f} degC, above the limit of {max_degC} degC"
-            )
+        value_degC = value_of(readings, channel)
+        if value_degC > max_degC:
+            return Fault("over_temperature", f"{channel} is {value_degC:.2f} degC, above the limit of {max_degC} degC")
         return None
 
     return rule
@@ -66,12 +101,85 @@ def trustworthy(channel: str, stale_after_s: float) -> Rule:
     return rule
 
 
-def safety_rules(max_degC: Mapping[str, float], trusted: tuple[str, ...], stale_after_s: float) -> tuple[Rule, ...]:
-    """Over-temperature for each channel of `max_degC`, and trust in each channel of `trusted`."""
-    hot = tuple(over_temperature(channel, limit) for channel, limit in max_degC.items())
-    return hot + tuple(trustworthy(channel, stale_after_s) for channel in trusted)
+def disagreement(channel: str, other: str, max_K: float) -> Rule:
+    """Two sensors of the same air differ by more than `max_K`."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        value_degC, other_degC = value_of(readings, channel), value_of(readings, other)
+        if abs(value_degC - other_degC) > max_K:
+            text = f"{channel} {value_degC:.2f} degC and {other} {other_degC:.2f} degC differ by more than {max_K} K"
+            return Fault("sensors_disagree", text)
+        return None
+
+    return rule
 
 
-def first_fault(rules: tuple[Rule, ...], readings: Readings, now_ns: int) -> Fault | None:
-    """The first rule that objects."""
-    return next((fault for rule in rules if (fault := rule(readings, now_ns)) is not None), None)
+def reported_fault(channel: str) -> Rule:
+    """A device says that something is wrong: a flag, whose reading's reason says what.
+
+    The regulator's names the set-point that somebody changed, and manual mode; its driver compares the set-point with
+    the one it sent under the lock of both, so that a change of ours never looks like one of theirs.
+    """
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        reading = readings.latest(channel)
+        if reading is not None and reading.value > 0:
+            return Fault("device_fault", f"{channel}: {reading.reason}")
+        return None
+
+    return rule
+
+
+def stopped_while_permitted(running: str, permit: str) -> Rule:
+    """The stand permits heat, yet the regulator does not control: somebody has pressed its keys."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        if value_of(readings, running) == 0 and value_of(readings, permit) == 1:
+            return Fault("regulator_stopped", f"{running} is 0 though heating is permitted: stopped at the unit")
+        return None
+
+    return rule
+
+
+def permit_missing(running: str, permit: str) -> Rule:
+    """The regulator controls, yet the relay that lets heat through stays open: a lost write, a stuck relay."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        if value_of(readings, running) == 1 and value_of(readings, permit) == 0:
+            return Fault("permit_missing", f"{permit} is off though the regulator runs")
+        return None
+
+    return rule
+
+
+def stage_alarm(position: str) -> Rule:
+    """An axis' controller has an alarm; not homed or without current, as before the first move, is none."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        reading = readings.latest(position)
+        if reading is not None and reading.reason.startswith(_AXIS_ALARM):
+            return Fault("stage_alarm", f"{position}: {reading.reason}")
+        return None
+
+    return rule
+
+
+def flap_open(position: str, is_excused: Callable[[], bool] = lambda: False) -> Rule:
+    """The flap is open and nothing excuses it; how long that may last is the watch's grace time."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        openness = value_of(readings, position)
+        if openness > _OPEN_ABOVE and not is_excused():
+            return Fault("flap_open", f"{position} is {openness:.2f}, open")
+        return None
+
+    return rule
+
+
+def frames_stopped(reason: Callable[[], str]) -> Rule:
+    """The recorder takes no more frames; `reason()` says why, "" while it does."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        return Fault("disk_low", reason()) if reason() else None
+
+    return rule

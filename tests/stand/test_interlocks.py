@@ -5,9 +5,23 @@ import pytest
 from drivers.clock import seconds_ns
 from drivers.interface import Quality, Reading, bad_reading
 from stand.hub import Batch, Hub
-from stand.interlocks import first_fault, over_temperature, safety_rules, trustworthy
+from stand.interlocks import (
+    Fault,
+    Rule,
+    Watch,
+    disagreement,
+    flap_open,
+    frames_stopped,
+    over_temperature,
+    permit_missing,
+    reported_fault,
+    stage_alarm,
+    stopped_while_permitted,
+    trustworthy,
+)
 
-AIR = "thermometers.air"
+PV, AIR = "regulator.pv", "thermometers.air"
+RUNNING, PERMIT = "regulator.running", "relays.heater_enable"
 
 
 def reading(value: float, time_s: float = 0.0, quality: Quality = Quality.GOOD) -> Reading:
@@ -19,6 +33,21 @@ def hub_of(*readings: Reading) -> Hub:
     for one in readings:
         hub.publish(Batch("thermometers", one.time_ns, (one,)))
     return hub
+
+
+def hub_with(**values: float) -> Hub:
+    """A hub with one reading per channel, `regulator_pv` standing for regulator.pv; NaN is BAD."""
+    channels = {name.replace("_", ".", 1): value for name, value in values.items()}
+    return hub_of(
+        *(
+            bad_reading(channel, "1", 0, "lost") if math.isnan(value) else Reading(channel, value, "1", 0)
+            for channel, value in channels.items()
+        )
+    )
+
+
+def rule_of(fault: Fault | None) -> str | None:
+    return None if fault is None else fault.rule
 
 
 @pytest.mark.parametrize(
@@ -49,13 +78,90 @@ STALE = Quality.STALE
     ids=["never read", "bad", "old", "fresh", "one stale poll", "stale for long", "never good"],
 )
 def test_a_safety_sensor_must_be_there_good_and_fresh(readings: list[Reading], rule: str | None):
-    fault = trustworthy(AIR, 15.0)(hub_of(*readings), seconds_ns(100))
-    assert (fault.rule if fault else None) == rule
+    assert rule_of(trustworthy(AIR, 15.0)(hub_of(*readings), seconds_ns(100))) == rule
 
 
-def test_the_first_objection_is_reported():
-    rules = safety_rules({AIR: 65.0}, (AIR,), 15.0)
-    assert first_fault(rules, hub_of(reading(24.0)), 0) is None
-    hot = first_fault(rules, hub_of(reading(99.0)), 0)
-    assert hot is not None
-    assert hot.rule == "over_temperature"
+@pytest.mark.parametrize(
+    ("air_degC", "trips"), [(24.0, False), (30.0, False), (30.1, True), (17.9, True), (math.nan, False)]
+)
+def test_two_sensors_of_one_air_may_differ_by_so_much(air_degC: float, trips: bool):
+    fault = disagreement(PV, AIR, 6.0)(hub_with(regulator_pv=24.0, thermometers_air=air_degC), 0)
+    assert (fault is not None) is trips
+    if fault is not None:
+        assert fault.text.startswith("regulator.pv 24.00 degC and thermometers.air")
+
+
+def test_a_device_that_reports_a_fault_is_believed():
+    rule = reported_fault("regulator.fault")
+    assert rule(hub_with(regulator_fault=0.0), 0) is None
+    assert rule(hub_with(regulator_fault=math.nan), 0) is None
+    reported = Reading("regulator.fault", 1.0, "1", 0, reason="set point changed at the unit")
+    fault = rule(hub_of(reported), 0)
+    assert fault is not None
+    assert fault.text == "regulator.fault: set point changed at the unit"
+
+
+@pytest.mark.parametrize(
+    ("running", "permit", "objection"),
+    [
+        (1.0, 1.0, None),
+        (0.0, 0.0, None),
+        (0.0, 1.0, "regulator_stopped"),
+        (1.0, 0.0, "permit_missing"),
+        (math.nan, 1.0, None),
+        (1.0, math.nan, None),
+    ],
+    ids=["heating", "at rest", "keys pressed", "relay stuck open", "regulator unknown", "relay unknown"],
+)
+def test_regulator_and_permit_belong_together(running: float, permit: float, objection: str | None):
+    hub = hub_with(regulator_running=running, relays_heater_enable=permit)
+    objections = [rule_of(rule(RUNNING, PERMIT)(hub, 0)) for rule in (stopped_while_permitted, permit_missing)]
+    assert [name for name in objections if name] == ([objection] if objection else [])
+
+
+@pytest.mark.parametrize(
+    ("reason", "trips"),
+    [
+        ("", False),
+        ("not homed", False),
+        ("motor off, the rotor may have moved by up to a step", False),
+        ("controller alarm, flags 0x00000040", True),
+    ],
+)
+def test_only_an_alarm_of_a_stage_is_one(reason: str, trips: bool):
+    position = Reading("linear.position", 1.0, "mm", 0, STALE if reason else Quality.GOOD, reason)
+    assert (rule_of(stage_alarm("linear.position")(hub_of(position), 0)) == "stage_alarm") is trips
+
+
+def test_an_open_flap_may_be_excused():
+    excuse = [False]
+    rule = flap_open("flap.position", lambda: excuse[0])
+    assert rule(hub_with(flap_position=0.02), 0) is None
+    assert rule(hub_with(flap_position=math.nan), 0) is None
+    assert rule_of(rule(hub_with(flap_position=0.3), 0)) == "flap_open"
+    excuse[0] = True
+    assert rule(hub_with(flap_position=1.0), 0) is None
+
+
+def test_a_recorder_that_takes_no_frames_is_told_with_its_reason():
+    reason = [""]
+    rule = frames_stopped(lambda: reason[0])
+    assert rule(Hub(), 0) is None
+    reason[0] = "less than 2.0 GB free"
+    assert rule(Hub(), 0) == Fault("disk_low", "less than 2.0 GB free")
+
+
+def objecting(instants: set[int]) -> Rule:
+    return lambda readings, now_ns: Fault("rule", "it is so") if now_ns // seconds_ns(1) in instants else None
+
+
+def test_a_watch_waits_until_its_rule_has_objected_without_a_break_for_its_grace_time():
+    watch = Watch(objecting({1, 2, 4, 5, 6, 7, 8}), grace_s=3.0, action="hold")
+    seen = {second: watch.check(Hub(), seconds_ns(second)) for second in range(10)}
+    told = Fault("rule", "it is so, for 3 s", "hold")
+    assert {second for second, fault in seen.items() if fault is not None} == {7, 8}
+    assert seen[7] == told
+
+
+def test_a_watch_without_grace_objects_at_once():
+    assert Watch(objecting({0})).check(Hub(), 0) == Fault("rule", "it is so", "abort")

@@ -1,0 +1,234 @@
+"""Heat that should come and does not, and heat that should not and does: on a simulated chamber, with the defaults."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from drivers.clock import NS_PER_S, seconds_ns
+from drivers.interface import Reading, bad_reading
+from stand.config import load_config, packaged
+from stand.hub import Batch, Hub
+from stand.interlocks import Fault
+from stand.plausibility import Heating, HeatingLimits, heating, stuck, stuck_while_other_moves
+from stand.rules import Announcements, watches
+from tests.stand.chamber_night import START_NS, Night
+
+LIMITS = HeatingLimits(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)
+LOOK_S = 10.0
+
+
+def looks(pv_degC: Callable[[float], float], set_point_degC: float, until_s: float) -> list[Heating | None]:
+    """The check after each look at a heater that is on all the time."""
+    states: list[Heating | None] = [None]
+    for look in range(round(until_s / LOOK_S)):
+        time_s = look * LOOK_S
+        states.append(heating(states[-1], LIMITS, set_point_degC, pv_degC(time_s), seconds_ns(time_s)))
+    return states[1:]
+
+
+def trips(state: Heating | None) -> bool:
+    return state is not None and not state.approaching and state.error_K_s >= LIMITS.max_error_K_s
+
+
+def first_trip_s(states: list[Heating | None]) -> float | None:
+    return next((index * LOOK_S for index, state in enumerate(states) if trips(state)), None)
+
+
+def test_a_temperature_that_rises_fast_enough_is_fine_for_hours():
+    assert first_trip_s(looks(lambda time_s: 20 + 0.06 * time_s / 60, 60.0, 20_000)) is None
+
+
+def test_a_temperature_that_rises_too_slowly_trips_when_the_window_ends():
+    assert first_trip_s(looks(lambda time_s: 20 + 0.04 * time_s / 60, 60.0, 20_000)) == 600
+
+
+def test_a_temperature_that_stops_rising_trips_one_window_after_its_last_goal():
+    tripped_s = first_trip_s(looks(lambda time_s: 20 + min(10.0, time_s / 60), 60.0, 20_000))
+    assert tripped_s == pytest.approx(600 + 600, abs=2 * LOOK_S)
+
+
+def test_the_first_goal_follows_a_temperature_that_still_falls():
+    """It falls by 1 K in the first minutes, then rises by 0.7 K in what is left of the window."""
+    assert (
+        first_trip_s(looks(lambda time_s: 20 - min(1.0, time_s / 240) + max(0.0, time_s - 240) / 500, 60, 3000)) is None
+    )
+
+
+def test_near_its_set_point_a_temperature_need_not_rise():
+    assert looks(lambda time_s: 29.1, 30.0, 100) == [None] * 10
+
+
+def test_little_that_lacks_is_borne_for_long():
+    """1.1 K below the set-point is 0.1 K too much: 6000 s make up the 600 K s."""
+    assert first_trip_s(looks(lambda time_s: 28.9, 30.0, 20_000)) == pytest.approx(6000, abs=2 * LOOK_S)
+
+
+def test_a_new_set_point_begins_a_new_window():
+    state = looks(lambda time_s: 20.0, 60.0, 590)[-1]
+    again = heating(state, LIMITS, 40.0, 20.0, seconds_ns(595))
+    assert again == Heating(40.0, seconds_ns(595), 20.5, seconds_ns(1195))
+
+
+@pytest.mark.parametrize("missing", [(math.nan, 20.0), (60.0, math.nan)])
+def test_what_is_not_known_is_no_fault(missing: tuple[float, float]):
+    state = looks(lambda time_s: 20.0, 60.0, 590)[-1]
+    assert heating(state, LIMITS, *missing, seconds_ns(2000)) is None
+
+
+def faults_of(night: Night) -> list[tuple[float, Fault]]:
+    """(s, fault) of everything the whole table says in a night, warnings too."""
+    config, announced = load_config(packaged("", "simulated")), Announcements()
+    rules = watches(config, announced)
+    said: list[tuple[float, Fault]] = []
+    for now_ns in night.polls():
+        for fault in (watch.check(night.hub, now_ns) for watch in rules):
+            if fault is not None:
+                said.append(((now_ns - START_NS) / NS_PER_S, fault))
+        if said:
+            break
+    return said
+
+
+@pytest.mark.parametrize(
+    "night",
+    [
+        Night([24, 60, -10, 52, 10, 24], 3600),
+        Night([30, 24, 45, 10, 60, 20, 50, 31, 34, 24], 900),
+        Night([24, 55, 24, 40], 2700, compressor_always=True),
+        Night([-10, 60, 0], 3600, laboratory_degC=32),
+        Night([60, -10, 60], 3600, laboratory_degC=10),
+        Night([52, 10], 5400, disturb=lambda night, time_s: night.send("0600000101") if time_s == 6000 else None),
+    ],
+    ids=["far", "fast", "compressor fights", "hot laboratory", "cold laboratory", "stopped and warming by itself"],
+)
+def test_a_good_night_trips_nothing_and_warns_of_nothing(night: Night):
+    assert faults_of(night) == []
+
+
+def dead_heater(from_s: float) -> Callable[[Night, float], None]:
+    def disturb(night: Night, time_s: float) -> None:
+        night.plant.cut_out_open = time_s >= from_s
+
+    return disturb
+
+
+def welded(share: float) -> Callable[[float], Callable[[Night, float], None]]:
+    """The solid-state relay conducts for that share, whatever the regulator says."""
+
+    def from_(from_s: float) -> Callable[[Night, float], None]:
+        def disturb(night: Night, time_s: float) -> None:
+            def conduct(time_ns: int, dt_s: float) -> None:
+                night.plant.heater_on_fraction = max(share, night.plant.heater_on_fraction)
+
+            if time_s == from_s:
+                night.plant.on_step.append(conduct)
+
+        return disturb
+
+    return from_
+
+
+def stuck_probe(pv_degC: float) -> Callable[[float], Callable[[Night, float], None]]:
+    def from_(from_s: float) -> Callable[[Night, float], None]:
+        def disturb(night: Night, time_s: float) -> None:
+            night.regulator.stuck_pv_degC = pv_degC if time_s >= from_s else None
+
+        return disturb
+
+    return from_
+
+
+def lost_permit(from_s: float) -> Callable[[Night, float], None]:
+    def disturb(night: Night, time_s: float) -> None:
+        night.permitted = time_s < from_s
+
+    return disturb
+
+
+def drifting_probe(K_per_h: float) -> Callable[[float], Callable[[Night, float], None]]:
+    def from_(from_s: float) -> Callable[[Night, float], None]:
+        def disturb(night: Night, time_s: float) -> None:
+            night.regulator.pv_offset_K = max(0.0, time_s - from_s) * K_per_h / 3600
+
+        return disturb
+
+    return from_
+
+
+@pytest.mark.parametrize(
+    ("break_it", "from_s", "set_points_degC", "rule", "action", "within_s"),
+    [
+        (dead_heater, 0, [40], "heater_not_warming", "abort", 700),
+        (dead_heater, 3600, [30, 45], "heater_not_warming", "abort", 700),
+        (dead_heater, 2700, [45], "heater_not_warming", "abort", 700),
+        (welded(0.6), 1800, [30], "warming_while_off", "abort", 500),
+        (welded(0.8), 1800, [10], "warming_while_off", "abort", 300),
+        (stuck_probe(23.9), 3000, [30], "sensor_stuck", "hold", 100),
+        (stuck_probe(30.0), 3605, [30, 45], "sensor_stuck", "hold", 100),
+        (drifting_probe(6.0), 1800, [30, 30], "sensors_disagree", "warn", 2600),
+        (drifting_probe(60.0), 1800, [30], "sensors_disagree", "abort", 600),
+        (lost_permit, 1800, [40], "permit_missing", "hold", 100),
+    ],
+    ids=[
+        "dead heater at the start",
+        "dead heater on a ramp",
+        "dead heater at a set-point",
+        "welded relay",
+        "welded relay in the cold",
+        "detached probe",
+        "probe stuck on a ramp",
+        "probe that drifts",
+        "probe that drifts fast",
+        "relay that fell",
+    ],
+)
+def test_what_breaks_is_found_in_time(
+    break_it: Callable[[float], Callable[[Night, float], None]],
+    from_s: float,
+    set_points_degC: list[float],
+    rule: str,
+    action: str,
+    within_s: float,
+):
+    time_s, fault = faults_of(Night(set_points_degC, 3600, disturb=break_it(from_s)))[0]
+    assert (fault.rule, fault.action) == (rule, action)
+    assert from_s < time_s <= from_s + within_s
+
+
+PV, AIR = "regulator.pv", "thermometers.air"
+
+
+def publish(hub: Hub, channel: str, value: float) -> None:
+    reading = bad_reading(channel, "degC", 0, "lost") if math.isnan(value) else Reading(channel, value, "degC", 0)
+    hub.publish(Batch("device", 0, (reading,)))
+
+
+def test_a_thermometer_without_noise_is_stuck_until_it_moves_again():
+    hub, rule = Hub(), stuck(AIR, 900.0)
+    assert rule(hub, 0) is None
+    publish(hub, AIR, 24.003)
+    assert rule(hub, seconds_ns(1)) is None
+    assert rule(hub, seconds_ns(900)) is None
+    fault = rule(hub, seconds_ns(901))
+    assert fault is not None
+    assert fault.text == "thermometers.air has been exactly 24.003 for 900 s"
+    publish(hub, AIR, 24.006)
+    assert rule(hub, seconds_ns(902)) is None
+    publish(hub, AIR, math.nan)
+    assert rule(hub, seconds_ns(2000)) is None
+    assert rule(hub, seconds_ns(4000)) is None
+
+
+def test_a_regulator_that_holds_its_temperature_is_not_stuck_one_that_misses_a_change_is():
+    hub, rule = Hub(), stuck_while_other_moves(PV, AIR, 1.0, 60.0)
+    publish(hub, PV, 24.0)
+    for second in range(0, 4000, 10):
+        publish(hub, AIR, 24.0 + 0.4 * math.sin(second / 300))
+        assert rule(hub, seconds_ns(second)) is None
+    publish(hub, AIR, 25.3)
+    fault = rule(hub, seconds_ns(4000))
+    assert fault is not None
+    assert fault.text == "regulator.pv stays at 24.0 while thermometers.air went by 1.30 K"
+    publish(hub, PV, 24.1)
+    assert rule(hub, seconds_ns(4001)) is None
