@@ -40,7 +40,7 @@ class PricedStep:
 
     work, stated_s: what of the duration follows from the step, the rest being usual for this kind of work.
     in_band_after_s: of a soak, when the chamber is expected at its set-point, s after the soak begins; None when it is
-    there already. warning: why a soak is too short, "" when it is not.
+    there already. warning: of a first capture, why the dwell before it is too short, "" when it is not.
     """
 
     planned: PlannedStep
@@ -73,13 +73,14 @@ class _Approach:
 
     from_degC: float
     to_degC: float
-    age_s: float
+    age_s: float = 0.0
+    captured: bool = False
 
     def after(self, step: Step, duration_s: float) -> _Approach:
         """When the step is done; a new set-point is taken to find the air at the old one."""
         if isinstance(step, StartChamber | SetTemperature):
-            return _Approach(self.to_degC, step.chamber_degC, 0.0)
-        return replace(self, age_s=self.age_s + duration_s)
+            return _Approach(self.to_degC, step.chamber_degC)
+        return replace(self, age_s=self.age_s + duration_s, captured=self.captured or isinstance(step, Capture))
 
 
 def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | None = None) -> tuple[PricedStep, ...]:
@@ -88,7 +89,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
     learned = learned or Learned()
     frame_px = (config.camera.width_px or _SENSOR_PX[0]) * (config.camera.height_px or _SENSOR_PX[1])
     telemetry_bytes_per_s = _messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
-    found, approach = Situation(), _Approach(_LABORATORY_degC, _LABORATORY_degC, 0.0)
+    found, approach = Situation(), _Approach(_LABORATORY_degC, _LABORATORY_degC)
     priced: list[PricedStep] = []
     for planned in plan:
         _check(planned, config)
@@ -96,7 +97,6 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
         expected = expect(step, found, config, learned.overheads_s)
         duration_s = expected.duration_s
         size_bytes = frame_px * _image_bytes_per_px(step, config) + duration_s * telemetry_bytes_per_s
-        in_band_after_s, warning = _arrival(step, approach, learned.chamber)
         priced.append(
             PricedStep(
                 planned,
@@ -105,8 +105,8 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
                 size_bytes,
                 expected.work,
                 expected.stated_s,
-                in_band_after_s,
-                warning,
+                _in_band_after_s(step, approach, learned.chamber),
+                _warning(step, approach, learned.chamber),
             )
         )
         found, approach = found.after(step), approach.after(step, duration_s)
@@ -116,21 +116,24 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
     return tuple(priced)
 
 
-def _arrival(step: Step, approach: _Approach, chamber: ChamberModel) -> tuple[float | None, str]:
-    """Of a soak: s until the chamber is in its band (None: it is), and a warning when the camera cannot follow."""
-    arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s
-    settled_s = chamber.settled_s(approach.from_degC, approach.to_degC) - approach.age_s
-    if not isinstance(step, Soak):
-        return None, ""
-    warning = ""
-    if step.duration_s < settled_s:
-        spare_s = step.duration_s - arrives_s
-        warning = (
-            f"the dwell at {approach.to_degC:g} degC ends {_minutes(abs(spare_s))} "
-            f"{'before' if spare_s < 0 else 'after'} the chamber arrives; "
-            f"the camera needs {_minutes(settled_s - arrives_s)} to follow"
-        )
-    return (arrives_s if arrives_s > 0.0 else None), warning
+def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:
+    """Of a soak: s until the chamber is in its band; None when it is, and of other steps."""
+    after_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s
+    return after_s if isinstance(step, Soak) and after_s > 0.0 else None
+
+
+def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:
+    """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then."""
+    arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC)
+    settled_s = chamber.settled_s(approach.from_degC, approach.to_degC)
+    if not isinstance(step, Capture) or approach.captured or approach.age_s >= settled_s:
+        return ""
+    spare_s = approach.age_s - arrives_s
+    return (
+        f"the dwell at {approach.to_degC:g} degC ends {_minutes(abs(spare_s))} "
+        f"{'before' if spare_s < 0.0 else 'after'} the chamber arrives; "
+        f"the camera needs {_minutes(settled_s - arrives_s)} to follow"
+    )
 
 
 def _minutes(duration_s: float) -> str:
