@@ -97,10 +97,12 @@ def overheads_of(session: Session, config: StandConfig) -> list[tuple[str, float
     found, overheads = Situation(), list[tuple[str, float]]()
     for mark, duration_s in _done(session.steps()):
         step = _step_of(mark)
-        if step is not None:
+        if step is None:
+            continue
+        if duration_s is not None:
             expected = expect(step, found, config)
             overheads.append((expected.work, duration_s - expected.stated_s))
-            found = found.after(step)
+        found = found.after(step)
     return overheads
 
 
@@ -123,16 +125,16 @@ def _nights(directory: Path, config: StandConfig) -> Iterator[_Night]:
                 yield _Night(path.name, overheads_of(session, config), ramps_of(session))
 
 
-def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float]]:
-    """The marks of steps that ended well, each with its duration, s; a step that was begun again is left out."""
+def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float | None]]:
+    """The marks of steps that ended well, each with its duration, s; None when it was interrupted and begun again."""
     begun_ns: dict[int, int | None] = {}
     for mark in marks:
         if mark.state is StepState.STARTED:
             begun_ns[mark.index] = None if mark.index in begun_ns else mark.time_ns
             continue
         start_ns = begun_ns.pop(mark.index, None)
-        if mark.state is StepState.DONE and start_ns is not None:
-            yield mark, (mark.time_ns - start_ns) / NS_PER_S
+        if mark.state is StepState.DONE:
+            yield mark, None if start_ns is None else (mark.time_ns - start_ns) / NS_PER_S
 
 
 def _replace(path: Path, text: str) -> None:

@@ -31,7 +31,7 @@ from stand.estimate import PricedStep, price
 from stand.eta import Eta
 from stand.follow import Follow
 from stand.hub import Batch, Event, StepMark, StepState
-from stand.learned import LEARNED_FILE, Learned, learn, load_learned
+from stand.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
 from stand.recording.session import Session
 from stand.thermal_model import ChamberModel, Response
 from tests.recording.recorded import record
@@ -82,7 +82,7 @@ def test_a_move_is_priced_by_the_way_from_where_the_axis_stands(config: StandCon
     homing, up, down, check = (step.duration_s for step in price(plan, config))
     assert homing > 10.0
     assert up == pytest.approx(100 / 2.5, abs=1.0)
-    assert down == pytest.approx(50.5 / 2.5 + 0.6, abs=1.0)  # past it, then up
+    assert down == pytest.approx(50.5 / 2.5 + 0.375 + 0.548 + 0.1, abs=0.05)  # past it, then up
     assert check == pytest.approx(15 + 50 / 1.25 + 50 / 2.5, abs=1.0)
 
 
@@ -212,17 +212,25 @@ async def test_runs_teach_what_work_takes_and_the_median_counts(tmp_path: Path, 
     assert [path.name for path in tmp_path.glob(f"{LEARNED_FILE}*")] == [LEARNED_FILE]
 
 
+async def test_a_step_that_was_begun_again_teaches_nothing(tmp_path: Path, config: StandConfig):
+    plan = planned(OpenFlap(), CloseFlap())
+    killed, *rest = marks([plan[0], *plan], [2.0, 0.4, 1.1])
+    session = await recorded_marks(tmp_path / "night", config.name, [killed, *rest[1:]])
+    assert overheads_of(session, config) == [("flap travel", pytest.approx(1.1, abs=1e-3))]
+
+
 async def recorded(directory: Path, stand: str, plan: list[PlannedStep], durations_s: list[float]) -> Session:
     """A session of the stand of that name in which the steps took so long."""
-    waiting = marks(plan, durations_s)
+    return await recorded_marks(directory, stand, marks(plan, durations_s))
 
+
+async def recorded_marks(directory: Path, stand: str, waiting: list[StepMark]) -> Session:
     def items(time_ns: int, index: int):
         yield from (mark for mark in waiting if index <= (mark.time_ns - BEGIN_NS) / NS_PER_S < index + 1)
 
-    seconds = int(sum(durations_s)) + 2
-    await record(
-        directory, seconds, items, segment_s=1e6, period_ns=NS_PER_S, attachments={"config.yaml": f"name: {stand}\n"}
-    )
+    seconds = (waiting[-1].time_ns - BEGIN_NS) // NS_PER_S + 2
+    attachments = {"config.yaml": f"name: {stand}\n"}
+    await record(directory, seconds, items, segment_s=1e6, period_ns=NS_PER_S, attachments=attachments)
     return Session.open(directory)
 
 
