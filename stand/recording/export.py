@@ -26,10 +26,11 @@ from google.protobuf.message import DecodeError
 from drivers.interface import Reading, SessionError
 from stand.hub import Batch
 from stand.recording import messages
+from stand.recording.damage import naming
 from stand.recording.folder import new_folder
 from stand.recording.images import decode_image
 from stand.recording.png import SIGNATURE, encode_png
-from stand.recording.records import Message, naming, telemetry_messages
+from stand.recording.records import Message, telemetry_messages
 from stand.recording.session import RecordedImage, Session
 from stand.recording.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
 from stand.recording.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format

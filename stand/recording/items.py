@@ -13,8 +13,9 @@ from mcap.records import Channel
 from drivers.interface import Frame
 from stand.hub import Batch, Event, StepMark
 from stand.recording import messages
+from stand.recording.damage import naming
 from stand.recording.images import decode_image
-from stand.recording.records import FramePlace, Message, naming
+from stand.recording.records import FramePlace, Message
 
 
 @dataclass(frozen=True, slots=True)

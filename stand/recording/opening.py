@@ -21,7 +21,8 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, Schema
 
 from stand.recording.layout import FINISHED, FRAMES, TELEMETRY
-from stand.recording.walk import Source, Survey, survey
+from stand.recording.walk import Survey, survey
+from stand.recording.wire import Source
 
 SIBLINGS_PER_SERIES = 4  # enough for a vote, few enough for a night of hundreds
 SESSION_ID = "session_id"

@@ -14,13 +14,15 @@ import numpy as np
 from drivers.interface import SessionError
 from stand.hub import Event, StepMark, StepState
 from stand.recording.contents import RUN_END, Channel, Contents
+from stand.recording.damage import reading
 from stand.recording.gaps import Silence, silences, told_blocks
 from stand.recording.images import decode_image
 from stand.recording.inventory import SegmentFile, State, inventory
 from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.records import FramePlace, frame_places, read_frame, read_head, reading, telemetry_messages
+from stand.recording.records import FramePlace, frame_places, read_frame, read_head, telemetry_messages
 from stand.recording.summary import Summary, read_summary
-from stand.recording.walk import Source, survey
+from stand.recording.walk import survey
+from stand.recording.wire import Source
 
 
 @dataclass(frozen=True, slots=True)

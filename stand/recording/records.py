@@ -9,46 +9,38 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Container, Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
-import zstandard
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from drivers.interface import SessionError
+from stand.recording.damage import reading
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
 from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
 from stand.recording.messages import CLASSES
-from stand.recording.summary import CRC, RECORD, ChunkPlace, Summary, check_crc, read_summary, stream
-
-# What reading damaged bytes raises; CRC and Unicode errors are ValueErrors.
-DAMAGE = (
-    McapError,
-    OSError,
-    struct.error,
-    zstandard.ZstdError,
-    ValueError,
-    LookupError,
-    EOFError,
-    OverflowError,
-    MemoryError,
+from stand.recording.summary import ChunkPlace, Summary, read_summary
+from stand.recording.wire import (
+    CHUNK_LIMIT_BYTES,
+    RECORD,
+    ChunkHead,
+    check_attachment,
+    check_crc,
+    chunk_content,
+    chunk_head,
+    stream,
 )
-CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; whoever claims more is damaged
+
 _FRAME_HEAD_BYTES = 1 << 14  # schema, channel and what precedes the image; 3 KiB in the first chunk, 90 bytes in others
-INFLATED_LIMIT_BYTES = 1 << 26  # only telemetry is compressed, and its chunks are 1 MiB and a message
 SCHEMAS = {
     CAMERA_IMAGE: {image.DESCRIPTOR.full_name for image in IMAGE_CLASS.values()},
     **{topic: {message.DESCRIPTOR.full_name} for topic, message in CLASSES.items()},
 }
 
-_CHUNK = struct.Struct("<qqQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
-_DATA_LENGTH = struct.Struct("<Q")
 _MESSAGE_START = struct.Struct("<BQH")  # opcode, length, channel id
 _MESSAGE_REST = struct.Struct("<Iqq")  # sequence, log time, publish time; signed, as every instant of ours
 _HEADER_BYTES = RECORD.size
@@ -98,25 +90,6 @@ class MessageSpan:
     last_ns: int
 
 
-@contextmanager
-def reading(path: Path) -> Generator[None]:
-    """Whatever damage raises inside becomes a SessionError that names the file."""
-    try:
-        yield
-    except DAMAGE as error:
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        raise SessionError(f"{path}: damaged or not readable ({text})") from error
-
-
-@contextmanager
-def naming(path: Path) -> Generator[None]:
-    """A SessionError from inside gets the file's name in front."""
-    try:
-        yield
-    except SessionError as error:
-        raise SessionError(f"{path}: {error}") from error
-
-
 def read_head(path: Path) -> Head:
     """Metadata `session` and the attachments of a finished segment."""
     with reading(path), path.open("rb") as file:
@@ -150,7 +123,7 @@ def _head(path: Path, file: BinaryIO) -> Head:
             break
         content = file.read(min(length, size))
         if opcode == Opcode.ATTACHMENT:
-            check_crc(content[: -CRC.size], *CRC.unpack(content[-CRC.size :]))
+            check_attachment(content)
             attachment = Attachment.read(stream(content))
             attachments[attachment.name] = attachment.data.decode()
         elif opcode == Opcode.METADATA:
@@ -194,9 +167,9 @@ def _channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
 def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
     """The records of the chunk at that place, their CRC checked."""
     data = memoryview(_read(file, place.offset, place.length))
-    head = _chunk_head(data, place)
-    content = _uncompressed(head.compression, data[head.end :], head.size_bytes)
-    check_crc(content, head.crc)
+    _check_place(data, place)
+    head, content = chunk_content(data[RECORD.size :])
+    _check_times(head, place)
     return content
 
 
@@ -208,40 +181,16 @@ def _read(file: BinaryIO, offset: int, length: int) -> bytes:
     return file.read(length)
 
 
-class _ChunkHead(NamedTuple):
-    """A chunk's record before its content: what it says of it, and where it ends."""
-
-    size_bytes: int
-    crc: int
-    compression: bytes
-    end: int
-
-
-def _chunk_head(data: bytes | memoryview, place: ChunkPlace) -> _ChunkHead:
-    """The head of the chunk that begins `data`; ValueError when it is not the one that the index tells of."""
+def _check_place(data: bytes | memoryview, place: ChunkPlace) -> None:
+    """ValueError when what begins there is not as long a chunk as the index tells."""
     opcode, length = RECORD.unpack_from(data)
     if opcode != Opcode.CHUNK or length != place.length - RECORD.size:
         raise ValueError("the index does not point to a chunk")
-    first_ns, last_ns, size_bytes, crc, name_bytes = _CHUNK.unpack_from(data, RECORD.size)
-    if (first_ns, last_ns) != (place.first_ns, place.last_ns):
+
+
+def _check_times(head: ChunkHead, place: ChunkPlace) -> None:
+    if (head.first_ns, head.last_ns) != (place.first_ns, place.last_ns):
         raise ValueError("the index points to another chunk")
-    name_begin = RECORD.size + _CHUNK.size
-    name = bytes(data[name_begin : name_begin + name_bytes])
-    return _ChunkHead(size_bytes, crc, name, name_begin + name_bytes + _DATA_LENGTH.size)
-
-
-def _uncompressed(compression: bytes, data: memoryview, size: int) -> memoryview:
-    """The content of a chunk that says it has that size."""
-    if compression == b"zstd":
-        # As much memory is taken as the frame says: so both have to say the same, and not too much.
-        if size > INFLATED_LIMIT_BYTES or zstandard.frame_content_size(data) != size:
-            raise ValueError("a chunk's size is wrong")
-        data = memoryview(zstandard.decompress(data))
-    elif compression:
-        raise ValueError(f"a chunk compressed with {compression!r}")
-    if len(data) != size:
-        raise ValueError("a chunk's size is wrong")
-    return data
 
 
 def _message_places(chunk: memoryview, wanted: Container[int]) -> list[tuple[int, int, int]]:
@@ -295,17 +244,20 @@ def read_frame(place: FramePlace) -> Message:
     chunk = place.chunk
     with reading(place.path), place.path.open("rb", buffering=0) as file:
         data = _read(file, chunk.offset, min(chunk.length, _FRAME_HEAD_BYTES))
-        head = _chunk_head(data, chunk)
-        if head.compression or head.end + head.size_bytes != chunk.length:
-            raise ValueError("a frame's chunk is compressed or has another size")
-        begin = _image_record(data, head.end)
+        _check_place(data, chunk)
+        head = chunk_head(memoryview(data)[RECORD.size :], chunk.length - RECORD.size)
+        _check_times(head, chunk)
+        if head.compression:
+            raise ValueError("a frame's chunk is compressed")
+        content_begin = RECORD.size + head.begin
+        begin = _image_record(data, content_begin)
         _, length, number = _MESSAGE_START.unpack_from(data, begin)
         sequence, time_ns, _ = _MESSAGE_REST.unpack_from(data, begin + _MESSAGE_START.size)
         begin += _MESSAGE_BYTES
         if length != chunk.length - begin + _MESSAGE_BYTES - RECORD.size:
             raise ValueError("a frame's chunk holds more than the frame")
         image = _read(file, chunk.offset + begin, chunk.length - begin)
-        check_crc(image, head.crc, data[head.end : begin])
+        check_crc(image, head.crc, "a chunk", data[content_begin:begin])
         if (number, time_ns) != (place.channel, place.time_ns):
             raise ValueError("the index tells of another frame")
         return Message(CAMERA_IMAGE, sequence, time_ns, image)

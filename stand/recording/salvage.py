@@ -39,7 +39,8 @@ from stand.recording.layout import (
 from stand.recording.opening import Opening, opening_of, segments_of
 from stand.recording.segment_check import check_segment
 from stand.recording.sink import sync_folder
-from stand.recording.walk import Source, StoredMessage, Survey, stored_messages, survey
+from stand.recording.walk import StoredMessage, Survey, stored_messages, survey
+from stand.recording.wire import Source
 
 SALVAGE_METADATA = "salvage"
 BEING_RECORDED = "is being recorded"

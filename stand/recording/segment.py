@@ -27,8 +27,8 @@ from mcap_protobuf.schema import register_schema
 
 from stand.recording.block import Block, chunk_writer
 from stand.recording.compaction import merge_chunks
+from stand.recording.damage import DAMAGE
 from stand.recording.layout import DEVICES, FINISHED, SEGMENT_METADATA, SESSION_METADATA, UNFINISHED, segment_metadata
-from stand.recording.records import DAMAGE
 from stand.recording.sink import CommitSink, sync_folder
 from stand.recording.space import disk_space
 

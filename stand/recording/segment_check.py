@@ -9,8 +9,6 @@ stand/recording/verify.py compares them between segments.
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -19,18 +17,14 @@ from math import inf
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    Chunk,
     ChunkIndex,
-    Footer,
     Header,
-    McapRecord,
     MessageIndex,
     Metadata,
     MetadataIndex,
@@ -39,14 +33,23 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from stand.recording.damage import DAMAGE
 from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
-from stand.recording.records import CHUNK_LIMIT_BYTES, DAMAGE, Message
-from stand.recording.summary import CRC, RECORD, records, stream
+from stand.recording.records import Message
+from stand.recording.summary import Summary, read_summary
+from stand.recording.wire import (
+    CHUNK,
+    CRC,
+    LENGTH,
+    MESSAGE,
+    RECORD,
+    ChunkHead,
+    bytes_of,
+    chunk_content,
+    records,
+    stream,
+)
 
-_CHUNK = struct.Struct("<QQQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
-_LENGTH = struct.Struct("<Q")
-_MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
-_FOOTER_BYTES = RECORD.size + 20  # places of the summary and of its offsets, CRC
 _DATA_END_BYTES = RECORD.size + CRC.size
 
 
@@ -76,7 +79,7 @@ def check_segment(path: Path, receive: Callable[[Message], None], report: Callab
     check = SegmentCheck(path)
     try:
         with path.open("rb") as file:
-            walk = _Walk(check, file, _read_index(file, path.stat().st_size), receive)
+            walk = _Walk(check, file, _indexed(read_summary(file, path.stat().st_size)), receive)
             walk.run(report)
     except DAMAGE as error:
         check.damages.append(Damage(_sentence(error), -inf, inf))
@@ -101,26 +104,10 @@ class _Index:
     channels: Mapping[int, Channel]
 
 
-def _read_index(file: BinaryIO, size: int) -> _Index:
-    """The index, by the footer and its CRC; raises one of DAMAGE."""
-    tail_bytes = _FOOTER_BYTES + len(MCAP0_MAGIC)
-    file.seek(max(0, size - tail_bytes))
-    tail = file.read()
-    if tail[_FOOTER_BYTES:] != MCAP0_MAGIC:
-        raise ValueError("it ends in the middle")
-    begin = Footer.read(stream(tail[RECORD.size :])).summary_start
-    if not len(MCAP0_MAGIC) <= begin <= size - tail_bytes:
-        raise ValueError("its index is not in the file")
-    file.seek(begin)
-    summary = file.read(size - tail_bytes - begin)
-    covered = _FOOTER_BYTES - CRC.size
-    _check_crc(summary + tail[:covered], _crc_at(tail, covered), "its index")
-    return _parsed(memoryview(summary), begin)
-
-
-def _parsed(summary: memoryview, begin: int) -> _Index:
+def _indexed(summary: Summary) -> _Index:
+    """The records of the index; raises one of DAMAGE."""
     contents: dict[int, list[ReadDataStream]] = {}
-    for opcode, content in records(summary):
+    for opcode, content in records(summary.content):
         contents.setdefault(opcode, []).append(stream(content))
     schemas = [Schema.read(data) for data in contents.get(Opcode.SCHEMA, ())]
     channels = [Channel.read(data) for data in contents.get(Opcode.CHANNEL, ())]
@@ -129,7 +116,7 @@ def _parsed(summary: memoryview, begin: int) -> _Index:
     metadata = [MetadataIndex.read(data) for data in contents.get(Opcode.METADATA_INDEX, ())]
     (statistics,) = [Statistics.read(data) for data in contents.get(Opcode.STATISTICS, ())]
     return _Index(
-        begin,
+        summary.begin,
         statistics,
         {chunk.chunk_start_offset: chunk for chunk in chunks},
         {attachment.offset: attachment for attachment in attachments},
@@ -191,7 +178,7 @@ class _Walk:
     def _header(self, place: int, data: bytes) -> None:
         content = data[len(MCAP0_MAGIC) + RECORD.size :]
         header = Header.read(stream(content))
-        if data != MCAP0_MAGIC + _bytes_of(header) or header.profile:
+        if data != MCAP0_MAGIC + bytes_of(header) or header.profile:
             raise ValueError("its first bytes are not the header of one of our files")
 
     def _record(self, place: int, data: bytes) -> None:
@@ -201,33 +188,32 @@ class _Walk:
             self._chunk(index.chunks[place], data)
         elif place in index.attachments:
             attachment = Attachment.read(stream(content))
-            _check_same(_bytes_of(attachment), data, "an attachment")
+            _check_same(bytes_of(attachment), data, "an attachment")
         else:
             metadata = Metadata.read(stream(content))
-            _check_same(_bytes_of(metadata), data, "a metadata record")
+            _check_same(bytes_of(metadata), data, "a metadata record")
             if metadata.name != index.metadata[place].name:
                 raise ValueError("a metadata record has another name than in the index")
             self._check.metadata[metadata.name] = metadata.metadata
 
     def _chunk(self, told: ChunkIndex, data: bytes) -> None:
         """A chunk and the message indexes behind it."""
-        chunk = Chunk.read(stream(data[RECORD.size : told.chunk_length]))
-        head = _head_of(chunk, told)
-        _check_same(head, data[: len(head)], "the head of a chunk")
-        messages = self._contents(_uncompressed(chunk))
+        head, content = chunk_content(memoryview(data)[RECORD.size : told.chunk_length])
+        _check_same(_head_bytes(head, told), data[: RECORD.size + head.begin], "the head of a chunk")
+        messages = self._contents(content)
         offsets, indexes = _message_indexes(messages, told.chunk_start_offset + told.chunk_length)
         _check_same(indexes, data[told.chunk_length :], "the index of a chunk's messages")
         times_ns = [message.time_ns for message in messages]
         rebuilt = ChunkIndex(
             chunk_length=told.chunk_length,
             chunk_start_offset=told.chunk_start_offset,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
+            compression=head.compression.decode(),
+            compressed_size=told.chunk_length - RECORD.size - head.begin,
             message_end_time=max(times_ns),
             message_index_length=len(indexes),
             message_index_offsets=offsets,
             message_start_time=min(times_ns),
-            uncompressed_size=chunk.uncompressed_size,
+            uncompressed_size=head.size_bytes,
         )
         if rebuilt != told:
             raise ValueError("a chunk's size or times are not those in the index")
@@ -240,9 +226,9 @@ class _Walk:
         offset = 0
         for opcode, content in records(data):
             if opcode == Opcode.MESSAGE:
-                channel, sequence, time_ns, _ = _MESSAGE.unpack_from(content)
+                channel, sequence, time_ns, _ = MESSAGE.unpack_from(content)
                 topic = self._index.channels[channel].topic  # the first chunk, which tells it too, may be damaged
-                message = Message(topic, sequence, time_ns, bytes(content[_MESSAGE.size :]))
+                message = Message(topic, sequence, time_ns, bytes(content[MESSAGE.size :]))
                 placed.append(_Placed(channel, offset, time_ns, message))
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream(content))
@@ -297,15 +283,15 @@ class _Placed(NamedTuple):
     message: Message
 
 
-def _head_of(chunk: Chunk, told: ChunkIndex) -> bytes:
+def _head_bytes(head: ChunkHead, told: ChunkIndex) -> bytes:
     """What stands before the data of a chunk, by the index where that tells it."""
     name = told.compression.encode()
     times_ns = told.message_start_time, told.message_end_time
     return (
         RECORD.pack(Opcode.CHUNK, told.chunk_length - RECORD.size)
-        + _CHUNK.pack(*times_ns, told.uncompressed_size, chunk.uncompressed_crc, len(name))
+        + CHUNK.pack(*times_ns, told.uncompressed_size, head.crc, len(name))
         + name
-        + _LENGTH.pack(told.compressed_size)
+        + LENGTH.pack(told.compressed_size)
     )
 
 
@@ -318,44 +304,10 @@ def _message_indexes(messages: list[_Placed], place: int) -> tuple[dict[int, int
     data = b""
     for channel, places in entries.items():
         offsets[channel] = place + len(data)
-        data += _bytes_of(MessageIndex(channel, places))
+        data += bytes_of(MessageIndex(channel, places))
     return offsets, data
-
-
-def _uncompressed(chunk: Chunk) -> memoryview:
-    """The records of a chunk, its CRC checked."""
-    data, size = chunk.data, chunk.uncompressed_size
-    if size > CHUNK_LIMIT_BYTES:
-        raise ValueError(f"a chunk claims {size} bytes")
-    if chunk.compression == "zstd":
-        if zstandard.frame_content_size(data) != size:  # else a damaged size would be allocated as told
-            raise ValueError("a chunk's size is wrong")
-        data = zstandard.decompress(data)
-    elif chunk.compression:
-        raise ValueError(f"a chunk is compressed with {chunk.compression!r}")
-    if len(data) != size:
-        raise ValueError("a chunk's size is wrong")
-    _check_crc(data, chunk.uncompressed_crc, "a chunk")
-    return memoryview(data)
-
-
-def _bytes_of(record: McapRecord) -> bytes:
-    """The record as the writer would write it."""
-    builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()
 
 
 def _check_same(expected: bytes, found: bytes, what: str) -> None:
     if expected != found:
         raise ValueError(f"{what} is damaged")
-
-
-def _crc_at(data: bytes, place: int) -> int:
-    (crc,) = CRC.unpack_from(data, place)
-    return crc
-
-
-def _check_crc(data: bytes, crc: int, what: str) -> None:
-    if zlib.crc32(data) != crc:
-        raise ValueError(f"the CRC of {what} is wrong")

@@ -23,6 +23,7 @@ from drivers.interface import Frame, SessionError
 from stand.hub import Event, Item, StepMark
 from stand.recording import messages
 from stand.recording.columns import Column, TopicColumns
+from stand.recording.damage import naming
 from stand.recording.items import (
     ImagesToCome,
     RecordedImage,
@@ -41,7 +42,6 @@ from stand.recording.records import (
     MessageSpan,
     frame_places,
     message_span,
-    naming,
     read_frame,
     read_head,
     telemetry_messages,

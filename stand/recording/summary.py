@@ -6,20 +6,16 @@ read, and the rest when somebody asks for it.
 
 from __future__ import annotations
 
-import io
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple
 
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
-RECORD = struct.Struct("<BQ")  # opcode, length
-CRC = struct.Struct("<I")
+from stand.recording.wire import CRC, RECORD, RECORD_LIMIT_BYTES, check_crc, records, stream
 
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, begin of its offsets; a CRC follows
 _FOOTER_BYTES = _FOOTER.size + CRC.size + len(MCAP0_MAGIC)
@@ -53,16 +49,17 @@ class Statistics(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a segment's index tells."""
+    """What a segment's index tells; `begin`: where it begins in the file, behind the data. `content`: its records."""
 
     statistics: Statistics
-    _content: memoryview
+    begin: int
+    content: memoryview
 
     def channels(self) -> dict[int, tuple[Channel, str]]:
         """Channel id -> the channel and its schema's name; ValueError or LookupError when they do not fit together."""
         schemas: dict[int, str] = {}
         channels: list[Channel] = []
-        for opcode, record in records(self._content):
+        for opcode, record in records(self.content):
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream(record))
                 schemas[schema.id] = schema.name
@@ -74,7 +71,7 @@ class Summary:
 
     def chunks(self) -> Iterator[ChunkPlace]:
         """The chunks in the order of the file."""
-        for opcode, record in records(self._content):
+        for opcode, record in records(self.content):
             if opcode == Opcode.CHUNK_INDEX:
                 first_ns, last_ns, offset, length, map_bytes = _CHUNK_INDEX.unpack_from(record)
                 yield ChunkPlace(first_ns, last_ns, offset, length, tuple(_map(record, _CHUNK_INDEX.size, map_bytes)))
@@ -82,29 +79,31 @@ class Summary:
 
 def read_summary(file: BinaryIO, size_bytes: int) -> Summary:
     """The summary of a finished segment of that size; ValueError, struct.error or EOFError when it is damaged."""
-    content = _summary_bytes(file, size_bytes)
+    begin, content = _summary_bytes(file, size_bytes)
     record = next((record for opcode, record in records(content) if opcode == Opcode.STATISTICS), None)
     if record is None:
         raise ValueError("the index has no statistics")
     count, _, _, attachments, _, _, first_ns, last_ns, map_bytes = _STATISTICS.unpack_from(record)
     counts = _map(record, _STATISTICS.size, map_bytes)
-    return Summary(Statistics(count, attachments, first_ns, last_ns, counts), content)
+    return Summary(Statistics(count, attachments, first_ns, last_ns, counts), begin, content)
 
 
 def _map(record: memoryview, begin: int, size_bytes: int) -> dict[int, int]:
     return dict(_MAP_ENTRY.iter_unpack(record[begin : begin + size_bytes]))
 
 
-def _summary_bytes(file: BinaryIO, size_bytes: int) -> memoryview:
-    """The records of the summary, their CRC checked, which covers the footer before the CRC, too."""
+def _summary_bytes(file: BinaryIO, size_bytes: int) -> tuple[int, memoryview]:
+    """Where the summary begins, and its records, their CRC checked, which covers the footer before the CRC, too."""
     tail_begin = max(0, size_bytes - _TAIL_BYTES)
     file.seek(tail_begin)
     tail = file.read(size_bytes - tail_begin)
+    if not tail.endswith(MCAP0_MAGIC):
+        raise ValueError("it ends in the middle")
     footer_begin = len(tail) - _FOOTER_BYTES
     opcode, length, begin, _ = _FOOTER.unpack_from(tail, max(0, footer_begin))
     if opcode != Opcode.FOOTER or length != _FOOTER_BYTES - RECORD.size - len(MCAP0_MAGIC):
         raise ValueError("the footer is damaged")
-    if not len(MCAP0_MAGIC) <= begin <= tail_begin + footer_begin:
+    if not len(MCAP0_MAGIC) <= begin <= tail_begin + footer_begin or size_bytes - begin > RECORD_LIMIT_BYTES:
         raise ValueError("the index is not in the file")
     if begin < tail_begin:
         file.seek(begin)
@@ -112,28 +111,5 @@ def _summary_bytes(file: BinaryIO, size_bytes: int) -> memoryview:
         tail_begin = begin
     content = memoryview(tail)[begin - tail_begin :]
     (crc,) = CRC.unpack_from(content, len(content) - CRC.size - len(MCAP0_MAGIC))
-    check_crc(content[: -CRC.size - len(MCAP0_MAGIC)], crc)
-    return content[:-_FOOTER_BYTES]
-
-
-def records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, content) of each record; struct.error when the last one is cut."""
-    offset = 0
-    while offset < len(data):
-        opcode, length = RECORD.unpack_from(data, offset)
-        offset += RECORD.size
-        if length > len(data) - offset:
-            raise struct.error("a record is cut short")
-        yield opcode, data[offset : offset + length]
-        offset += length
-
-
-def check_crc(data: bytes | memoryview, crc: int, before: bytes = b"") -> None:
-    """ValueError when `before` and `data` are not what the CRC was made of."""
-    if zlib.crc32(data, zlib.crc32(before)) != crc:
-        raise ValueError("a CRC is wrong")
-
-
-def stream(data: bytes | memoryview) -> ReadDataStream:
-    """`data` for the mcap package's record readers."""
-    return ReadDataStream(io.BytesIO(data))
+    check_crc(content[: -CRC.size - len(MCAP0_MAGIC)], crc, "its index")
+    return begin, content[:-_FOOTER_BYTES]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from mcap.reader import SeekingReader
 from mcap.records import Channel
 
 from drivers.interface import SessionError
 from stand.recording import messages
+from stand.recording.damage import reading
 from stand.recording.layout import DEVICES, TELEMETRY
-from stand.recording.records import DAMAGE
 from stand.recording.segment import Topic
 from stand.recording.session import Session
+from stand.recording.summary import read_summary
 
 
 def recorded_topics(session: Session) -> tuple[Topic, ...]:
@@ -41,12 +41,7 @@ def _channels(session: Session) -> list[Channel]:
     for path in session.segments:
         if path.parent.name != TELEMETRY:
             continue
-        try:
-            with path.open("rb") as file:
-                summary = SeekingReader(file, record_size_limit=path.stat().st_size).get_summary()
-        except DAMAGE as error:
-            raise SessionError(f"{path}: damaged or not readable ({type(error).__name__}: {error})") from error
-        if summary is None:
-            raise SessionError(f"{path}: has no index")
-        channels += [summary.channels[number] for number in sorted(summary.channels)]
+        with reading(path), path.open("rb") as file:
+            told = read_summary(file, path.stat().st_size).channels()
+        channels += [told[number][0] for number in sorted(told)]
     return channels

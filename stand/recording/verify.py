@@ -20,6 +20,7 @@ from mcap.stream_reader import StreamReader
 from drivers.clock import NS_PER_S
 from drivers.interface import SessionError
 from stand.recording.contents import RUN_END, Contents, FrameKey
+from stand.recording.damage import DAMAGE
 from stand.recording.gaps import FRAMES_DROPPED, silences, told_blocks
 from stand.recording.images import CAMERA_IMAGE
 from stand.recording.instants import date_time
@@ -33,7 +34,7 @@ from stand.recording.layout import (
     TELEMETRY,
     segment_metadata,
 )
-from stand.recording.records import DAMAGE, Message
+from stand.recording.records import Message
 from stand.recording.salvage import SALVAGE_METADATA
 from stand.recording.segment_check import Damage, SegmentCheck, check_segment
 

@@ -1,8 +1,8 @@
 """A segment's bytes, whatever happened to them: what in them proves itself, and where nothing does.
 
-Read by place from the front; what counts as a proof is in stand/recording/proof.py. Behind a damaged place the walk
-goes on where the next record looks like one and proves to be one. Inside sound records nothing is searched, so an
-MCAP file that is attached is an attachment.
+Read by place from the front; what counts as a proof is in stand/recording/proof.py, what as a block that was being
+written in stand/recording/torn.py. Behind a damaged place the walk goes on where the next record looks like one and
+proves to be one. Inside sound records nothing is searched, so an MCAP file that is attached is an attachment.
 
 Memory is flat: one record at a time. Only OSError is raised, when the disk does not give a byte.
 """
@@ -18,32 +18,17 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, Footer, Metadata, Schema
+from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from stand.recording.damage import DAMAGE
 from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
-from stand.recording.proof import (
-    CRC,
-    MESSAGE,
-    OPCODES,
-    RECORD,
-    RECORD_LIMIT_BYTES,
-    Claim,
-    Contents,
-    check_chunk_lengths,
-    check_crc,
-    claim_of,
-    proven,
-    records_of,
-    stream_of,
-    uncompressed,
-)
-from stand.recording.records import DAMAGE
+from stand.recording.proof import Contents, claim_of, proven
+from stand.recording.summary import read_summary
+from stand.recording.torn import Blocks
+from stand.recording.wire import MESSAGE, RECORD, Source, chunk_content, chunk_head, records, stream
 
 WINDOW_BYTES = 4 << 20
-FIRST_BLOCK_BYTES = 1 << 14  # the opening of a segment, or its first block of a second's telemetry with the schemas
-
-_FOOTER_BYTES = RECORD.size + 20
 
 # Heads of records, little endian: lengths below 2**29, compression "" or "zstd".
 _CHUNK_HEAD = (
@@ -56,18 +41,6 @@ _SESSION_HEAD = rb"\x0c(?=.{8}\x07\x00{3}session)"
 _IN_OPENING = re.compile(_CHUNK_HEAD + b"|" + _ATTACHMENT_HEAD + b"|" + _SESSION_HEAD, re.DOTALL)
 _AFTER_OPENING = re.compile(_CHUNK_HEAD, re.DOTALL)
 _HEAD_BYTES = 64  # more than any of the patterns looks at
-
-
-class Source:
-    """An open file, read by place."""
-
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
-        self.size = os.fstat(fd).st_size
-
-    def read(self, offset: int, length: int) -> bytes:
-        """The bytes there, fewer at the end of the file; raises OSError."""
-        return os.pread(self._fd, length, offset)
 
 
 class ChunkPlace(NamedTuple):
@@ -131,10 +104,10 @@ def survey(source: Source, to_first_chunk: bool = False) -> Survey:
 def stored_messages(source: Source, place: ChunkPlace) -> Iterator[StoredMessage]:
     """The messages of a sound chunk in their order; OSError when the disk does not give the same bytes again."""
     try:
-        chunk = uncompressed(memoryview(source.read(*place)))
+        _, content = chunk_content(memoryview(source.read(*place)))
     except DAMAGE as error:
         raise OSError(errno.EIO, f"{os.strerror(errno.EIO)}: it reads differently each time") from error
-    for opcode, record in records_of(chunk):
+    for opcode, record in records(content):
         if opcode == Opcode.MESSAGE:
             channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(record)
             yield StoredMessage(channel, sequence, log_time_ns, publish_time_ns, bytes(record[MESSAGE.size :]))
@@ -154,7 +127,7 @@ class _Walk:
     def __init__(self, source: Source) -> None:
         self.found = Survey()
         self._source = source
-        self._blocks = _Blocks()
+        self._blocks = Blocks()
         self._index_begin: int | None = None
         self._sound_attachments: dict[str, Attachment] = {}  # those before the first damage
 
@@ -185,7 +158,7 @@ class _Walk:
             return None
         try:
             if claim.opcode == Opcode.CHUNK:  # before its bytes are read: a false one may claim very many
-                check_chunk_lengths(head[RECORD.size :], claim.length)
+                chunk_head(head[RECORD.size :], claim.length)
             content = proven(claim.opcode, self._source.read(offset + RECORD.size, claim.length))
         except DAMAGE as error:
             if isinstance(error, OSError):
@@ -210,7 +183,7 @@ class _Walk:
     def _note_gap(self, gap: Gap) -> None:
         if gap.begin == self._index_begin and gap.end == self._source.size:
             return
-        if gap.end == self._source.size and self._blocks.is_torn(self._source, gap):
+        if gap.end == self._source.size and self._blocks.is_torn(self._source, gap.begin):
             self.found.torn_bytes = gap.end - gap.begin
         else:
             if not self.found.damages:
@@ -250,84 +223,18 @@ class _Walk:
 
     def _take_index(self, begin: int) -> bool:
         """Learn from the index at `begin` when all of it is sound, to the end of the file."""
-        data = self._source.read(begin, min(self._source.size - begin, RECORD_LIMIT_BYTES))
-        footer_begin = len(data) - len(MCAP0_MAGIC) - _FOOTER_BYTES
         try:
-            if footer_begin < 0 or not data.endswith(MCAP0_MAGIC):
-                raise ValueError("the file ends in its index")
-            footer = Footer.read(stream_of(data[footer_begin + RECORD.size :]))
-            check_crc(data[: footer_begin + _FOOTER_BYTES - CRC.size], footer.summary_crc)
-            if footer.summary_start != begin:
+            with self._source.file() as file:
+                summary = read_summary(file, self._source.size)
+            if summary.begin != begin:
                 raise ValueError("the index does not begin behind the data")
-            for opcode, record in records_of(memoryview(data)[:footer_begin]):
+            for opcode, record in records(summary.content):
                 if opcode == Opcode.SCHEMA:
-                    schema = Schema.read(stream_of(record))
+                    schema = Schema.read(stream(record))
                     self.found.schemas[schema.id] = schema
                 elif opcode == Opcode.CHANNEL:
-                    channel = Channel.read(stream_of(record))
+                    channel = Channel.read(stream(record))
                     self.found.channels[channel.id] = channel
         except DAMAGE:
             return False
         return True
-
-
-class _Blocks:
-    """How long the blocks are that were written at once: a chunk and the message indexes behind it."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._end = 0  # of the last one
-        self._largest_bytes = FIRST_BLOCK_BYTES
-        self._largest_index_bytes = _index_bytes(Counter((0,)))
-
-    def note(self, begin: int, chunk_end: int, messages: Counter[int]) -> None:
-        """The block of the sound chunk [begin, chunk_end)."""
-        self._count += 1
-        index_bytes = _index_bytes(messages)
-        self._end = chunk_end + index_bytes
-        known_bytes = self._largest_bytes if self._count > 2 else 0  # the first is longer, for it holds the schemas
-        self._largest_bytes = max(known_bytes, self._end - begin)
-        self._largest_index_bytes = max(self._largest_index_bytes, index_bytes)
-
-    def is_torn(self, source: Source, gap: Gap) -> bool:
-        """Whether the end of the file is what one interrupted write leaves: the beginning of a block, then zeros or
-        nothing, and no more than a block. What a whole block held was acknowledged; a block that is cut or zero at its
-        end never was."""
-        written_end = _last_written(source, gap)
-        head = source.read(gap.begin, RECORD.size)
-        claim = claim_of(head)
-        head = head[: written_end - gap.begin]
-        if gap.begin == 0:
-            is_begun = MCAP0_MAGIC.startswith(head)
-        elif len(head) < RECORD.size:
-            is_begun = not head or head[0] in OPCODES
-        else:
-            is_begun = claim is not None and written_end < gap.begin + RECORD.size + claim.length
-        if gap.begin < self._end:
-            return is_begun and gap.end <= self._end
-        # Of a head that ends in zeros nobody knows whether they are the length's own.
-        block_bytes = self._largest_bytes if len(head) < RECORD.size else 0
-        if claim is not None:
-            block_bytes = max(block_bytes, self._claimed_bytes(claim))
-        return is_begun and gap.end <= gap.begin + block_bytes
-
-    def _claimed_bytes(self, claim: Claim) -> int:
-        """The size of the block that begins with that record."""
-        rest_bytes = self._largest_index_bytes if claim.opcode == Opcode.CHUNK else FIRST_BLOCK_BYTES
-        return RECORD.size + claim.length + rest_bytes
-
-
-def _index_bytes(messages: Counter[int]) -> int:
-    """The size of the message indexes behind a chunk with so many messages of each channel."""
-    return sum(RECORD.size + 6 + 16 * count for count in messages.values())
-
-
-def _last_written(source: Source, gap: Gap) -> int:
-    """Where the zeros begin that fill the end of the file."""
-    end = gap.end
-    while end > gap.begin:
-        begin = max(gap.begin, end - WINDOW_BYTES)
-        if data := source.read(begin, end - begin).rstrip(b"\0"):
-            return begin + len(data)
-        end = begin
-    return gap.begin

@@ -1,0 +1,127 @@
+"""The records of an MCAP file as bytes: how they are framed, what a chunk holds, which sizes are believed.
+
+Reader, salvage and verification all read through here, so that what one of them accepts the others accept, too.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import BinaryIO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.records import McapRecord
+
+RECORD = struct.Struct("<BQ")  # opcode, length
+CRC = struct.Struct("<I")
+LENGTH = struct.Struct("<Q")
+MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
+CHUNK = struct.Struct("<qqQII")  # first and last log time, uncompressed size, CRC, length of the compression's name
+MESSAGE_INDEX = struct.Struct("<HI")  # channel id, length of the entries
+MESSAGE_INDEX_ENTRY = struct.Struct("<QQ")  # log time, place in the chunk
+
+CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; whoever claims more is damaged
+INFLATED_LIMIT_BYTES = 1 << 26  # only telemetry is compressed, and its chunks are 1 MiB and a message
+RECORD_LIMIT_BYTES = CHUNK_LIMIT_BYTES + 1024
+
+_NAME_BYTES = {b"": 0, b"zstd": 4}
+
+
+class Source:
+    """An open file, read by place."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self.size = os.fstat(fd).st_size
+
+    def read(self, offset: int, length: int) -> bytes:
+        """The bytes there, fewer at the end of the file; raises OSError."""
+        return os.pread(self._fd, length, offset)
+
+    def file(self) -> BinaryIO:
+        """The same file for those who seek in it; it stays open when that is closed."""
+        return os.fdopen(self._fd, "rb", closefd=False)
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk's record says of it; its data begins at `begin`. The times are log times, the CRC is that of the
+    uncompressed data."""
+
+    first_ns: int
+    last_ns: int
+    size_bytes: int
+    crc: int
+    compression: bytes
+    begin: int
+
+
+def records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """(opcode, content) of each record; struct.error when the last one is cut."""
+    offset = 0
+    while offset < len(data):
+        opcode, length = RECORD.unpack_from(data, offset)
+        offset += RECORD.size
+        if length > len(data) - offset:
+            raise struct.error("a record is cut short")
+        yield opcode, data[offset : offset + length]
+        offset += length
+
+
+def stream(data: bytes | memoryview) -> ReadDataStream:
+    """The content of a record, for the mcap package's record readers."""
+    return ReadDataStream(io.BytesIO(data))
+
+
+def bytes_of(record: McapRecord) -> bytes:
+    """The record as the writer writes it."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def check_crc(data: bytes | memoryview, crc: int, what: str, before: bytes = b"") -> None:
+    """ValueError when `before` and `data` are not what the CRC was made of."""
+    if zlib.crc32(data, zlib.crc32(before)) != crc:
+        raise ValueError(f"the CRC of {what} is wrong")
+
+
+def check_attachment(content: bytes) -> None:
+    """ValueError when an attachment's record does not fit its CRC, struct.error when it has none."""
+    (crc,) = CRC.unpack(content[-CRC.size :])
+    check_crc(content[: -CRC.size], crc, "an attachment")
+
+
+def chunk_head(content: bytes | memoryview, length: int) -> ChunkHead:
+    """The head of a chunk, from the begin of its record's content, which has that length; ValueError when its sizes
+    are not those of a chunk of ours, struct.error when it is cut."""
+    first_ns, last_ns, size_bytes, crc, name_bytes = CHUNK.unpack_from(content)
+    name = bytes(content[CHUNK.size : CHUNK.size + min(name_bytes, 16)])
+    if _NAME_BYTES.get(name) != name_bytes:
+        raise ValueError(f"a chunk is compressed with {name!r}")
+    if size_bytes > (INFLATED_LIMIT_BYTES if name else CHUNK_LIMIT_BYTES):
+        raise ValueError(f"a chunk claims {size_bytes} bytes")
+    (data_bytes,) = LENGTH.unpack_from(content, CHUNK.size + name_bytes)
+    begin = CHUNK.size + name_bytes + LENGTH.size
+    if begin + data_bytes != length or (not name and data_bytes != size_bytes):
+        raise ValueError("a chunk's size is wrong")
+    return ChunkHead(first_ns, last_ns, size_bytes, crc, name, begin)
+
+
+def chunk_content(content: memoryview) -> tuple[ChunkHead, memoryview]:
+    """Head and records of a chunk, from the whole content of its record, the CRC checked; ValueError, struct.error or
+    ZstdError when it is damaged."""
+    head = chunk_head(content, len(content))
+    data = content[head.begin :]
+    if head.compression:
+        # As much memory is taken as the frame says: so both have to say the same.
+        if zstandard.frame_content_size(data) != head.size_bytes:
+            raise ValueError("a chunk's size is wrong")
+        data = memoryview(zstandard.decompress(data))
+        if len(data) != head.size_bytes:
+            raise ValueError("a chunk's size is wrong")
+    check_crc(data, head.crc, "a chunk")
+    return head, data
