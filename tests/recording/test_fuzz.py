@@ -16,12 +16,14 @@ from drivers.interface import Frame, Reading, SessionError
 from stand.hub import Batch, Event, StepMark, StepState
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.overview import overview
 from stand.recording.records import frame_places, read_frame, telemetry_messages
 from stand.recording.salvage import salvage_session
 from stand.recording.segment import Record, SeriesForm, Topic
 from stand.recording.series import Series
 from stand.recording.session import Session
 from stand.recording.telemetry import TelemetryEncoder
+from stand.recording.verify import verify
 from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
 
 START_NS = 1_767_290_400 * NS_PER_S
@@ -34,6 +36,7 @@ LIMIT_S = 5.0
 ROUNDS = 8
 INPUTS = 10_000
 SALVAGES = 1000
+VERIFICATIONS = 1000
 
 
 class TooSlow(BaseException):
@@ -251,6 +254,26 @@ def test_salvage_of_wrong_content_under_right_crcs_gives_data_or_a_sentence(soun
                 check_errors([error], directory)
             check_errors(read_everything(directory, {}), directory)
             shutil.rmtree(directory)
+
+
+@pytest.mark.parametrize("mutations", [(mutate_bytes, mutate_field, mutate_order), (mutate_inside,)])
+def test_verify_and_overview_answer_whatever_a_segment_holds(sound, tmp_path, mutations):
+    """Damage is part of their answer, and what verify does not find is harmless."""
+    directory = shutil.copytree(sound, tmp_path / "copy")
+    expected = {}
+    assert read_everything(directory, expected) == []
+    found = 0
+    with limits():
+        for _ in mutants(directory, 400, mutations, VERIFICATIONS // 4):
+            overview(directory)
+            findings = verify(directory).findings
+            found += bool(findings)
+            assert not any("\n" in str(finding) for finding in findings)
+            if not findings and mutate_inside not in mutations:
+                delivered = {}
+                assert read_everything(directory, delivered) == []
+                assert delivered == expected
+    assert found > VERIFICATIONS / 8
 
 
 def test_the_broken_sessions_begin_with_sound_ones(sound, tmp_path):
