@@ -2,33 +2,43 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Sequence
-from statistics import median
+from collections import Counter, deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from statistics import median_low
+from types import MappingProxyType
 
 from drivers.clock import NS_PER_S
 from stand.estimate import PricedStep
 from stand.hub import StepMark, StepState
 
-_REMEMBERED = 9  # measurements of a kind of work: the last ones count
+_REMEMBERED = 9  # the last measurements of a kind of work count
 
 
 class Eta:
     """Follows a run by its step marks and says how long it will still take on the stand's clock.
 
-    What work of a kind takes beyond what is stated is believed as estimated until the run has done such work once,
-    from then on as measured (the median). `done`: indices of steps that an earlier part of the run has done; steps
-    before the running one are never waited for.
+    What work of a kind takes beyond what is stated is the lower median of the estimate and what the run has measured:
+    a single delay, such as a pause that nobody told of, changes nothing. Steps before the running one are never waited
+    for.
+
+    Of a run that goes on after an interruption, `done` are the ids of steps that are done, `earned_s` what others have
+    earned of what is stated, by their ids.
     """
 
-    def __init__(self, steps: Sequence[PricedStep], done: Collection[int] = ()) -> None:
-        self._steps = steps
-        self._waiting = {step.planned.index: step for step in steps if step.planned.index not in done}
+    def __init__(
+        self,
+        steps: Sequence[PricedStep],
+        done: Collection[str] = (),
+        earned_s: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
+        self._steps = [_owed(step, earned_s.get(step.planned.step_id, 0.0)) for step in steps]
+        self._waiting = {step.planned.index: step for step in self._steps if step.planned.step_id not in done}
         self._first = min(self._waiting, default=0)
         self._stated_s = sum(step.stated_s for step in self._waiting.values())
         self._count = Counter(step.work for step in self._waiting.values())
         self._overhead_s = {step.work: step.duration_s - step.stated_s for step in steps}
-        self._measured_s: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_REMEMBERED))
+        self._seen_s = {work: deque([usual_s], _REMEMBERED) for work, usual_s in self._overhead_s.items()}
         self._running: PricedStep | None = None
         self._begun_ns = 0
         self._held_since_ns: int | None = None
@@ -43,9 +53,9 @@ class Eta:
             return
         running, self._running = self._running, None
         if running is not None and mark.state is StepState.DONE:
-            measured_s = self._measured_s[running.work]
-            measured_s.append(self._progress_s(mark.time_ns) - running.stated_s)
-            self._overhead_s[running.work] = median(measured_s)
+            seen_s = self._seen_s[running.work]
+            seen_s.append(self._progress_s(mark.time_ns) - running.stated_s)
+            self._overhead_s[running.work] = median_low(seen_s)
 
     def hold(self, time_ns: int) -> None:
         """The run is paused: the running step makes no progress."""
@@ -80,3 +90,8 @@ class Eta:
     def _progress_s(self, now_ns: int) -> float:
         held_ns = self._held_ns + (0 if self._held_since_ns is None else now_ns - self._held_since_ns)
         return (now_ns - self._begun_ns - held_ns) / NS_PER_S
+
+
+def _owed(step: PricedStep, earned_s: float) -> PricedStep:
+    earned_s = min(earned_s, step.stated_s)
+    return replace(step, stated_s=step.stated_s - earned_s, duration_s=step.duration_s - earned_s)

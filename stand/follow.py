@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from types import MappingProxyType
 
 from drivers.clock import NS_PER_S, seconds_ns
 from stand.estimate import PricedStep
@@ -19,14 +20,19 @@ class Follow:
     """A subscriber of the hub. It reports progress as expected stand seconds of the whole plan, which is what the plan
     takes on the clock of the stand: in virtual time the bar's own time left is wall time, the text's is stand time.
 
-    `report`: of a progress with the total `total_s`. `warn(line)`: gets warnings and errors as they come. `done`:
-    indices of steps that an earlier part of the run has done.
+    `report`: of a progress with the total `total_s`. `warn(line)`: gets warnings and errors as they come. `done`,
+    `earned_s`: as Eta has them.
     """
 
     def __init__(
-        self, steps: Sequence[PricedStep], report: Report, warn: Callable[[str], None], done: Collection[int] = ()
+        self,
+        steps: Sequence[PricedStep],
+        report: Report,
+        warn: Callable[[str], None],
+        done: Collection[str] = (),
+        earned_s: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        self.eta = Eta(steps, done)
+        self.eta = Eta(steps, done, earned_s)
         self._total_s = max(sum(step.duration_s for step in steps), 1e-9)
         self._count = len(steps)
         self._report, self._warn = report, warn
