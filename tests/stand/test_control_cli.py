@@ -1,0 +1,122 @@
+"""The commands for a run that is under way, against a daemon in this process."""
+
+import asyncio
+import json
+from pathlib import Path
+
+import yaml
+from click.testing import Result
+from typer.testing import CliRunner
+
+from stand.config import packaged
+from stand.control import SOCKET_NAME, RunStatus, handlers, serve
+from stand.control_cli import app
+from stand.gate import Gate
+
+runner = CliRunner()
+
+STATUS = RunStatus(
+    recipe="thermal-cycle",
+    step=12,
+    steps=87,
+    doing="Soak duration_s=2700",
+    state="held",
+    reasons=("disk_low", "operator"),
+    now_ns=1_767_290_400_000_000_000,
+    since_ns=1_767_290_340_000_000_000,
+    end_ns=1_767_294_000_000_000_000,
+    temperatures_degC={"thermometers.air": 23.98, "camera.temperature": None},
+    frames_saved=120,
+    frames_lost=1,
+    disk_free_bytes=12_300_000_000,
+    warning="a line\nand another",
+)
+
+
+def gate_held_by(*reasons: str) -> Gate:
+    gate = Gate()
+    for reason in reasons:
+        gate.hold(reason)
+    return gate
+
+
+async def invoke(*arguments: str | Path) -> Result:
+    return await asyncio.to_thread(runner.invoke, app, [str(argument) for argument in arguments])
+
+
+def session(root: Path, name: str) -> Path:
+    path = root / name
+    path.mkdir()
+    return path
+
+
+async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
+    path = session(tmp_path, "night")
+    async with serve(path / SOCKET_NAME, handlers(Gate(), lambda: None, lambda: STATUS)):
+        lines = (await invoke("status", tmp_path)).stdout.splitlines()
+        told = json.loads((await invoke("status", path, "--json")).stdout)
+    assert lines == [
+        f"session       {path}",
+        "recipe        thermal-cycle",
+        "state         held: disk_low, operator, since 2026-01-01 17:59:00 UTC (0:01:00)",
+        "step          12/87 Soak duration_s=2700",
+        "ends          2026-01-01 19:00:00 UTC (in 1:00:00)",
+        "temperatures  thermometers.air 23.98 degC",
+        "temperatures  camera.temperature BAD",
+        "frames        120 saved, 1 lost",
+        "disk          12.3 GB free",
+        "last warning  a line\\nand another",
+    ]
+    assert RunStatus.model_validate(told) == STATUS
+    assert told["session"] == str(path)
+
+
+async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_path: Path):
+    path, gate, stopped = session(tmp_path, "night"), gate_held_by("interlock"), asyncio.Event()
+    async with serve(path / SOCKET_NAME, handlers(gate, stopped.set, lambda: STATUS)):
+        assert "paused" in (await invoke("pause", tmp_path)).stdout
+        assert gate.reasons == {"operator", "interlock"}
+        held = (await invoke("continue", tmp_path)).stdout
+        assert "still held: interlock; `stand clear` once the cause is gone" in held
+        assert (await invoke("clear", tmp_path)).stdout.strip() == f"{path}: cleared; the run goes on"
+        nothing = await invoke("clear", tmp_path)
+        assert nothing.exit_code == 1
+        assert "nothing to clear" in nothing.stderr
+        assert not stopped.is_set()
+        assert (await invoke("stop", path)).exit_code == 0
+        assert stopped.is_set()
+
+
+async def test_without_a_name_the_only_running_session_is_meant(tmp_path: Path):
+    first, second = session(tmp_path, "first"), session(tmp_path, "second")
+    table = handlers(Gate(), lambda: None, lambda: STATUS)
+    nobody = await invoke("status", tmp_path)
+    assert nobody.exit_code == 1
+    assert nobody.stderr == f"error: {tmp_path}: no daemon is running a session there\n"
+    async with serve(second / SOCKET_NAME, table):
+        assert str(second) in (await invoke("status", tmp_path)).stdout
+        async with serve(first / SOCKET_NAME, table):
+            both = await invoke("pause", tmp_path)
+    assert both.exit_code == 2
+    assert both.stderr == f"error: {tmp_path}: several sessions are running, name one: {first}, {second}\n"
+
+
+async def test_the_recording_directory_of_the_configuration_is_searched(tmp_path: Path):
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["recording"] = {"directory": str(tmp_path / "recordings")}
+    config = tmp_path / "stand.yaml"
+    config.write_text(yaml.safe_dump(data))
+    (tmp_path / "recordings").mkdir()
+    path = session(tmp_path / "recordings", "night")
+    async with serve(path / SOCKET_NAME, handlers(Gate(), lambda: None, lambda: STATUS)):
+        found = await invoke("status", "--config", config)
+    assert str(path) in found.stdout
+
+
+async def test_a_session_that_has_ended_is_said_to(tmp_path: Path):
+    path = session(tmp_path, "night")
+    (path / "telemetry").mkdir()
+    (path / "telemetry" / "0001.mcap").touch()
+    result = await invoke("stop", path)
+    assert result.exit_code == 1
+    assert result.stderr == f"error: {path}: no daemon is running this session\n"
