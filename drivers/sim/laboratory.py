@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 from drivers.clock import FollowedClock, WallClock, seconds_ns
 from drivers.documents import Document
@@ -79,6 +79,8 @@ class Laboratory:
         plant_spec = PlantSpec(camera=spec.camera_kind, seed=spec.seed, laboratory_degC=spec.laboratory_degC)
         self.plant = Plant(plant_spec, self._clock.now_ns())
         self._scene = Scene(SceneSpec(), spec.seed)
+        self.axes: dict[str, FakeAxis] = {}
+        self.ssr_welded_share = 0.0
         self._closers: list[Callable[[], None]] = []
         try:
             self._build()
@@ -127,6 +129,7 @@ class Laboratory:
     def _build(self) -> None:
         spec, plant, clock = self.spec, self.plant, self._clock
         self.regulator = FakeRegulator(plant, clock, spec.regulator_unit)
+        plant.on_step.append(self._conduct)  # after the regulator's
         self.relays = FakeRelays(plant, clock, spec.relays_unit, spec.relay_channels)
         self.thermometers = FakeThermometers(
             plant, clock, spec.thermometers_unit, spec.thermometer_channels, seed=spec.seed
@@ -136,6 +139,7 @@ class Laboratory:
         self.bus_faults = self._listen(spec.bus, lambda: framing(units))
         for name, settings in spec.axes.items():
             axis = FakeAxis(plant, clock, PROFILES[settings.profile], settings.serial_number, name)
+            self.axes[str(name)] = axis
             self._listen(settings.address, axis.engine)
         self.flap = FakeFlap(plant, clock, spec.flap.serial_number or "")
         host, port = _host_and_port(spec.flap.address or "")
@@ -151,6 +155,10 @@ class Laboratory:
         )
         self._closers.append(self.camera.close)
         self.camera.start()
+
+    def _conduct(self, time_ns: int, dt_s: float) -> None:
+        """A welded solid-state relay conducts whatever the regulator says."""
+        self.plant.heater_on_fraction = max(self.plant.heater_on_fraction, self.ssr_welded_share)
 
     def _listen(self, address: str, make_engine: Callable[[], Engine]) -> LinkFaults:
         faults = LinkFaults(seed=self.spec.seed)
@@ -189,6 +197,52 @@ def _pv_offset(laboratory: Laboratory, value: object) -> None:
     laboratory.regulator.pv_offset_K = float(str(value))
 
 
+def _offset_thermometer(laboratory: Laboratory, value: object) -> None:
+    laboratory.thermometers.offset_K = _of_thermometers(laboratory, value)
+
+
+def _stuck_thermometer(laboratory: Laboratory, value: object) -> None:
+    laboratory.thermometers.stuck_degC = _of_thermometers(laboratory, value)
+
+
+def _of_thermometers(laboratory: Laboratory, value: object) -> dict[int, float]:
+    """`{"air": 30.0}` by the module's channel numbers."""
+    named = TypeAdapter(dict[str, float]).validate_python(value or {})
+    return {laboratory.spec.thermometer_channels[name]: number for name, number in named.items()}
+
+
+def _stuck_pv(laboratory: Laboratory, value: object) -> None:
+    laboratory.regulator.stuck_pv_degC = None if value is None else float(str(value))
+
+
+def _press_set_point(laboratory: Laboratory, value: object) -> None:
+    laboratory.regulator.press_setpoint(float(str(value)))
+
+
+def _press_stop(laboratory: Laboratory, value: object) -> None:
+    laboratory.regulator.press_stop()
+
+
+def _press_manual(laboratory: Laboratory, value: object) -> None:
+    if value is None:
+        laboratory.regulator.press_automatic()
+    else:
+        laboratory.regulator.press_manual(float(str(value)))
+
+
+def _cut_out(laboratory: Laboratory, value: object) -> None:
+    laboratory.plant.cut_out_open = bool(value)
+
+
+def _weld_ssr(laboratory: Laboratory, value: object) -> None:
+    laboratory.ssr_welded_share = float(str(value or 0))
+
+
+def _alarm_axis(laboratory: Laboratory, value: object) -> None:
+    for name, axis in laboratory.axes.items():
+        axis.alarm = name == value
+
+
 def _silent_bus(laboratory: Laboratory, value: object) -> None:
     laboratory.bus_faults.silent = bool(value)
 
@@ -205,6 +259,10 @@ def _silent_relays(laboratory: Laboratory, value: object) -> None:
     plant.on_step.append(wait)
 
 
+def _lose_relay_writes(laboratory: Laboratory, value: object) -> None:
+    laboratory.relays.lost_writes = bool(value)
+
+
 def _flap_jam(laboratory: Laboratory, value: object) -> None:
     laboratory.flap.jam_position = None if value is None else int(str(value))
 
@@ -218,8 +276,18 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "thermometer.open": _open_thermometer,  # the channel's name: its wire is broken
     "regulator.sensor_break": _sensor_break,
     "regulator.pv_offset_K": _pv_offset,  # the probe reads wrong by this much
+    "regulator.stuck_pv_degC": _stuck_pv,
+    "regulator.set_point_degC": _press_set_point,  # somebody changes it with the keys
+    "regulator.stop_key": _press_stop,  # somebody stops control with the keys
+    "regulator.manual_percent": _press_manual,  # somebody dials in a heating output; None gives control back
+    "thermometer.offset_K": _offset_thermometer,  # {channel's name: K}
+    "thermometer.stuck_degC": _stuck_thermometer,  # {channel's name: degC}
+    "heater.cut_out": _cut_out,  # the hard-wired thermal cut-out is open: a dead heater
+    "heater.welded_share": _weld_ssr,  # share of the time its solid-state relay conducts at least
+    "axis.alarm": _alarm_axis,  # the axis' name
     "bus.silent": _silent_bus,
     "relays.silent_s": _silent_relays,  # its timed-on relays go on and drop
+    "relays.lost_writes": _lose_relay_writes,  # acknowledged, not done
     "flap.jam": _flap_jam,  # feedback counts at which it stops
     "camera.loss": _camera_loss,  # share of stream packets lost
 }

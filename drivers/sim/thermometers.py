@@ -67,8 +67,8 @@ class FakeThermometers:
 
     The noise of a reading is a pure function of (seed, channel, grid time of the plant), however often it is read.
     type_codes: range of each channel, changed over the bus too. Faults, by channel number: open_channels,
-    shorted_channels, noisy_channel (1 K instead of 3 mK), offset_K, drift_K_per_h. late_fault_bit: the fault bits are
-    those of the poll before. name: identity as in FC 0x46. silent.
+    shorted_channels, stuck_degC (the converter gives this and no noise), noisy_channel (1 K instead of 3 mK), offset_K,
+    drift_K_per_h. late_fault_bit: the fault bits are those of the poll before. name: identity as in FC 0x46. silent.
     """
 
     def __init__(self, plant: Places, clock: Now, unit: int, channels: Mapping[str, int], seed: int) -> None:
@@ -89,6 +89,7 @@ class FakeThermometers:
         self.type_codes = [0x20] * CHANNELS
         self.open_channels: set[int] = set()
         self.shorted_channels: set[int] = set()
+        self.stuck_degC: dict[int, float] = {}
         self.noisy_channel: int | None = None
         self.offset_K: dict[int, float] = {}
         self.drift_K_per_h: dict[int, float] = {}
@@ -141,6 +142,8 @@ class FakeThermometers:
             return float("inf")
         if channel in self.shorted_channels:
             return float("-inf")
+        if channel in self.stuck_degC:
+            return self.stuck_degC[channel]
         noise_K = self._noise(channel) * (NOISY_K if channel == self.noisy_channel else NOISE_K)
         wrong_K = self.offset_K.get(channel, 0.0) + self._drifted_K.get(channel, 0.0)
         return self._sensors[channel]() + noise_K + wrong_K + _signed(self._register_offsets[channel]) / 10

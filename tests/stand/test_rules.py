@@ -1,0 +1,114 @@
+"""The guard's table with the installed limits: what is said on the hub, who is excused, what costs how much time."""
+
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import seconds_ns
+from drivers.interface import Reading
+from stand.config import load_config, packaged
+from stand.hub import Batch, Event, Hub, StepMark, StepState
+from stand.interlocks import Fault
+from stand.recording.space import Notice, SpaceWatch
+from stand.rules import Announcements, watches
+
+
+class Table:
+    """The whole table over a hub on which all is well."""
+
+    def __init__(self) -> None:
+        self.hub, self.announced = Hub(), Announcements()
+        self.hub.subscribe(self.announced.receive)
+        self.watches = watches(load_config(packaged("", "simulated")), self.announced)
+        self.values = {
+            "regulator.pv": 24.0,
+            "regulator.running": 1.0,
+            "relays.heater_enable": 1.0,
+            "thermometers.air": 24.0,
+            "thermometers.granite_inside": 24.0,
+            "flap.position": 0.0,
+        }
+
+    def look(self, time_s: float, **changed: float) -> list[Fault]:
+        """All read anew, with a little noise, then every rule asked."""
+        time_ns = seconds_ns(time_s)
+        values = self.values | {name.replace("_", ".", 1): value for name, value in changed.items()}
+        noise = {"thermometers.air", "thermometers.granite_inside"}
+        for channel, value in values.items():
+            reading = Reading(channel, value + (time_s % 7) * 1e-3 * (channel in noise), "1", time_ns)
+            self.hub.publish(Batch("device", time_ns, (reading,)))
+        return [fault for watch in self.watches if (fault := watch.check(self.hub, time_ns)) is not None]
+
+    def first_s(self, until_s: int, **changed: float) -> tuple[int, Fault] | None:
+        """When something is first said, looked at every 10 s, and what."""
+        for time_s in range(0, until_s, 10):
+            if faults := self.look(time_s, **changed):
+                return time_s, faults[0]
+        return None
+
+
+def mark(kind: str, state: StepState) -> StepMark:
+    return StepMark(0, "id", 0, kind, state)
+
+
+def test_a_stand_at_rest_is_left_alone():
+    assert Table().first_s(7200) is None
+
+
+@pytest.mark.parametrize(
+    ("channel", "value", "rule"),
+    [
+        ("regulator_pv", 65.1, "over_temperature"),
+        ("thermometers_air", 65.1, "over_temperature"),
+        ("thermometers_granite_inside", 60.1, "over_temperature"),
+        ("camera_temperature", 85.1, "over_temperature"),
+    ],
+)
+def test_what_is_too_hot_aborts_at_once(channel: str, value: float, rule: str):
+    found = Table().first_s(100, **{channel: value})
+    assert found is not None
+    assert (found[0], found[1].rule, found[1].action) == (0, rule, "abort")
+
+
+def test_an_open_flap_holds_after_five_minutes_unless_a_capture_is_under_way():
+    found = Table().first_s(4000, flap_position=1.0)
+    assert found is not None
+    assert (found[0], found[1].rule, found[1].action) == (300, "flap_open", "hold")
+
+    capturing = Table()
+    capturing.hub.publish(mark("OpenFlap", StepState.STARTED))
+    capturing.hub.publish(mark("Capture", StepState.STARTED))
+    found = capturing.first_s(4000, flap_position=1.0)
+    assert found is not None
+    assert (found[0], found[1].rule) == (2700, "flap_open")
+
+
+@pytest.mark.parametrize("end", [StepState.DONE, StepState.FAILED])
+def test_a_capture_that_has_ended_excuses_nothing(end: StepState):
+    table = Table()
+    table.hub.publish(mark("Capture", StepState.STARTED))
+    table.hub.publish(mark("Capture", end))
+    found = table.first_s(4000, flap_position=1.0)
+    assert found is not None
+    assert found[0] == 300
+
+
+def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_path: Path):
+    """What the recorder's own watch says, at a limit that no disk keeps."""
+    notices: list[Notice] = []
+    SpaceWatch(tmp_path, 10**18, 0.0, lambda: 0, notices.append).check()
+    table = Table()
+    table.hub.publish(Event(0, *notices[0]))
+    found = table.first_s(4000)
+    assert found is not None
+    assert (found[0], found[1].rule, found[1].action) == (900, "disk_low", "hold")
+    assert "frames are not recorded any more" in found[1].text
+    table.hub.publish(Event(0, "info", "frames_resumed", "frames are recorded again"))
+    assert table.look(5000) == []
+
+
+def test_all_other_events_and_steps_are_no_business_of_the_rules():
+    table = Table()
+    table.hub.publish(Event(0, "error", "frames_dropped", "the disk is too slow"))
+    table.hub.publish(mark("Soak", StepState.STARTED))
+    assert (table.announced.is_capturing, table.announced.frames_stopped) == (False, "")

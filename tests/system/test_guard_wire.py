@@ -1,0 +1,263 @@
+"""Every rule against the simulator with its fault, over the real wires: found in time, and the stand is safe.
+
+One simulated laboratory serves many faults, one after the other; the guard's callbacks only write down, so that the
+chamber can be started again.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
+from drivers.interface import Quality
+from stand.assembly import Assembly, assemble
+from stand.config import StandConfig, packaged
+from stand.hub import Event, Hub
+from stand.interlocks import Fault
+from stand.recording.session import Session
+from stand.rules import Announcements, watches
+from stand.run import run_virtual
+from stand.session_setup import Order
+from stand.simulator import ControlSocket, Simulator
+from tests.system.conftest import SHORT_RECIPE, require_aravis
+
+Start = Callable[[StandConfig, bool], Simulator]
+
+
+@dataclass
+class Bench:
+    """A stand without its camera, polled and guarded in virtual time."""
+
+    assembly: Assembly
+    clock: VirtualClock
+    control: ControlSocket
+    events: list[Event]
+    trips: list[Fault] = field(default_factory=list[Fault])
+    guarding: list[asyncio.Task[None]] = field(default_factory=list[asyncio.Task[None]])
+
+    async def fault(self, name: str, value: object) -> None:
+        with self.clock.hold():
+            await self.control.request({"do": "fault", "name": name, "value": value})
+
+    async def plant(self, quantity: str) -> float:
+        with self.clock.hold():
+            return float(str((await self.control.request({"do": "state"}))[quantity]))
+
+    async def wait(self, duration_s: float) -> None:
+        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+
+    async def start(self, chamber_degC: float, soak_s: float) -> None:
+        """A chamber in good order, guarded by a guard with no memory of what was."""
+        self.trips.clear()
+        await self.assembly.stand.start_chamber(chamber_degC)
+        self.guarding = [asyncio.create_task(self.assembly.guard(self.trips.append, self.trips.append).run())]
+        await self.wait(soak_s)
+        assert self.trips == []
+        assert await self.plant("heater_enabled") == 1
+
+    async def tripped(self, within_s: float) -> Fault:
+        """The trip that comes within that time, after which heat is off at the plant and the flap closed."""
+        end_ns = self.clock.now_ns() + seconds_ns(within_s)
+        while not self.trips:
+            assert self.clock.now_ns() < end_ns, f"no trip within {within_s} s"
+            await self.wait(5)
+        await self.wait(5)
+        assert len(self.trips) == 1
+        assert await self.plant("heater_enabled") == 0
+        assert await self.plant("heater_W") == 0
+        assert await self.plant("compressor_on") == 0
+        await self.end()
+        return self.trips[0]
+
+    async def end(self) -> None:
+        await _cancel(self.guarding)
+
+
+async def _cancel(tasks: list[asyncio.Task[None]]) -> None:
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@asynccontextmanager
+async def bench_of(order: Order, start: Start) -> AsyncIterator[Bench]:
+    simulation = order.config.simulation
+    assert simulation is not None
+    await asyncio.to_thread(start, order.config, True)
+    driver, faults = ControlSocket(simulation.control), ControlSocket(simulation.control)
+    await driver.open()
+    await faults.open()
+    clock, hub = VirtualClock(seconds_ns(simulation.start.timestamp()), driver.advance), Hub()
+    assembly = assemble(order.config, hub, clock)
+    events: list[Event] = []
+    bench = Bench(assembly, clock, faults, events)  # which the hub must not know: pyusb closes what nobody refers to
+    hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
+    tasks = [asyncio.create_task(clock.run())]
+    devices = assembly.devices
+    try:
+        await assembly.bus.open()
+        for device in (devices.relays, devices.regulator, devices.thermometers, devices.flap, *devices.axes.values()):
+            await device.open()
+        await devices.regulator.stop()
+        await devices.flap.move_closed()
+        pollers = [poller for poller in assembly.pollers() if poller.sensor is not devices.camera]
+        for poller in pollers:
+            await poller.first()
+        tasks.extend(asyncio.create_task(poller.run()) for poller in pollers)
+        yield bench
+    finally:
+        await bench.end()
+        await _cancel(tasks[1:])
+        for close in (*(axis.close for axis in devices.axes.values()), devices.flap.close):
+            await close()
+        await assembly.bus.close()
+        await _cancel(tasks[:1])
+        await driver.close()
+        await faults.close()
+
+
+async def test_hands_on_the_regulator_alarms_and_an_open_flap_hold_the_stand(
+    order: Callable[..., Order], simulator: Start
+):
+    async with bench_of(order(), simulator) as bench:
+        stand = bench.assembly.stand
+
+        await bench.start(26, 60)
+        await bench.fault("regulator.set_point_degC", 45)
+        trip = await bench.tripped(60)
+        assert (trip.rule, trip.action) == ("device_fault", "hold")
+        assert "set point changed at the unit" in trip.text
+
+        await bench.start(26, 60)
+        await bench.fault("regulator.stop_key", True)
+        trip = await bench.tripped(60)
+        assert (trip.rule, trip.action) == ("regulator_stopped", "hold")
+
+        await bench.start(26, 60)
+        await bench.fault("regulator.manual_percent", 30)
+        trip = await bench.tripped(60)
+        assert (trip.rule, trip.action) == ("device_fault", "hold")
+        assert "manual" in trip.text
+        await bench.fault("regulator.manual_percent", None)
+
+        await bench.start(26, 60)
+        await bench.fault("relays.lost_writes", True)
+        trip = await bench.tripped(120)
+        assert (trip.rule, trip.action) == ("permit_missing", "hold")
+        assert "permit_not_renewed" in {event.kind for event in bench.events}
+        await bench.fault("relays.lost_writes", False)
+
+        await bench.start(26, 60)
+        await bench.fault("axis.alarm", "rotary")
+        trip = await bench.tripped(60)
+        assert (trip.rule, trip.action) == ("stage_alarm", "hold")
+        assert trip.text.startswith("rotary.position: controller alarm")
+        await bench.fault("axis.alarm", None)
+        await bench.wait(60)
+
+        await bench.start(26, 60)
+        await stand.open_flap()
+        trip = await bench.tripped(400)
+        assert (trip.rule, trip.action) == ("flap_open", "hold")
+        assert await bench.plant("flap_open") < 0.05
+
+        await bench.start(26, 60)
+        await stand.open_flap()
+        await bench.fault("flap.jam", 2000)
+        await bench.tripped(400)
+        assert await bench.plant("flap_open") > 0.3
+        unsafe = [event for event in bench.events if event.kind == "not_confirmed_safe"]
+        assert [event.level for event in unsafe] == ["error"]
+        assert "flap: jammed" in unsafe[0].text
+        await bench.fault("flap.jam", None)
+
+
+async def test_heat_that_does_not_come_or_comes_unasked_and_sensors_that_lie_are_found(
+    order: Callable[..., Order], simulator: Start
+):
+    async with bench_of(order(), simulator) as bench:
+        await bench.start(28, 600)
+        await bench.fault("thermometer.stuck_degC", {"granite_outside": 24.0})
+        await bench.wait(1000)
+        await bench.fault("thermometer.stuck_degC", None)
+        stuck = [event for event in bench.events if event.kind == "guard.sensor_stuck"]
+        assert [event.level for event in stuck] == ["warning"]
+        assert "thermometers.granite_outside has been exactly" in stuck[0].text
+        assert bench.trips == []
+
+        await bench.fault("thermometer.offset_K", {"granite_inside": 40.0})
+        trip = await bench.tripped(20)
+        assert (trip.rule, trip.action) == ("over_temperature", "abort")
+        assert trip.text.startswith("thermometers.granite_inside is")
+        await bench.fault("thermometer.offset_K", {"air": 9.0})
+        await bench.wait(20)
+
+        await bench.start(28, 20)
+        trip = await bench.tripped(140)
+        assert (trip.rule, trip.action) == ("sensors_disagree", "abort")
+        await bench.fault("thermometer.offset_K", None)
+        await bench.wait(20)
+
+        await bench.start(24, 600)
+        await bench.fault("regulator.stuck_pv_degC", 24.0)
+        await bench.assembly.stand.set_temperature(45)
+        trip = await bench.tripped(120)
+        assert (trip.rule, trip.action) == ("sensor_stuck", "hold")
+        await bench.fault("regulator.stuck_pv_degC", None)
+
+        await bench.start(30, 300)
+        await bench.fault("heater.cut_out", True)
+        await bench.assembly.stand.set_temperature(50)
+        trip = await bench.tripped(700)
+        assert (trip.rule, trip.action) == ("heater_not_warming", "abort")
+        await bench.fault("heater.cut_out", False)
+
+        await bench.start(30, 1200)
+        await bench.fault("heater.welded_share", 0.7)
+        trip = await bench.tripped(600)
+        assert (trip.rule, trip.action) == ("warming_while_off", "abort")
+        await bench.fault("heater.welded_share", None)
+
+        await bench.start(24, 20)
+        await bench.fault("thermometer.open", "air")
+        trip = await bench.tripped(20)
+        assert (trip.rule, trip.action) == ("sensor_bad", "abort")
+        reading = bench.assembly.hub.latest("thermometers.air")
+        assert reading is not None
+        assert reading.quality is Quality.BAD
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+NIGHTS = [
+    pytest.param(SHORT_RECIPE, id="short"),
+    pytest.param(packaged("recipes", "demo").read_text(), id="demo", marks=pytest.mark.nightly),
+]
+
+
+@pytest.mark.usefixtures("_aravis")
+@pytest.mark.parametrize("recipe", NIGHTS)
+async def test_a_good_night_trips_nothing_and_warns_of_nothing(
+    tmp_path: Path, order: Callable[..., Order], recipe: str
+):
+    """As the guard of the run saw it, and the recording of it once more, asked every second."""
+    ordered = order(recipe)
+    session = Session.open(await run_virtual(ordered, tmp_path / "out", None, lambda hub: None))
+    assert [event.text for event in session.events() if event.kind.startswith("guard.")] == []
+    hub, announced = Hub(), Announcements()
+    hub.subscribe(announced.receive)
+    rules = watches(ordered.config, announced)
+    items = session.items()
+    looked_ns = next(items).time_ns + seconds_ns(10)  # by then every device has been read
+    for item in items:
+        while looked_ns < item.time_ns:
+            assert [fault for watch in rules if (fault := watch.check(hub, looked_ns)) is not None] == []
+            looked_ns += NS_PER_S
+        hub.publish(item)
