@@ -21,7 +21,7 @@ class Notifier:
         self._clock = clock
 
     async def tell(self, text: str) -> str:
-        """Why it failed, "" when it did not; virtual time stands still meanwhile."""
+        """Why it failed, "" when it did not; off the loop, but virtual time stands still meanwhile."""
         if not self._command:
             return ""
         lane = Lane("notify", self._clock)
