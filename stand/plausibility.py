@@ -61,7 +61,8 @@ def heating(
     """The check after one more look at a heater that is on; None near the set-point, where all is well.
 
     Klipper's verify_heater (klippy/extras/verify_heater.py): the first goal follows a falling temperature down, each
-    goal reached clears the error, a missed deadline ends the approach, and then the error decides.
+    goal reached clears the error, a missed deadline ends the approach, and then the error decides. Unlike there, a goal
+    reached late is one: a chamber's window is long.
     """
     lacking_K = set_point_degC - limits.hysteresis_K - pv_degC
     if not lacking_K > 0:
@@ -69,7 +70,7 @@ def heating(
     goal_degC, deadline_ns = pv_degC + limits.gain_K, now_ns + seconds_ns(limits.window_s)
     if last is None or last.set_point_degC != set_point_degC:
         return Heating(set_point_degC, now_ns, goal_degC, deadline_ns)
-    if last.approaching and pv_degC >= last.goal_degC:
+    if pv_degC >= last.goal_degC:
         return Heating(set_point_degC, now_ns, goal_degC, deadline_ns, first_goal=False)
     return replace(
         last,

@@ -43,9 +43,16 @@ class Night:
     def send(self, pdu: str) -> None:
         self.regulator.handle(bytes.fromhex(pdu))
 
+    def stop(self) -> None:
+        """As the stand stops its chamber: regulator, permit and compressor."""
+        self.send("0600000101")
+        self.permitted = self._running = False
+        self._compressor = CompressorState(False, self.clock.now_ns())
+
     def polls(self) -> Iterator[int]:
         """Every instant at which all was read, ns."""
-        self.send("0600000100")  # run
+        self.send("0600000100")
+        self._running = True
         end_ns = START_NS
         for set_point_degC in self.set_points_degC:
             self.send(f"062103{round(set_point_degC * 10) & 0xFFFF:04x}")
@@ -62,7 +69,8 @@ class Night:
         self.plant.advance(now_ns)
         self._publish(now_ns)
         mv_heat, mv_cool = (self._latest(f"regulator.mv_{side}") for side in ("heat", "cool"))
-        self._compressor = decide(self._compressor, COMPRESSOR, mv_heat, mv_cool, now_ns)
+        if self._running:
+            self._compressor = decide(self._compressor, COMPRESSOR, mv_heat, mv_cool, now_ns)
         self.plant.compressor_on = self._compressor.running or self.compressor_always
 
     def _latest(self, channel: str) -> float:
@@ -83,7 +91,7 @@ class Night:
             "regulator.sp": words(0x2103, 1)[0],
             "regulator.mv_heat": mv_heat,
             "regulator.mv_cool": mv_cool,
-            "regulator.running": 1.0,
+            "regulator.running": float(self._running),
             "relays.heater_enable": float(self.permitted),
             "thermometers.air": plant.air_degC,
             "thermometers.granite_inside": plant.granite_inside_degC,

@@ -176,7 +176,7 @@ async def test_a_trip_is_told_to_a_command_as_one_argument(tmp_path: Path, scrip
 
 
 async def test_a_run_that_is_taken_down_waits_until_somebody_was_told(tmp_path: Path, script: Callable[[str], str]):
-    """The guard is cancelled as soon as the stand is safe, while the command still runs, as it can in real time only."""
+    """The guard is cancelled as soon as the stand is safe, while the command still runs: it only can in real time."""
     told = tmp_path / "told"
     bench = Bench("abort", command=(script(f"sleep 0.3; touch {told}; exit 3"),), clock=WallClock())
     bench.objecting = {0}
