@@ -34,6 +34,10 @@ class Gate:
         """Call `listener(reason, held)` at once when a reason appears (held) or goes."""
         self._listeners.append(listener)
 
+    def let_go(self) -> None:
+        """Forget the listeners: the run they belong to has ended."""
+        self._listeners.clear()
+
     def hold(self, reason: str) -> None:
         """Close the gate for `reason`; nothing happens when it holds already."""
         if reason not in self._reasons:

@@ -5,10 +5,11 @@ on the disk (fdatasync) when `write` returns. A reader goes as far as the first 
 it was never acknowledged, and is cut off before anything is appended.
 
     Begun     the run, its plan and the texts it was made of; the first line and no other
-    Step      a step was started, done or failed
+    Step      a step was started, or is done
     Dwell     what a soak has earned so far
     Held      a reason to wait appeared or went
     Gap       nothing ran between two instants
+    Tripped   the guard has made the stand safe, and why
     Cleared   an operator has seen to what had tripped
     Ended     complete, tripped, interrupted by the operator, or failed
 
@@ -56,7 +57,7 @@ class Step:
 
     time_ns: int
     step_id: str
-    state: Literal["started", "done", "failed"]
+    state: Literal["started", "done"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,15 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
+class Tripped:
+    """The guard has made the stand safe; nothing goes on before an operator has cleared it."""
+
+    time_ns: int
+    rule: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Cleared:
     """An operator has seen to what had tripped."""
 
@@ -101,8 +111,10 @@ class Ended:
     text: str
 
 
-Entry = Begun | Step | Dwell | Held | Gap | Cleared | Ended
-_ENTRIES: dict[str, type[Entry]] = {kind.__name__: kind for kind in (Begun, Step, Dwell, Held, Gap, Cleared, Ended)}
+Entry = Begun | Step | Dwell | Held | Gap | Tripped | Cleared | Ended
+_ENTRIES: dict[str, type[Entry]] = {
+    kind.__name__: kind for kind in (Begun, Step, Dwell, Held, Gap, Tripped, Cleared, Ended)
+}
 
 
 def encode_line(entry: Entry) -> bytes:
@@ -170,7 +182,7 @@ class Journal:
 
     @classmethod
     def open(cls, directory: Path) -> tuple[Journal, list[Entry]]:
-        """The journal of a session and its entries; a torn tail is cut off.
+        """The journal of a session and its entries, none when not even the first was written; a torn tail is cut off.
 
         SessionError when there is none, or when a daemon is running this session.
         """
@@ -217,6 +229,10 @@ class Journal:
         if self._lane is not None:
             self._lane.close()
             self._lane = None
+        self.release()
+
+    def release(self) -> None:
+        """As `close`, for a journal that was not started."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)

@@ -3,28 +3,61 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.clock import Clock, VirtualClock, WallClock, seconds_ns
-from drivers.interface import ConfigError, SessionError, StandError, StandTripped
+from drivers.interface import ConfigError, SessionError, StandError, Unreachable
 from stand.assembly import Assembly, assemble
 from stand.hub import Event, Hub
-from stand.interlocks import Fault
-from stand.recipe import Recipe
+from stand.performance import Performance, perform
 from stand.recording.recorder import Recorder
-from stand.recording.salvage import salvage_unfinished
-from stand.scheduler import Scheduler
-from stand.session_setup import Order, recorder_of, session_directory
+from stand.recording.salvage import Salvaged, salvage_unfinished
+from stand.recording.settings import SessionInfo
+from stand.resume import Interruption
+from stand.session_setup import Order, info_of, recorder_of, session_directory
 from stand.session_text import salvage_line
 from stand.simulator import ControlSocket, Simulator, laboratory_of
-from stand.stand import Stand
+from stand.stop import Interrupted, Stop
+from stand.tasks import cancelled, watched
+
+__all__ = ["Interrupted", "resume", "run_real", "run_virtual"]
+
+_ORPHAN_S = 300.0  # of stand time that a simulator may be ahead of what its killed daemon had recorded
+_ORPHAN_TRIES, _ORPHAN_PAUSE_S = 40, 0.25  # real time that it takes to let go of its addresses
 
 
-class Interrupted(StandError):
-    """The operator ended the run (Ctrl-C or SIGTERM); the text says whether the stand confirmed its safe state."""
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What to run and who watches: anew, in a folder below `out`, or on from where a run was interrupted (`before`)."""
+
+    order: Order
+    out: Path
+    seed: int | None
+    watch: Callable[[Hub], None]
+    before: Interruption | None = None
+
+    async def salvaged(self) -> tuple[Salvaged, ...]:
+        """What earlier runs that were killed have left unfinished, finished before anything moves."""
+        if self.before is not None:
+            return self.before.salvaged
+        return tuple(await asyncio.to_thread(salvage_unfinished, self.out))
+
+    def directory(self, clock: Clock) -> Path:
+        """The session's folder."""
+        return self.before.directory if self.before is not None else session_directory(self.out, self.order, clock)
+
+    def info(self, directory: Path, assembly: Assembly) -> SessionInfo:
+        """The session's metadata; SessionError when the camera is another one than before the interruption."""
+        if self.before is None:
+            return info_of(self.order, directory, assembly)
+        if self.before.set_up.camera_on:
+            answers, recorded = assembly.devices.camera.identity.serial_number, self.before.info.camera_serial
+            if answers != recorded:
+                raise SessionError(f"{directory}: was recorded with camera {recorded}, now {answers} answers")
+        return self.before.info
 
 
 async def run_virtual(order: Order, out: Path, seed: int | None, watch: Callable[[Hub], None]) -> Path:
@@ -33,181 +66,126 @@ async def run_virtual(order: Order, out: Path, seed: int | None, watch: Callable
     The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start.
     Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
     """
-    laboratory = laboratory_of(order.config, virtual=True, seed=seed)
     simulation = order.config.simulation
     if simulation is None:
         raise ConfigError(f"{order.config.name}: virtual time needs a `simulation` section")
-    start_ns = seconds_ns(simulation.start.timestamp())
-    async with Stop() as stop, AsyncExitStack() as stack:
-        simulator = await _started(laboratory)
-        stack.push_async_callback(asyncio.to_thread, simulator.stop)
-        control = ControlSocket(simulation.control)
-        stack.push_async_callback(control.close)
-        await control.open()
-        clock = VirtualClock(start_ns, control.advance)
-        return await _run(order, out, clock, clock.run, watch, stop)
+    return await _run_virtual(_Job(order, out, seed, watch), seconds_ns(simulation.start.timestamp()))
 
 
 async def run_real(order: Order, out: Path, watch: Callable[[Hub], None]) -> Path:
     """Run on the host's clock, against whatever answers at the configured addresses; else as run_virtual."""
     async with Stop() as stop:
-        return await _run(order, out, WallClock(), None, watch, stop)
+        return await _run(_Job(order, out, None, watch), WallClock(), None, stop)
 
 
-class Stop:
-    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM): `stop(fault)`.
+async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0) -> Path:
+    """Go on with an interrupted run, in the time it was run in, and add to its session; raises as run_virtual.
 
-    The run is cancelled where it waits, once, and not while it is being taken down; what it then raises becomes
-    Interrupted or StandTripped with the first reason. The stand's own latch is closed first.
+    What is done is not done again. In virtual time the laboratory is a new one with a chamber at room temperature,
+    `downtime_s` after the last recorded instant. SessionError when the host's clock is before that instant.
     """
-
-    def __init__(self) -> None:
-        self.stand: Stand | None = None
-        self.fault: Fault | None = None
-        self._cancellable = True
-
-    def __call__(self, fault: Fault) -> None:
-        """Latch and cancel; making safe is the caller's next step, and the run's last."""
-        self.fault = self.fault or fault
-        if self.stand is not None:
-            self.stand.latch(fault)
-        if self._cancellable:
-            self.taking_down()
-            self._run.cancel()
-
-    def taking_down(self) -> None:
-        """From here on the run cleans up and must not be cancelled."""
-        self._cancellable = False
-
-    async def __aenter__(self) -> Stop:
-        running = asyncio.current_task()
-        if running is None:
-            raise ValueError("a run is stopped by its task; there is none")
-        self._run = running
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, self, Fault("operator", "stopped by the operator"))
-        return self
-
-    async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().remove_signal_handler(number)
-        if self.fault is None or error is None:
-            return
-        unsafe = self.stand.unconfirmed if self.stand is not None else ()
-        text = f"{self.fault.text}; " + (f"NOT SAFE: {'; '.join(unsafe)}" if unsafe else "the stand is safe")
-        if isinstance(error, SessionError):
-            text = f"{text}; {error}"
-        if isinstance(error, asyncio.CancelledError):
-            self._run.uncancel()
-        raise (Interrupted(text) if self.fault.rule == "operator" else StandTripped(text)) from error
-
-
-async def _started(laboratory: Mapping[str, object]) -> Simulator:
-    """The simulator process; when the run is stopped meanwhile, it is ended again."""
-    starting = asyncio.ensure_future(asyncio.to_thread(Simulator, laboratory))
     try:
-        return await asyncio.shield(starting)
-    except asyncio.CancelledError:
-        simulator = await starting
-        await asyncio.to_thread(simulator.stop)
-        raise
+        job = _Job(before.order, before.directory.parent, before.seed, watch, before)
+        if before.info.clock_source == "virtual":
+            return await _run_virtual(job, before.last_ns + seconds_ns(downtime_s))
+        clock = WallClock()
+        if clock.now_ns() <= before.last_ns:
+            raise SessionError(f"{before.directory}: the host's clock is before its last instant; set it right")
+        async with Stop() as stop:
+            return await _run(job, clock, None, stop)
+    finally:
+        before.release()
 
 
-async def _run(
-    order: Order,
-    out: Path,
-    clock: Clock,
-    time: Callable[[], Coroutine[None, None, None]] | None,
-    watch: Callable[[Hub], None],
-    stop: Stop,
-) -> Path:
+async def _run_virtual(job: _Job, start_ns: int) -> Path:
+    laboratory = {**laboratory_of(job.order.config, virtual=True, seed=job.seed), "start_ns": start_ns}
+    async with Stop() as stop, AsyncExitStack() as stack:
+        address = str(laboratory["control"])
+        tries = 1 if job.before is None else await _orphan_ended(address, job.before.last_ns)
+        simulator = await _started(laboratory, tries)
+        stack.push_async_callback(asyncio.to_thread, simulator.stop)
+        control = ControlSocket(address)
+        stack.push_async_callback(control.close)
+        await control.open()
+        clock = VirtualClock(start_ns, control.advance)
+        return await _run(job, clock, clock.run, stop)
+
+
+async def _orphan_ended(address: str, last_ns: int) -> int:
+    """End the simulator that a killed daemon has left, which would go on for a minute and knows nothing of the time
+    since; one at another instant than this run's is somebody else's. Returns how often to try to start a new one."""
+    control = ControlSocket(address)
+    try:
+        await control.open()
+        now_ns = (await control.request({"do": "state"}))["now_ns"]
+        if isinstance(now_ns, int) and 0 <= now_ns - last_ns <= seconds_ns(_ORPHAN_S):
+            await control.request({"do": "quit"})
+            return _ORPHAN_TRIES
+    except Unreachable:
+        pass  # nobody is there, or is any more
+    finally:
+        await control.close()
+    return 1
+
+
+async def _started(laboratory: Mapping[str, object], tries: int) -> Simulator:
+    """The simulator process; when the run is stopped meanwhile, it is ended again."""
+    clock = WallClock()
+    while True:
+        starting = asyncio.ensure_future(asyncio.to_thread(Simulator, laboratory))
+        try:
+            return await asyncio.shield(starting)
+        except ConfigError:
+            tries -= 1
+            if tries <= 0:
+                raise
+            await clock.sleep_until(clock.now_ns() + seconds_ns(_ORPHAN_PAUSE_S))
+        except asyncio.CancelledError:
+            simulator = await starting
+            await asyncio.to_thread(simulator.stop)
+            raise
+
+
+async def _run(job: _Job, clock: Clock, time: Callable[[], Coroutine[None, None, None]] | None, stop: Stop) -> Path:
     hub = Hub()
-    watch(hub)
-    await _salvage(out, hub, clock)
-    assembly = assemble(order.config, hub, clock)
-    directory = session_directory(out, order, clock)
+    job.watch(hub)
+    for segment in await job.salvaged():
+        hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
+    assembly = assemble(job.order.config, hub, clock)
+    directory = job.directory(clock)
     async with AsyncExitStack() as stack:
         background: list[asyncio.Task[None]] = []
-        stack.push_async_callback(_cancel, background)
+        stack.push_async_callback(cancelled, background)
         if time is not None:
             background.append(asyncio.create_task(time()))
         stack.push_async_callback(_close, assembly)
-        stop.stand = assembly.stand
-        await _opened(assembly, background, stop)
-        recorder = recorder_of(order, directory, assembly)
+        stack.callback(assembly.stand.gate.let_go)
+        stack.push_async_callback(stop.settled)
+        stop.watch(assembly.stand)
+        await _opened(assembly, background, stop, camera_on=job.before is None or job.before.set_up.camera_on)
+        recorder = recorder_of(job.order, directory, job.info(directory, assembly), assembly)
         recorder.start()
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording)
-        await _perform(assembly, order.recipe, [*background, recording], stop)
+        await perform(Performance(job.order, job.seed, job.before, assembly, recorder, stop, (*background, recording)))
     if recorder.frames_lost:
         raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
     return directory
 
 
-async def _salvage(out: Path, hub: Hub, clock: Clock) -> None:
-    """Finish what an earlier run that was killed has left unfinished, before anything moves."""
-    for segment in await asyncio.to_thread(salvage_unfinished, out):
-        hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
-
-
-async def _perform(assembly: Assembly, recipe: Recipe, background: list[asyncio.Task[None]], stop: Stop) -> None:
-    """Poll, guard and run the plan; on every way out the actuators are safe before anything else is taken down."""
-    hub, clock, stand = assembly.hub, assembly.clock, assembly.stand
-    pollers, guard = assembly.pollers(), assembly.guard(stop)
-    watchers: list[asyncio.Task[None]] = []
-    try:
-        for poller in pollers:
-            await _watched(poller.first(), background)
-        hub.publish(Event(clock.now_ns(), "info", "run.start", f"recipe {recipe.name}"))
-        await guard.check()  # nothing moves before the rules have held once
-        watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
-        watchers.append(asyncio.create_task(guard.run()))
-        await _watched(Scheduler(stand, hub, clock).run(recipe.plan()), [*background, *watchers])
-    except BaseException as error:
-        reason = f"aborted: {stop.fault.text}" if stop.fault is not None else f"failed: {error or 'cancelled'}"
-        hub.publish(Event(clock.now_ns(), "error", "run.end", reason))
-        raise
-    else:
-        hub.publish(Event(clock.now_ns(), "info", "run.end", "complete"))
-    finally:
-        stop.taking_down()
-        await stand.make_safe()
-        await _cancel(watchers)
-        # One more look at every device, so that the recording ends with the safe state as the wire tells it.
-        for poller in pollers:
-            await poller.poll()
-
-
-async def _watched(work: Coroutine[None, None, None], background: list[asyncio.Task[None]]) -> None:
-    """Await `work`, but raise at once what a background task raises: without time or polls nothing would wake it.
-
-    On any other way out than its own, `work` has ended before this returns.
-    """
-    task = asyncio.create_task(work)
-    try:
-        pending = set(background)
-        while not task.done():
-            done, _ = await asyncio.wait({task, *pending}, return_when=asyncio.FIRST_COMPLETED)
-            for finished in done - {task}:
-                pending.discard(finished)
-                finished.result()
-        await task
-    finally:
-        await _cancel([task])
-
-
-async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop: Stop) -> None:
+async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop: Stop, *, camera_on: bool) -> None:
     """Open everything; when that fails or is stopped half-way, whatever already answers is made safe."""
     try:
-        await _watched(_open(assembly), background)
+        await watched(_open(assembly, camera_on=camera_on), background)
     except BaseException:
         stop.taking_down()
         await assembly.stand.make_safe()
         raise
 
 
-async def _open(assembly: Assembly) -> None:
-    """Connect everything; the flap is closed and the camera switched on before anything else may happen."""
+async def _open(assembly: Assembly, *, camera_on: bool) -> None:
+    """Connect everything; the flap is closed and the camera switched on before anything else may happen, but for a run
+    that goes on with the camera off."""
     devices = assembly.devices
     await assembly.bus.open()
     await devices.relays.open()
@@ -218,7 +196,8 @@ async def _open(assembly: Assembly) -> None:
     await devices.flap.move_closed()
     for axis in devices.axes.values():
         await axis.open()
-    await assembly.stand.power_camera(on=True)
+    if camera_on:
+        await assembly.stand.power_camera(on=True)
 
 
 async def _close(assembly: Assembly) -> None:
@@ -230,11 +209,5 @@ async def _close(assembly: Assembly) -> None:
 
 
 async def _finish(recorder: Recorder, recording: asyncio.Task[None]) -> None:
-    await _cancel([recording])
+    await cancelled([recording])
     await recorder.finish()
-
-
-async def _cancel(tasks: list[asyncio.Task[None]]) -> None:
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)

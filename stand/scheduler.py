@@ -1,11 +1,19 @@
-"""Runs one plan: each step marked as begun, performed by the stand, marked as done."""
+"""Runs one plan: each step begun, performed and done once, in the record and in the journal.
+
+Before each action, and within dwells and captures, the run waits at the stand's gate. What an interlock or the death of
+an earlier daemon has undone is brought about again: the set-up the steps so far have left, and the soaks since the last
+set-point, unless the chamber is still (or back) in its band. A step is done when all it has recorded is on the disk.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+import math
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 
-from drivers.clock import Clock
+from drivers.clock import NS_PER_S, Clock, seconds_ns
+from drivers.interface import DeviceError
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -23,30 +31,97 @@ from experiments.steps import (
     kind_of,
     parameters_of,
 )
-from stand.hub import Hub, StepMark, StepState
-from stand.stand import Stand
+from stand.gate import INTERLOCK
+from stand.hub import Event, Hub, StepMark, StepState
+from stand.journal import Dwell, Journal, Step
+from stand.set_up import SetUp
+from stand.stand import Interlocked, Stand
+
+# A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
+# chamber left alone for a minute has gone further. The camera, which is slower than the air, has then hardly moved.
+BAND_K = 1.0
+_JOURNAL_NS = 60 * NS_PER_S  # of a dwell that a kill costs at most
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What an earlier daemon has done. done: ids of steps. earned_s: of soaks, by id; one that is done and not listed
+    has earned all of it. frames: on the disk, by the id of a capture that is not done."""
+
+    done: frozenset[str] = frozenset()
+    earned_s: Mapping[str, float] = field(default_factory=dict[str, float])
+    frames: Mapping[str, int] = field(default_factory=dict[str, int])
 
 
 class Scheduler:
-    """Performs steps in order; what a step raises ends the run, after the step is marked as failed."""
+    """Performs a plan; what a step raises ends the run, after the step is marked as failed.
 
-    def __init__(self, stand: Stand, hub: Hub, clock: Clock) -> None:
+    `flushed` returns when all that was published is on the disk. `progress`: go on where an earlier daemon was.
+    """
+
+    def __init__(
+        self,
+        stand: Stand,
+        hub: Hub,
+        clock: Clock,
+        journal: Journal,
+        flushed: Callable[[], Awaitable[None]],
+        progress: Progress | None = None,
+    ) -> None:
         self._stand = stand
         self._hub = hub
         self._clock = clock
+        self._journal = journal
+        self._flushed = flushed
+        self._disturbed = progress is not None  # the set-up has to be brought about before anything else
+        progress = progress or Progress()
+        self._done = set(progress.done)
+        self._earned_ns = {step_id: seconds_ns(earned_s) for step_id, earned_s in progress.earned_s.items()}
+        self._frames = dict(progress.frames)
+        stand.gate.subscribe(self._on_hold)
 
     async def run(self, plan: Iterable[PlannedStep]) -> None:
-        """The whole plan."""
+        """What is not done of the plan."""
+        set_up = SetUp()
         for planned in plan:
-            self._mark(planned, StepState.STARTED)
-            try:
-                await self._perform(planned)
-            except (Exception, asyncio.CancelledError):
-                self._mark(planned, StepState.FAILED)
-                raise
-            self._mark(planned, StepState.DONE)
+            if planned.step_id not in self._done:
+                # A soak depends on what it has earned itself as on those before it.
+                needed = set_up.after(planned) if isinstance(planned.step, Soak) else set_up
+                await self._ready(planned, needed)
+                await self._run_step(planned, needed)
+            set_up = set_up.after(planned)
 
-    async def _perform(self, planned: PlannedStep) -> None:
+    async def _run_step(self, planned: PlannedStep, set_up: SetUp) -> None:
+        await self._journal.write(Step(self._clock.now_ns(), planned.step_id, "started"))
+        self._mark(planned, StepState.STARTED)
+        try:
+            await self._perform_undisturbed(planned, set_up)
+            if isinstance(planned.step, Capture):
+                await self._flushed()
+        except (Exception, asyncio.CancelledError):
+            self._mark(planned, StepState.FAILED)
+            raise
+        self._mark(planned, StepState.DONE)
+        await self._flushed()
+        self._earned_ns.pop(planned.step_id, None)
+        self._done.add(planned.step_id)
+        await self._journal.write(Step(self._clock.now_ns(), planned.step_id, "done"))
+
+    async def _perform_undisturbed(self, planned: PlannedStep, set_up: SetUp) -> None:
+        """The step; once more after an interlock that made it fail has been cleared."""
+        while True:
+            try:
+                await self._perform(planned, set_up)
+            except (DeviceError, Interlocked) as error:
+                if not self._disturbed:
+                    raise
+                text = f"{kind_of(planned.step)} was broken off by an interlock ({error})"
+                self._hub.publish(Event(self._clock.now_ns(), "warning", "step_broken_off", text))
+                await self._ready(planned, set_up)
+            else:
+                return
+
+    async def _perform(self, planned: PlannedStep, set_up: SetUp) -> None:
         stand = self._stand
         match planned.step:
             case StartChamber(chamber_degC):
@@ -55,14 +130,14 @@ class Scheduler:
                 await stand.set_temperature(chamber_degC)
             case StopChamber():
                 await stand.stop_chamber()
-            case Soak(duration_s):
-                await stand.soak(duration_s)
+            case Soak():
+                await self._soak(planned, set_up)
             case OpenFlap():
                 await stand.open_flap()
             case CloseFlap():
                 await stand.close_flap()
-            case Capture(frames, interval_s, exposure_s):
-                await stand.capture(frames, interval_s, exposure_s, planned.step_id)
+            case Capture() as capture:
+                await self._capture(planned, capture, set_up)
             case MoveTo(axis, position):
                 await stand.move_to(axis, position)
             case PowerCamera(on):
@@ -73,6 +148,125 @@ class Scheduler:
                 await stand.check_home(axis)
             case Prompt(text):
                 await stand.prompt(text)
+
+    async def _capture(self, planned: PlannedStep, capture: Capture, set_up: SetUp) -> None:
+        """The frames that are not there yet, on a grid of absolute deadlines: those missed while the run was held or a
+        lost camera opened anew are skipped, not made up for by a burst."""
+        step_id = planned.step_id
+        await self._stand.approach_again()
+        due_ns, interval_ns = self._clock.now_ns(), seconds_ns(capture.interval_s)
+        while self._frames.get(step_id, 0) < capture.frames:
+            await self._clock.sleep_until(due_ns)
+            if self._stand.gate.reasons or self._disturbed:
+                await self._ready(planned, set_up)
+                await self._stand.approach_again()
+                due_ns += max(0, math.ceil((self._clock.now_ns() - due_ns) / interval_ns)) * interval_ns
+                continue
+            await self._stand.take_frame(capture.exposure_s, step_id)
+            self._frames[step_id] = self._frames.get(step_id, 0) + 1
+            # To the latest deadline that has passed: a free-running camera gives its frame up to a period late.
+            due_ns += max(1, (self._clock.now_ns() - due_ns) // interval_ns) * interval_ns
+
+    async def _soak(self, planned: PlannedStep, set_up: SetUp) -> None:
+        """All of a soak, with everything that has to be restored on the way."""
+        while self._owed_ns(planned):
+            await self._ready(planned, set_up)
+            await self._dwell(planned)
+
+    async def _dwell(self, planned: PlannedStep) -> None:
+        """Earn what a soak still owes, while the gate is open; returns early when the set-up was disturbed."""
+        while (owed_ns := self._owed_ns(planned)) and not self._disturbed:
+            begin_ns = self._clock.now_ns()
+            await self._sleep_while_open(begin_ns + min(owed_ns, _JOURNAL_NS))
+            end_ns = self._clock.now_ns()
+            earned_ns = self._duration_ns(planned) - owed_ns + min(end_ns - begin_ns, owed_ns)
+            self._earned_ns[planned.step_id] = earned_ns
+            await self._journal.write(Dwell(end_ns, planned.step_id, earned_ns / NS_PER_S))
+            await self._stand.gate.passed()
+
+    async def _sleep_while_open(self, until_ns: int) -> None:
+        """Until then, or until the gate closes."""
+        tasks = [
+            asyncio.ensure_future(self._clock.sleep_until(until_ns)),
+            asyncio.ensure_future(self._stand.gate.closed()),
+        ]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    async def _ready(self, planned: PlannedStep, set_up: SetUp) -> None:
+        """Return when nothing holds the run and everything is as the steps before `planned` have left it."""
+        restored = False
+        while True:
+            await self._stand.gate.passed()
+            try:
+                if self._disturbed:
+                    self._disturbed, restored = False, True
+                    await self._restore(set_up)
+                for soak in set_up.soaks:
+                    if soak != planned:
+                        await self._dwell(soak)
+                if restored and set_up.flap_open and not self._disturbed:
+                    await self._stand.open_flap()
+                    restored = False
+            except (DeviceError, Interlocked):
+                if not self._disturbed:
+                    raise
+            if not self._disturbed and not self._stand.gate.reasons:
+                return
+
+    async def _restore(self, set_up: SetUp) -> None:
+        """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
+        stand = self._stand
+        await stand.close_flap()
+        for axis, position in set_up.positions.items():
+            await stand.move_to(axis, position)
+        if not set_up.camera_on:
+            await stand.power_camera(on=False)
+        if set_up.chamber_degC is not None:
+            await self._credit_soaks(set_up, set_up.chamber_degC)
+            await stand.start_chamber(set_up.chamber_degC)
+        self._tell("info", "restored", set_up.text)
+
+    async def _credit_soaks(self, set_up: SetUp, chamber_degC: float) -> None:
+        """Soaks since the last set-point keep what they have earned only if the chamber is in its band."""
+        begun = [soak for soak in set_up.soaks if self._is_begun(soak)]
+        pv = self._hub.latest("regulator.pv")
+        pv_degC = math.nan if pv is None else pv.value
+        if not begun:
+            return
+        if abs(pv_degC - chamber_degC) <= BAND_K:
+            self._tell(
+                "info", "soak_credited", f"the chamber is at {pv_degC:.2f} degC, within {BAND_K:g} K of its set-point"
+            )
+            return
+        for soak in begun:
+            self._earned_ns[soak.step_id] = 0
+        now_ns = self._clock.now_ns()
+        await self._journal.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in begun))
+        text = f"the chamber is at {pv_degC:.2f} degC, not within {BAND_K:g} K of its set-point; it soaks anew"
+        self._tell("warning", "soak_restarted", text)
+
+    def _is_begun(self, soak: PlannedStep) -> bool:
+        return soak.step_id in self._done or self._earned_ns.get(soak.step_id, 0) > 0
+
+    def _owed_ns(self, soak: PlannedStep) -> int:
+        """What the soak has not earned yet."""
+        duration_ns = self._duration_ns(soak)
+        earned_ns = self._earned_ns.get(soak.step_id, duration_ns if soak.step_id in self._done else 0)
+        return max(0, duration_ns - earned_ns)
+
+    def _duration_ns(self, soak: PlannedStep) -> int:
+        return seconds_ns(soak.step.duration_s) if isinstance(soak.step, Soak) else 0
+
+    def _on_hold(self, reason: str, held: bool) -> None:
+        """An interlock makes the stand safe: nothing is as it was."""
+        self._disturbed = self._disturbed or (held and reason == INTERLOCK)
+
+    def _tell(self, level: str, kind: str, text: str) -> None:
+        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
 
     def _mark(self, planned: PlannedStep, state: StepState) -> None:
         self._hub.publish(

@@ -32,6 +32,10 @@ class Order:
     recipe_text: str
     target_text: str
 
+    def attachments(self) -> dict[str, str]:
+        """The texts by the names under which a session has them."""
+        return {"config.yaml": self.config_text, "recipe.yaml": self.recipe_text, "target.yaml": self.target_text}
+
 
 def session_directory(out: Path, order: Order, clock: Clock) -> Path:
     """The session's folder below `out`, named for the instant and the recipe; ConfigError when it exists already."""
@@ -42,24 +46,24 @@ def session_directory(out: Path, order: Order, clock: Clock) -> Path:
     return directory
 
 
-def recorder_of(order: Order, directory: Path, assembly: Assembly) -> Recorder:
-    """The recorder of this run."""
-    config, clock = order.config, assembly.clock
-    info = SessionInfo(
+def info_of(order: Order, directory: Path, assembly: Assembly) -> SessionInfo:
+    """Who records what with which; the camera has told its serial number already."""
+    config = order.config
+    return SessionInfo(
         session_id=directory.name,
         recipe=order.recipe.name,
         operator=config.operator,
         camera_serial=assembly.devices.camera.identity.serial_number,
         software_version=importlib.metadata.version("thermostand"),
-        clock_source="virtual" if isinstance(clock, VirtualClock) else "wall",
+        clock_source="virtual" if isinstance(assembly.clock, VirtualClock) else "wall",
         simulated=config.simulation is not None,
         host=platform.node(),
     )
-    attachments = {
-        "config.yaml": order.config_text,
-        "recipe.yaml": order.recipe_text,
-        "target.yaml": order.target_text,
-    }
+
+
+def recorder_of(order: Order, directory: Path, info: SessionInfo, assembly: Assembly) -> Recorder:
+    """The recorder of this run."""
+    config, clock = order.config, assembly.clock
     settings = RecordingSettings(
         config.recording.frame_encoding,
         VIRTUAL_COMMIT_S if isinstance(clock, VirtualClock) else config.recording.telemetry_commit_s,
@@ -67,7 +71,7 @@ def recorder_of(order: Order, directory: Path, assembly: Assembly) -> Recorder:
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
     encode = _partial_frames(order)
-    recorder = Recorder(directory, info, attachments, _kinds(config), assembly.hub, clock, settings, encode)
+    recorder = Recorder(directory, info, order.attachments(), _kinds(config), assembly.hub, clock, settings, encode)
     if encode is not None:
         encode.tell = partial(recorder.warn, "search_failed")
     return recorder

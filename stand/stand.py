@@ -16,6 +16,7 @@ from drivers.stage import Axis
 from drivers.thermometers import Thermometers
 from stand.camera_cooling import Cooling, cool_down, last_word
 from stand.compressor import CompressorLimits, CompressorState, decide
+from stand.gate import CAMERA_LOST, INTERLOCK, Gate
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
 from stand.stage_care import check_home, ready
@@ -23,7 +24,12 @@ from stand.stage_care import check_home, ready
 # Real seconds for all actuators together to reach their safe state; the dead-man relay drops by itself after that.
 _SAFE_LIMIT_S = 10.0
 _CAMERA_BOOT_LIMIT_S = 60.0
-_CAMERA_RETRY_S = 1.0
+_CAMERA_LOST_LIMIT_S = 1800.0
+_CAMERA_RETRY_S, _CAMERA_LONGEST_RETRY_S = 1.0, 10.0
+
+
+class Interlocked(StandTripped):
+    """The guard has made the stand safe and an operator has not cleared it yet: nothing may move meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +55,13 @@ class Limits:
 
 
 class Stand:
-    """One stand. A latched fault closes the gate: every verb but make_safe raises StandTripped."""
+    """One stand. After a latched fault every verb but close_flap and make_safe raises StandTripped, while an interlock
+    holds the gate Interlocked."""
 
     def __init__(self, devices: Devices, limits: Limits, hub: Hub, clock: Clock) -> None:
         self.devices = devices
         self.fault: Fault | None = None
+        self.gate = Gate()
         self._limits = limits
         self._hub = hub
         self._clock = clock
@@ -126,11 +134,6 @@ class Stand:
             self._hub.publish(Event(self._clock.now_ns(), "info", "compressor", text))
         self._compressor = wanted
 
-    async def soak(self, duration_s: float) -> None:
-        """Wait, s."""
-        self._check()
-        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(duration_s))
-
     async def open_flap(self) -> None:
         """Open the flap and confirm it."""
         self._check()
@@ -140,31 +143,33 @@ class Stand:
         """Close the flap and confirm it; allowed after a trip too."""
         await self.devices.flap.move_closed()
 
-    async def capture(self, frames: int, interval_s: float, exposure_s: float, step_id: str) -> None:
-        """`frames` images, one each `interval_s` by absolute deadlines; each published as soon as it is there.
-
-        Stages whose motors have been switched off meanwhile are first approached anew.
-        Deadlines missed while a lost camera was opened anew are skipped, not made up for by a burst.
-        """
+    async def approach_again(self) -> None:
+        """Before frames: stages whose motors have been switched off meanwhile are approached anew, from below."""
         self._check()
         await ready(self.devices.axes, self._commanded, self._hub, self._clock)
-        due_ns, interval_ns = self._clock.now_ns(), seconds_ns(interval_s)
-        for _ in range(frames):
-            await self._clock.sleep_until(due_ns)
-            self._check()
-            frame = await self._grab(exposure_s)
-            self._hub.publish(replace(frame, step_id=step_id))
-            # To the latest deadline that has passed: a free-running camera gives its frame up to a period late.
-            due_ns += max(1, (self._clock.now_ns() - due_ns) // interval_ns) * interval_ns
 
-    async def _grab(self, exposure_s: float) -> Frame:
-        """One frame; a camera lost meanwhile is opened anew and asked once more, and the event says so."""
+    async def take_frame(self, exposure_s: float, step_id: str) -> None:
+        """One frame of the step, published. A camera lost meanwhile holds the gate until it has answered again and
+        given the frame; Unreachable after 30 min."""
+        self._check()
+        deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_LOST_LIMIT_S)
         try:
-            return await self.devices.camera.grab(exposure_s)
-        except Unreachable as error:
-            self._hub.publish(Event(self._clock.now_ns(), "warning", "camera_lost", str(error)))
-        await self._open_camera()
-        return await self.devices.camera.grab(exposure_s)
+            frame = await self._grab(exposure_s, deadline_ns)
+        finally:
+            self.gate.clear(CAMERA_LOST)
+        self._hub.publish(replace(frame, step_id=step_id))
+
+    async def _grab(self, exposure_s: float, deadline_ns: int) -> Frame:
+        while True:
+            try:
+                return await self.devices.camera.grab(exposure_s)
+            except Unreachable as error:
+                if self._clock.now_ns() >= deadline_ns:
+                    raise
+                self._hub.publish(Event(self._clock.now_ns(), "warning", "camera_lost", str(error)))
+                self.gate.hold(CAMERA_LOST)
+            await self._open_camera(deadline_ns, _CAMERA_LONGEST_RETRY_S)
+            self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
 
     async def move_to(self, axis: str, position: float) -> None:
         """Move a stage (mm or deg), homing it first when it lost its scale."""
@@ -207,7 +212,11 @@ class Stand:
         self._cooling = None
         await self.devices.relays.switch("camera_power", on=True)
         await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.camera_boot_s))
-        await self._open_camera()
+        await self._open_camera(self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S), _CAMERA_RETRY_S)
+
+    def camera_is_off(self, cooling: Cooling | None) -> None:
+        """What an earlier daemon left: the camera is off, and this was its last word before it was switched off."""
+        self._cooling = cooling
 
     async def make_safe(self) -> None:
         """Every actuator to its safe state, all at once, within a real-time limit; what failed is in `unconfirmed`."""
@@ -233,15 +242,18 @@ class Stand:
             return text
         return ""
 
-    async def _open_camera(self) -> None:
-        deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S)
+    async def _open_camera(self, deadline_ns: int, longest_retry_s: float) -> None:
+        """Open the camera, trying again after 1 s, 2 s, 4 s ... until `deadline_ns`; what the last try raised."""
+        retry_s = _CAMERA_RETRY_S
         while True:
+            self._check()
             try:
                 return await self.devices.camera.open()
             except Unreachable:
                 if self._clock.now_ns() >= deadline_ns:
                     raise
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_CAMERA_RETRY_S))
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(retry_s))
+            retry_s = min(2 * retry_s, longest_retry_s)
 
     def _compressor_is_off(self) -> None:
         if self._compressor.running:
@@ -258,6 +270,8 @@ class Stand:
     def _check(self, chamber_degC: float | None = None) -> None:
         if self.fault is not None:
             raise StandTripped(f"the stand is latched: {self.fault.text}")
+        if INTERLOCK in self.gate.reasons:
+            raise Interlocked("an interlock holds the stand until an operator clears it")
         low, high = self._limits.chamber_degC
         if chamber_degC is not None and not low <= chamber_degC <= high:
             raise ConfigError(f"chamber set-point {chamber_degC} degC is outside limits.chamber_degC {low}..{high}")

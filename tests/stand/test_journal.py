@@ -21,6 +21,7 @@ from stand.journal import (
     Held,
     Journal,
     Step,
+    Tripped,
     encode_line,
     read_lines,
 )
@@ -32,6 +33,7 @@ ENTRIES = [
     Held(4, "operator", True),
     Held(5, "operator", False),
     Gap(5, 8),
+    Tripped(6, "over_temperature", "too hot"),
     Cleared(8),
     Step(9, "a1", "done"),
     Ended(10, "interrupted", "stopped by the operator: “✓”\n"),
@@ -41,10 +43,11 @@ times_ns = st.integers(0, 2**62)
 words = st.text(max_size=20)
 entries = st.one_of(
     st.builds(Begun, times_ns, words, words, st.dictionaries(words, words, max_size=3), st.none() | st.integers(0)),
-    st.builds(Step, times_ns, words, st.sampled_from(["started", "done", "failed"])),
+    st.builds(Step, times_ns, words, st.sampled_from(["started", "done"])),
     st.builds(Dwell, times_ns, words, st.floats(0, 1e6)),
     st.builds(Held, times_ns, words, st.booleans()),
     st.builds(Gap, times_ns, times_ns),
+    st.builds(Tripped, times_ns, words, words),
     st.builds(Cleared, times_ns),
     st.builds(Ended, times_ns, st.sampled_from(["complete", "failed"]), words),
 )

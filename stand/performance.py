@@ -1,0 +1,159 @@
+"""The part of a run in which things move: polled, guarded, journaled, and made safe on every way out."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.metadata
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from drivers.clock import NS_PER_S
+from drivers.interface import StandTripped
+from stand.assembly import Assembly
+from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
+from stand.guard import Guard
+from stand.hub import Event, Hub, Item
+from stand.interlocks import Fault
+from stand.journal import Cleared, Ended, Entry, Gap, Journal
+from stand.logbook import Logbook
+from stand.poller import Poller
+from stand.recording.instants import utc_text
+from stand.recording.recorder import Recorder
+from stand.resume import Interruption, begun
+from stand.scheduler import Scheduler
+from stand.session_setup import Order
+from stand.stop import OPERATOR, Stop
+from stand.tasks import cancelled, watched
+
+# The recorder's events that hold a run, and those that let it go on.
+_HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
+_RELEASING = {"frames_resumed": DISK_LOW, "telemetry_saved_again": NOT_RECORDED}
+
+
+@dataclass(frozen=True, slots=True)
+class Performance:
+    """What is run, by what, and what it goes on from. `background`: tasks without which nothing goes on."""
+
+    order: Order
+    seed: int | None
+    before: Interruption | None
+    assembly: Assembly
+    recorder: Recorder
+    stop: Stop
+    background: tuple[asyncio.Task[None], ...]
+
+
+async def perform(work: Performance) -> None:
+    """The whole plan, or what is not done of it; the actuators are safe before anything else is taken down."""
+    assembly, stop = work.assembly, work.stop
+    log = Logbook(assembly.hub, assembly.clock)
+    pollers, guard = assembly.pollers(), _guard(assembly, stop, log)
+    watchers: list[asyncio.Task[None]] = []
+    ended = Ended(0, "failed", "")
+    try:
+        scheduler = await watched(_begun(work, pollers, guard, log), work.background)
+        watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
+        watchers.append(asyncio.create_task(guard.run()))
+        stop.started()
+        await watched(scheduler.run(work.order.recipe.plan()), [*work.background, *watchers])
+        ended = Ended(0, "complete", "complete")
+    except BaseException as error:
+        ended = _ending(stop.fault, error)
+        raise
+    finally:
+        log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
+        stop.taking_down()
+        await assembly.stand.make_safe()
+        await cancelled(watchers)
+        # One more look at every device, so that the recording ends with the safe state as the wire tells it.
+        for poller in pollers:
+            await poller.poll()
+        stop.ended()
+        await log.end(ended)
+
+
+async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log: Logbook) -> Scheduler:
+    """Everything read and judged once, and the journal begun or continued: nothing moves before that."""
+    for poller in pollers:
+        await poller.first()
+    if work.before is None:
+        log.tell("info", "run.start", f"recipe {work.order.recipe.name}")
+    else:
+        _tell_interruption(work.before, work.assembly.hub, work.assembly.clock.now_ns(), log)
+    if not await guard.check():
+        raise StandTripped("the rules do not hold")
+    await work.recorder.flushed()  # a session with a journal can be opened and resumed
+    before = work.before
+    journal = Journal.create(work.recorder.directory) if before is None else before.journal
+    await log.begin(journal, *_first_entries(work))
+    gate = work.assembly.stand.gate
+    gate.subscribe(log.held)
+    gate.subscribe(lambda reason, held: _forget_cleared(guard, reason, held))
+    work.assembly.hub.subscribe(_hold_while_not_recorded(gate))
+    if before is not None and not before.set_up.camera_on:
+        work.assembly.stand.camera_is_off(before.cooling)
+    progress = None if before is None else before.progress
+    return Scheduler(
+        work.assembly.stand, work.assembly.hub, work.assembly.clock, journal, work.recorder.flushed, progress
+    )
+
+
+def _first_entries(work: Performance) -> tuple[Entry, ...]:
+    now_ns = work.assembly.clock.now_ns()
+    if work.before is None:
+        return (begun(work.order, work.recorder.directory.name, now_ns, work.seed),)
+    cleared = (Cleared(now_ns),) if work.before.tripped else ()
+    return (*cleared, Gap(work.before.last_ns, now_ns))
+
+
+def _tell_interruption(before: Interruption, hub: Hub, now_ns: int, log: Logbook) -> None:
+    """The end of the run that was interrupted, the gap since, and that it goes on."""
+    if not before.ended:
+        hub.publish(Event(before.last_ns, "error", "run.end", "interrupted: killed"))
+    gap_s = (now_ns - before.last_ns) / NS_PER_S
+    span = f"from {utc_text(before.last_ns)} to {utc_text(now_ns)}"
+    log.tell("warning", "gap", f"nothing was recorded and nobody watched the stand {span} ({gap_s:.3f} s)")
+    if before.tripped:
+        log.tell("warning", "cleared", f"an operator cleared: {before.tripped}")
+    version = importlib.metadata.version("thermostand")
+    done = f"{len(before.progress.done)} steps are done"
+    log.tell("info", "run.resume", f"recipe {before.order.recipe.name} goes on, {done}; thermostand {version}")
+
+
+def _guard(assembly: Assembly, stop: Stop, log: Logbook) -> Guard:
+    """On a fault it ends the run, or makes the stand safe and lets the run wait for an operator."""
+
+    def trip(fault: Fault) -> None:
+        stop(fault)
+        log.tripped(fault)
+
+    def hold(fault: Fault) -> None:
+        assembly.stand.gate.hold(INTERLOCK)
+        log.tripped(fault)
+
+    return assembly.guard(trip, hold)
+
+
+def _forget_cleared(guard: Guard, reason: str, held: bool) -> None:
+    """An operator has cleared the interlock: the guard's hold is over."""
+    if reason == INTERLOCK and not held:
+        guard.clear()
+
+
+def _ending(fault: Fault | None, error: BaseException) -> Ended:
+    """How a run ended that did not come to its end."""
+    if fault is None:
+        return Ended(0, "failed", f"failed: {error or 'cancelled'}")
+    return Ended(0, "interrupted" if fault.rule == OPERATOR else "tripped", f"aborted: {fault.text}")
+
+
+def _hold_while_not_recorded(gate: Gate) -> Callable[[Item], None]:
+    """A subscriber: the run waits while the recorder cannot record frames, or telemetry."""
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Event) and item.kind in _HOLDING:
+            gate.hold(_HOLDING[item.kind])
+        if isinstance(item, Event) and item.kind in _RELEASING:
+            gate.clear(_RELEASING[item.kind])
+
+    return follow

@@ -1,0 +1,203 @@
+"""What a session says of a run that did not come to its end, and whether it may go on.
+
+The journal tells which steps are done, the recording what they have left: a step whose end is recorded is done, and a
+frame counts when its image and its description are both on the disk. Configuration, recipe and target are those that
+were attached to the session, whatever today's files are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+from compensation.target import Target
+from drivers.documents import parse_document
+from drivers.interface import SessionError
+from experiments.steps import Capture, PlannedStep
+from stand.camera_cooling import Cooling
+from stand.config import StandConfig
+from stand.hub import StepState
+from stand.journal import Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
+from stand.recipe import Recipe
+from stand.recording.overview import glance
+from stand.recording.salvage import Salvaged, salvage_unfinished
+from stand.recording.session import Session
+from stand.recording.settings import SessionInfo
+from stand.scheduler import Progress
+from stand.session_setup import Order
+from stand.set_up import SetUp
+
+
+def begun(order: Order, run: str, time_ns: int, seed: int | None) -> Begun:
+    """The first line of a run's journal."""
+    return Begun(time_ns, run, plan_hash(order.recipe.plan()), _text_hashes(order.attachments()), seed)
+
+
+def plan_hash(plan: Iterable[PlannedStep]) -> str:
+    """The same for the same steps in the same order."""
+    return hashlib.sha256("\n".join(planned.step_id for planned in plan).encode()).hexdigest()[:16]
+
+
+def _text_hashes(texts: Mapping[str, str]) -> dict[str, str]:
+    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in texts.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Interruption:
+    """A run that may go on. Its journal is open, and so locked, until it is run or `release`d.
+
+    last_ns: the last instant on the disk. seed: of the simulated laboratory. ended: how it ended, "" when it was
+    killed. tripped: what an operator has cleared. salvaged: what had to be finished first. cooling: the last word of
+    a camera that was off.
+    """
+
+    directory: Path
+    order: Order
+    info: SessionInfo
+    journal: Journal
+    progress: Progress
+    set_up: SetUp
+    last_ns: int
+    seed: int | None
+    ended: str
+    tripped: str
+    salvaged: tuple[Salvaged, ...]
+    cooling: Cooling | None
+
+    @property
+    def done_indices(self) -> frozenset[int]:
+        """The places in the plan of the steps that are done."""
+        plan = self.order.recipe.plan()
+        return frozenset(planned.index for planned in plan if planned.step_id in self.progress.done)
+
+    def release(self) -> None:
+        """Give the session free for another daemon; may be called twice."""
+        self.journal.release()
+
+
+def interruption(directory: Path, *, clear: bool = False) -> Interruption:
+    """What is needed to go on with the run recorded in `directory`; its unfinished segments are salvaged.
+
+    SessionError when a daemon is running it, it is complete, it tripped and `clear` is not given, or journal, recording
+    and this version of the program do not belong together.
+    """
+    journal, entries = Journal.open(directory)
+    try:
+        return _interruption(directory, journal, entries, clear)
+    except BaseException:
+        journal.release()
+        raise
+
+
+def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear: bool) -> Interruption:
+    first = entries[0] if entries else None
+    if not isinstance(first, Begun):
+        raise SessionError(f"{directory}: its run had not begun when it was killed; begin a new run")
+    last = entries[-1]
+    if isinstance(last, Ended) and last.status == "complete":
+        raise SessionError(f"{directory}: its run is complete; there is nothing to resume")
+    tripped = _tripped(entries)
+    if tripped and not clear:
+        raise SessionError(f"{directory}: the stand tripped: {tripped}; look into it, then resume with --clear")
+    salvaged = tuple(salvage_unfinished(directory.resolve().parent))
+    session = Session.open(directory)
+    order = _order(session, first)
+    progress = _progress(session, entries, order.recipe)
+    set_up = SetUp()
+    for planned in order.recipe.plan():
+        set_up = set_up.after(planned) if planned.step_id in progress.done else set_up
+    return Interruption(
+        directory,
+        order,
+        _info(session.metadata),
+        journal,
+        progress,
+        set_up,
+        max(entries[-1].time_ns, glance(directory).end_ns or 0),
+        first.seed,
+        last.text if isinstance(last, Ended) else "",
+        tripped,
+        salvaged,
+        None if set_up.camera_on else _cooling(session),
+    )
+
+
+def _tripped(entries: Iterable[Entry]) -> str:
+    """Why an operator has to look first; "" when nothing tripped, or it was cleared."""
+    text = ""
+    for entry in entries:
+        if isinstance(entry, Tripped):
+            text = text or entry.text
+        if isinstance(entry, Cleared):
+            text = ""
+    return text
+
+
+def _order(session: Session, first: Begun) -> Order:
+    """What was to be run, from the texts in the session; SessionError when they are not those the run began with."""
+    texts = dict(session.attachments)
+    if _text_hashes(texts) != first.texts:
+        raise SessionError(f"{session.path}: the attached files are not those its run began with")
+    where = f"{session.path}: "
+    order = Order(
+        parse_document(texts["config.yaml"], StandConfig, f"{where}config.yaml"),
+        parse_document(texts["recipe.yaml"], Recipe, f"{where}recipe.yaml"),
+        texts["config.yaml"],
+        texts["recipe.yaml"],
+        texts["target.yaml"],
+    )
+    parse_document(order.target_text, Target, f"{where}target.yaml")
+    if plan_hash(order.recipe.plan()) != first.plan:
+        raise SessionError(f"{where}this version of thermostand makes another plan of its recipe; begin a new run")
+    return order
+
+
+def _info(metadata: Mapping[str, str]) -> SessionInfo:
+    """The session's own metadata again: its segments must all have the same."""
+    clock_source = cast('Literal["wall", "virtual"]', metadata["clock_source"])
+    return SessionInfo(
+        session_id=metadata["session_id"],
+        recipe=metadata["recipe"],
+        camera_serial=metadata["camera_serial"],
+        operator=metadata["operator"],
+        software_version=metadata["software_version"],
+        clock_source=clock_source,
+        simulated=metadata["simulated"] == "true",
+        host=metadata.get("host", ""),
+    )
+
+
+def _progress(session: Session, entries: Iterable[Entry], recipe: Recipe) -> Progress:
+    done = {mark.step_id for mark in session.steps() if mark.state is StepState.DONE}
+    earned_s: dict[str, float] = {}
+    for entry in entries:
+        if isinstance(entry, Dwell):
+            earned_s[entry.step_id] = entry.earned_s
+        if isinstance(entry, Step) and entry.state == "done":
+            done.add(entry.step_id)
+            earned_s.pop(entry.step_id, None)
+    begun = {planned.step_id for planned in recipe.plan() if isinstance(planned.step, Capture)} - done
+    return Progress(frozenset(done), earned_s, _frames(session, begun))
+
+
+def _frames(session: Session, step_ids: set[str]) -> dict[str, int]:
+    """How many frames of these steps are on the disk with their descriptions."""
+    times_ns = set(session.frame_times_ns.tolist())
+    counts: dict[str, int] = {}
+    for time_ns, meta in session.frame_metas:
+        if meta.step_id in step_ids and time_ns in times_ns:
+            counts[meta.step_id] = counts.get(meta.step_id, 0) + 1
+    return counts
+
+
+def _cooling(session: Session) -> Cooling | None:
+    """The camera's last temperature; None when it never gave one."""
+    times_ns, values_degC = session.readings("camera.temperature")
+    for time_ns, camera_degC in zip(reversed(times_ns.tolist()), reversed(values_degC.tolist()), strict=True):
+        if not math.isnan(camera_degC):
+            return Cooling(camera_degC, time_ns)
+    return None
