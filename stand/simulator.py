@@ -7,8 +7,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, suppress
 
 from drivers.clock import seconds_ns
 from drivers.interface import ConfigError, Unreachable
@@ -43,6 +43,21 @@ def laboratory_of(config: StandConfig, *, virtual: bool, seed: int | None) -> di
         "flap": {"address": config.flap.backend_address, "serial_number": config.flap.serial_number},
         "camera": {"address": config.camera.address, "serial_number": config.camera.serial_number},
     }
+
+
+@contextmanager
+def one_cpu() -> Generator[None]:
+    """Inside, this thread and whatever it starts (the simulator) run on one of the CPUs it may use.
+
+    In virtual time daemon and simulator take turns, a dozen in each polled second, and never work at once. On one CPU a
+    turn is a switch of context; on two it is waking an idle CPU, which takes longer than the answer.
+    """
+    usable = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {sorted(usable)[os.getpid() % len(usable)]})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, usable)
 
 
 class Simulator:
