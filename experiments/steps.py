@@ -15,12 +15,19 @@ from enum import StrEnum
 
 
 class Role(StrEnum):
-    """What a capture is for; the fitter never sees VALIDATION frames, the validation never scores FIT frames."""
+    """What a capture is for; the fitter never sees VALIDATION frames, the validation never scores FIT frames.
+
+    CALIBRATION, POSE and REPEATABILITY frames show the target elsewhere than the drift's: no drift is fitted to them.
+    POSE: the target at a validation position; REPEATABILITY: back at the first of them.
+    """
 
     REFERENCE = "reference"
     FIT = "fit"
     VALIDATION = "validation"
     WARM_UP = "warm_up"
+    CALIBRATION = "calibration"
+    POSE = "pose"
+    REPEATABILITY = "repeatability"
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,22 +11,12 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import CaptureParameters, Chamber_degC, FrameCount, Wait_s
-from experiments.steps import (
-    Capture,
-    CloseFlap,
-    MoveTo,
-    OpenFlap,
-    Role,
-    SetTemperature,
-    Soak,
-    StartChamber,
-    Step,
-    StopChamber,
-)
+from experiments.parameters import Chamber_degC, FrameCount, StillTable, Wait_s
+from experiments.pieces import frames_through_flap, placed
+from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
 
 
-class ThermalCycle(CaptureParameters):
+class ThermalCycle(StillTable):
     """Parameters of a thermal cycle; temperatures are chamber set-points."""
 
     reference_degC: Chamber_degC = 24.0
@@ -56,20 +46,14 @@ class ThermalCycle(CaptureParameters):
 def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped and the flap closed."""
     yield CloseFlap()
-    yield from (MoveTo(axis, position) for axis, position in parameters.table_position.items())
+    yield from placed(parameters.table_position)
     yield StartChamber(parameters.reference_degC)
     yield Soak(parameters.equilibrium_s)
-    yield from _frames(parameters, parameters.reference_degC, Role.REFERENCE, parameters.reference_frames)
+    yield from frames_through_flap(parameters, parameters.reference_frames, Role.REFERENCE, parameters.reference_degC)
     for _ in range(parameters.cycles):
         for chamber_degC in parameters.set_points_degC:
             yield SetTemperature(chamber_degC)
             yield Soak(parameters.dwell_s)
             role = Role.VALIDATION if chamber_degC in parameters.held_out_degC else Role.FIT
-            yield from _frames(parameters, chamber_degC, role, parameters.frames_per_point)
+            yield from frames_through_flap(parameters, parameters.frames_per_point, role, chamber_degC)
     yield StopChamber()
-
-
-def _frames(parameters: ThermalCycle, chamber_degC: float, role: Role, frames: int) -> Iterator[Step]:
-    yield OpenFlap()
-    yield Capture(frames, parameters.interval_s, parameters.exposure_s, role, chamber_degC)
-    yield CloseFlap()

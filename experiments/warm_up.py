@@ -1,47 +1,91 @@
 """The paper's warm-up (section 3.1): a cold camera is switched on and watched while it heats itself.
 
 The chamber stays at the ambient temperature; the camera is off until it has cooled to it; the flap is open
-throughout the capture so that frames come without a pause.
+throughout the capture so that frames come without a pause. The table takes its place while the camera is still off,
+and the flap opens before it is switched on: nothing comes between its start and the first frame. The camera's own
+temperature comes with each frame; that of lens and housing would come from a thermal imager, read on its own period
+during the capture as every sensor is, and needs no step here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Annotated, Self
 
-from experiments.parameters import CaptureParameters, Chamber_degC, FrameCount, Wait_s
+from pydantic import Field, StringConstraints, model_validator
+
+from experiments.parameters import Chamber_degC, FrameCount, StillTable, Wait_s
+from experiments.pieces import placed
 from experiments.steps import (
     Capture,
     CloseFlap,
-    MoveTo,
+    CoolDown,
     OpenFlap,
     PowerCamera,
+    Prompt,
     Role,
-    Soak,
     StartChamber,
     Step,
     StopChamber,
 )
 
+CameraName = Annotated[str, StringConstraints(pattern=r"^[ -~]{1,100}$")]
+Roll_deg = Annotated[float, Field(ge=-180, le=180)]
 
-class WarmUp(CaptureParameters):
-    """Parameters of a warm-up; the paper took 3600 frames every 500 ms at 24 degC."""
+
+class WarmUp(StillTable):
+    """Parameters of a warm-up; the paper took 3600 frames every 500 ms at 24 degC, then again rolled by 20 degrees.
+
+    band_K, time_constant_s, cool_down_max_s: as in CoolDown. rolls_deg: about the optical axis, the camera being at
+    0 when the run begins. cameras: what the operator mounts, one after another, each with its serial number or none in
+    the stand's configuration; empty for the camera that is mounted, with no question asked.
+    """
 
     chamber_degC: Chamber_degC = 24.0
-    cool_down_s: Wait_s = 7200.0
+    band_K: float = Field(default=0.5, gt=0, le=20)
+    time_constant_s: float = Field(default=1200.0, gt=0, le=86400)
+    cool_down_max_s: Wait_s = 7200.0
     frames: FrameCount = 3600
+    rolls_deg: tuple[Roll_deg, ...] = Field(default=(0.0,), min_length=1, max_length=36)
+    cameras: tuple[CameraName, ...] = Field(default=(), max_length=20)
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        if len(set(self.rolls_deg)) < len(self.rolls_deg):
+            raise ValueError("rolls_deg has the same roll twice")
+        if len(set(self.cameras)) < len(self.cameras):
+            raise ValueError("cameras has the same camera twice")
+        return self
+
+    @property
+    def visits(self) -> int:
+        """How many captures the plan has."""
+        return len(self.rolls_deg) * max(1, len(self.cameras))
 
 
 def warm_up(parameters: WarmUp) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped, the flap closed and the camera on."""
-    yield CloseFlap()
-    yield from (MoveTo(axis, position) for axis, position in parameters.table_position.items())
-    yield PowerCamera(on=False)
-    yield StartChamber(parameters.chamber_degC)
-    yield Soak(parameters.cool_down_s)
+    mounted, roll_deg = "", 0.0
+    for camera in parameters.cameras or ("",):
+        for wanted_deg in parameters.rolls_deg:
+            yield CloseFlap()
+            yield PowerCamera(on=False)
+            if camera != mounted:
+                yield Prompt(f"mount the camera {camera}, rolled by {wanted_deg:g} deg about its optical axis")
+            elif wanted_deg != roll_deg:
+                yield Prompt(f"roll the camera about its optical axis, from {roll_deg:g} to {wanted_deg:g} deg")
+            mounted, roll_deg = camera, wanted_deg
+            yield from _once(parameters)
+
+
+def _once(parameters: WarmUp) -> Iterator[Step]:
+    """One warm-up of a camera that is off."""
+    chamber_degC = parameters.chamber_degC
+    yield StartChamber(chamber_degC)
+    yield CoolDown(parameters.band_K, parameters.time_constant_s, parameters.cool_down_max_s)
+    yield from placed(parameters.table_position)
     yield OpenFlap()
     yield PowerCamera(on=True)
-    yield Capture(
-        parameters.frames, parameters.interval_s, parameters.exposure_s, Role.WARM_UP, parameters.chamber_degC
-    )
+    yield Capture(parameters.frames, parameters.interval_s, parameters.exposure_s, Role.WARM_UP, chamber_degC)
     yield CloseFlap()
     yield StopChamber()

@@ -9,31 +9,50 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from drivers.documents import Document, load_document
+from experiments.calibration import Calibration, calibration
 from experiments.steps import PlannedStep, Step, number_steps
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
 
-_MOST_VISITS = 10_000  # of set-points; more than any camera lives through, and a plan is still listed within a second
+_MOST_VISITS = 10_000  # captures; more than any camera lives through, and a plan is still listed within a second
 
 
 class Experiment(Document):
     """One entry of the recipe: exactly one of the keys."""
 
-    thermal_cycle: ThermalCycle | None = None
     warm_up: WarmUp | None = None
+    thermal_cycle: ThermalCycle | None = None
+    calibration: Calibration | None = None
+    validation: Validation | None = None
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Self:
-        if (self.thermal_cycle is None) == (self.warm_up is None):
-            raise ValueError("give exactly one of thermal_cycle, warm_up")
+        if len(self._given) != 1:
+            raise ValueError(f"give exactly one of {', '.join(type(self).model_fields)}")
         return self
+
+    @property
+    def visits(self) -> int:
+        """How many captures the entry asks for, the reference frames of a cycle apart."""
+        return self._given[0].visits
 
     def steps(self) -> Iterator[Step]:
         """The steps of this entry."""
-        if self.thermal_cycle is not None:
-            yield from thermal_cycle(self.thermal_cycle)
-        if self.warm_up is not None:
-            yield from warm_up(self.warm_up)
+        match self._given[0]:
+            case WarmUp() as parameters:
+                return warm_up(parameters)
+            case ThermalCycle() as parameters:
+                return thermal_cycle(parameters)
+            case Calibration() as parameters:
+                return calibration(parameters)
+            case Validation() as parameters:
+                return validation(parameters)
+
+    @property
+    def _given(self) -> tuple[WarmUp | ThermalCycle | Calibration | Validation, ...]:
+        entries = (self.warm_up, self.thermal_cycle, self.calibration, self.validation)
+        return tuple(entry for entry in entries if entry is not None)
 
 
 class Recipe(Document):
@@ -45,10 +64,9 @@ class Recipe(Document):
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
-        cycles = (experiment.thermal_cycle for experiment in self.experiments)
-        visits = sum(cycle.visits for cycle in cycles if cycle is not None)
+        visits = sum(experiment.visits for experiment in self.experiments)
         if visits > _MOST_VISITS:
-            raise ValueError(f"{visits} visits of set-points are more than {_MOST_VISITS}")
+            raise ValueError(f"{visits} visits of set-points and positions are more than {_MOST_VISITS}")
         return self
 
     def plan(self) -> Iterator[PlannedStep]:

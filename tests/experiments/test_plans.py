@@ -107,7 +107,7 @@ def test_impossible_parameters_are_refused_with_a_reason(change: dict[str, objec
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"cool_down_s": 604801}, "less than or equal to 604800"),
+        ({"cool_down_max_s": 604801}, "less than or equal to 604800"),
         ({"frames": 1_000_001}, "less than or equal to 1000000"),
         ({"interval_s": 0.05}, "does not fit"),
         ({"dwell_s": 5}, "Extra inputs"),

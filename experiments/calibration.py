@@ -1,0 +1,68 @@
+"""The paper's calibration (section 6.3): the target at 34 table positions, all at the reference temperature.
+
+Positions are a grid of linear and rotary ones without those left out. The chamber is closed but for the captures, and
+the camera comes to equilibrium first. The home checks at both ends tell whether the table lost steps in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from experiments.parameters import Chamber_degC, Linear_mm, MovingTable, Rotary_deg, TablePosition, Wait_s
+from experiments.pieces import frames_at, homes_checked, moved
+from experiments.steps import CloseFlap, Role, Soak, StartChamber, Step, StopChamber
+
+
+class Calibration(MovingTable):
+    """Parameters of a calibration."""
+
+    reference_degC: Chamber_degC = 24.0
+    equilibrium_s: Wait_s = 2700.0
+    linear_mm: tuple[Linear_mm, ...] = Field(min_length=1, max_length=100)
+    rotary_deg: tuple[Rotary_deg, ...] = Field(min_length=1, max_length=100)
+    left_out: tuple[TablePosition, ...] = Field(default=(), max_length=1000)
+
+    @model_validator(mode="after")
+    def _positions_left(self) -> Self:
+        if len(set(self.linear_mm)) < len(self.linear_mm) or len(set(self.rotary_deg)) < len(self.rotary_deg):
+            raise ValueError("linear_mm or rotary_deg has the same position twice")
+        for position in self.left_out:
+            if position.linear_mm not in self.linear_mm or position.rotary_deg not in self.rotary_deg:
+                raise ValueError(
+                    f"left_out has ({position.linear_mm}, {position.rotary_deg}), which is not in the grid"
+                )
+        if not self.positions:
+            raise ValueError("left_out leaves no position")
+        return self
+
+    @property
+    def positions(self) -> tuple[TablePosition, ...]:
+        """In order of visit: there and back through the rotary positions, so that the table takes short ways."""
+        grid = (
+            TablePosition(linear_mm=linear_mm, rotary_deg=rotary_deg)
+            for row, linear_mm in enumerate(self.linear_mm)
+            for rotary_deg in (self.rotary_deg if row % 2 == 0 else reversed(self.rotary_deg))
+        )
+        return tuple(position for position in grid if position not in self.left_out)
+
+    @property
+    def visits(self) -> int:
+        """How many captures the plan has."""
+        return len(self.positions)
+
+
+def calibration(parameters: Calibration) -> Iterator[Step]:
+    """The steps, in order; ends with the chamber stopped and the flap closed."""
+    positions, reference_degC = parameters.positions, parameters.reference_degC
+    yield CloseFlap()
+    yield StartChamber(reference_degC)
+    yield from moved(positions[0])
+    yield from homes_checked()
+    yield Soak(parameters.equilibrium_s)
+    for position in positions:
+        yield from frames_at(parameters, position, parameters.frames_per_position, Role.CALIBRATION, reference_degC)
+    yield from homes_checked()
+    yield StopChamber()

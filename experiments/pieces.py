@@ -1,0 +1,43 @@
+"""Pieces that several sequences share; each closes the flap it opens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from experiments.parameters import CaptureParameters, MovingTable, TablePosition
+from experiments.steps import Capture, CheckHome, CloseFlap, MoveTo, OpenFlap, Role, Soak, Step
+
+_AXES = ("linear", "rotary")
+
+
+def frames_through_flap(parameters: CaptureParameters, frames: int, role: Role, chamber_degC: float) -> Iterator[Step]:
+    """`frames` images; the flap is open for them only."""
+    yield OpenFlap()
+    yield Capture(frames, parameters.interval_s, parameters.exposure_s, role, chamber_degC)
+    yield CloseFlap()
+
+
+def placed(table_position: Mapping[str, float]) -> Iterator[Step]:
+    """Each axis of `table_position` moved there, mm or deg."""
+    for axis, position in table_position.items():
+        yield MoveTo(axis, position)
+
+
+def moved(position: TablePosition) -> Iterator[Step]:
+    """Both axes approached anew, also one that is there already: its motor may have been without current meanwhile."""
+    yield from placed(dict(zip(_AXES, (position.linear_mm, position.rotary_deg), strict=True)))
+
+
+def frames_at(
+    parameters: MovingTable, position: TablePosition, frames: int, role: Role, chamber_degC: float
+) -> Iterator[Step]:
+    """The target moved to `position` and at rest there, then its frames."""
+    yield from moved(position)
+    yield Soak(parameters.settle_s)
+    yield from frames_through_flap(parameters, frames, role, chamber_degC)
+
+
+def homes_checked() -> Iterator[Step]:
+    """A home check of both axes."""
+    for axis in _AXES:
+        yield CheckHome(axis)

@@ -1,0 +1,70 @@
+"""The paper's validation in three dimensions (section 6.3): the target at V0..V3, at each of 12 temperatures.
+
+The first temperature is the reference: what the table does to the target is known from there. The paper counts 12
+temperatures in its text and shows 11 deviations from the reference. At each temperature the target goes back to V0
+at the end; how far it is then from where it was is the table's own share of the deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from experiments.parameters import Chamber_degC, FrameCount, MovingTable, TablePosition, Wait_s
+from experiments.pieces import frames_at, homes_checked, moved
+from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
+
+
+class Validation(MovingTable):
+    """Parameters of a validation; temperatures are chamber set-points, the first one is the reference.
+
+    positions: V0, V1, ... in order of visit. check_home_every: temperatures between two home checks.
+    """
+
+    temperatures_degC: tuple[Chamber_degC, ...] = Field(min_length=2, max_length=100)
+    positions: tuple[TablePosition, ...] = Field(min_length=2, max_length=100)
+    equilibrium_s: Wait_s = 2700.0
+    dwell_s: Wait_s = 2700.0
+    reference_frames: FrameCount = 20
+    check_home_every: int = Field(default=3, ge=1, le=100)
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        if len(set(self.temperatures_degC)) < len(self.temperatures_degC):
+            raise ValueError("temperatures_degC has the same temperature twice")
+        if len(set(self.positions)) < len(self.positions):
+            raise ValueError("positions has the same position twice; going back to the first is in the plan already")
+        return self
+
+    @property
+    def visits(self) -> int:
+        """How many captures the plan has."""
+        return len(self.temperatures_degC) * (len(self.positions) + 1)
+
+
+def validation(parameters: Validation) -> Iterator[Step]:
+    """The steps, in order; ends with the chamber stopped and the flap closed."""
+    reference_degC, *others_degC = parameters.temperatures_degC
+    yield CloseFlap()
+    yield StartChamber(reference_degC)
+    yield from moved(parameters.positions[0])
+    yield from homes_checked()
+    yield Soak(parameters.equilibrium_s)
+    yield from _poses(parameters, reference_degC, parameters.reference_frames)
+    for number, chamber_degC in enumerate(others_degC, start=1):
+        if number % parameters.check_home_every == 0:
+            yield from homes_checked()
+        yield SetTemperature(chamber_degC)
+        yield Soak(parameters.dwell_s)
+        yield from _poses(parameters, chamber_degC, parameters.frames_per_position)
+    yield from homes_checked()
+    yield StopChamber()
+
+
+def _poses(parameters: Validation, chamber_degC: float, frames: int) -> Iterator[Step]:
+    """Every position in turn, and the first once more."""
+    for position in parameters.positions:
+        yield from frames_at(parameters, position, frames, Role.POSE, chamber_degC)
+    yield from frames_at(parameters, parameters.positions[0], frames, Role.REPEATABILITY, chamber_degC)
