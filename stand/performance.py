@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from drivers.clock import NS_PER_S
-from drivers.interface import StandTripped
+from drivers.interface import SessionError, StandTripped
 from stand.assembly import Assembly
+from stand.control import SOCKET_NAME, handlers, serve
+from stand.estimate import price
 from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.guard import Guard
-from stand.hub import Event, Hub, Item
+from stand.hub import Event, Item
 from stand.interlocks import Fault
 from stand.journal import Cleared, Ended, Entry, Gap, Journal
 from stand.logbook import Logbook
@@ -20,8 +22,9 @@ from stand.poller import Poller
 from stand.recording.instants import utc_text
 from stand.recording.recorder import Recorder
 from stand.resume import Interruption, begun
-from stand.scheduler import Scheduler
+from stand.scheduler import Progress, Scheduler
 from stand.session_setup import Order
+from stand.status import StatusBoard
 from stand.stop import OPERATOR, Stop
 from stand.tasks import cancelled, watched
 
@@ -52,6 +55,7 @@ async def perform(work: Performance) -> None:
     ended = Ended(0, "failed", "")
     try:
         scheduler = await watched(_begun(work, pollers, guard, log), work.background)
+        watchers.append(asyncio.create_task(_answer(work, log)))
         watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
         watchers.append(asyncio.create_task(guard.run()))
         stop.started()
@@ -79,7 +83,7 @@ async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log
     if work.before is None:
         log.tell("info", "run.start", f"recipe {work.order.recipe.name}")
     else:
-        _tell_interruption(work.before, work.assembly.hub, work.assembly.clock.now_ns(), log)
+        _tell_interruption(work.before, work.assembly.clock.now_ns(), log)
     if not await guard.check():
         raise StandTripped("the rules do not hold")
     await work.recorder.flushed()  # a session with a journal can be opened and resumed
@@ -98,6 +102,22 @@ async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log
     )
 
 
+async def _answer(work: Performance, log: Logbook) -> None:
+    """Answer at the control socket until cancelled; a run goes on without one."""
+    assembly, before = work.assembly, work.before
+    progress = Progress() if before is None else before.progress
+    steps = price(work.order.recipe.plan(), work.order.config)
+    gate, stop, clock = assembly.stand.gate, work.stop, assembly.clock
+    board = StatusBoard(work.order.recipe.name, steps, progress, gate, stop, work.recorder, clock)
+    assembly.hub.subscribe(board)
+    try:
+        async with serve(work.recorder.directory / SOCKET_NAME, handlers(gate, stop, board.status)):
+            await asyncio.Event().wait()
+    except SessionError as error:
+        log.tell("warning", "no_control", f"the run cannot be asked or paused: {error}")
+        await asyncio.Event().wait()
+
+
 def _first_entries(work: Performance) -> tuple[Entry, ...]:
     now_ns = work.assembly.clock.now_ns()
     if work.before is None:
@@ -106,10 +126,10 @@ def _first_entries(work: Performance) -> tuple[Entry, ...]:
     return (*cleared, Gap(work.before.last_ns, now_ns))
 
 
-def _tell_interruption(before: Interruption, hub: Hub, now_ns: int, log: Logbook) -> None:
+def _tell_interruption(before: Interruption, now_ns: int, log: Logbook) -> None:
     """The end of the run that was interrupted, the gap since, and that it goes on."""
     if not before.ended:
-        hub.publish(Event(before.last_ns, "error", "run.end", "interrupted: killed"))
+        log.tell("error", "run.end", f"interrupted: killed after {utc_text(before.last_ns)}")
     gap_s = (now_ns - before.last_ns) / NS_PER_S
     span = f"from {utc_text(before.last_ns)} to {utc_text(now_ns)}"
     log.tell("warning", "gap", f"nothing was recorded and nobody watched the stand {span} ({gap_s:.3f} s)")

@@ -68,12 +68,6 @@ class Interruption:
     salvaged: tuple[Salvaged, ...]
     cooling: Cooling | None
 
-    @property
-    def done_indices(self) -> frozenset[int]:
-        """The places in the plan of the steps that are done."""
-        plan = self.order.recipe.plan()
-        return frozenset(planned.index for planned in plan if planned.step_id in self.progress.done)
-
     def release(self) -> None:
         """Give the session free for another daemon; may be called twice."""
         self.journal.release()

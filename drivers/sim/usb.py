@@ -230,7 +230,9 @@ class ForwardingBackend(IBackend):
         return dev
 
     def close_device(self, dev_handle: Handle) -> None:
-        """Nothing is held open."""
+        """Lets go of the connection; the next request makes a new one."""
+        with self._lock:
+            self._drop()
 
     def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
         """Accepted."""

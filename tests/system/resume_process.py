@@ -1,0 +1,78 @@
+"""A daemon of its own that runs or resumes a night in virtual time, to be killed at a random moment.
+
+`python -m tests.system.resume_process` reads a pickled (order, out) or (None, session) from its standard input. It
+writes a line for each item of the hub: its type, and after a capture the instants of its frames, which are then on the
+disk.
+"""
+
+import asyncio
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+from drivers.interface import Frame
+from stand.hub import StepMark, StepState
+from stand.resume import interruption
+from stand.run import resume, run_virtual
+
+DOWNTIME_S = 45.0
+
+
+def watch(hub):
+    taken = {}
+
+    def follow(item):
+        if isinstance(item, Frame):
+            taken.setdefault(item.step_id, []).append(item.time_ns)
+        is_done = isinstance(item, StepMark) and item.state is StepState.DONE
+        times_ns = taken.get(item.step_id, []) if is_done else []
+        sys.stdout.write(" ".join([type(item).__name__, *map(str, times_ns)]) + "\n")
+        sys.stdout.flush()
+
+    hub.subscribe(follow)
+
+
+def main():
+    order, place = pickle.loads(sys.stdin.buffer.read())
+    if order is None:
+        asyncio.run(resume(interruption(place), watch, DOWNTIME_S))
+    else:
+        asyncio.run(run_virtual(order, place, None, watch))
+
+
+class Daemon:
+    """A running daemon; the frames at `acknowledged` (ns) are on the disk."""
+
+    def __init__(self, order, place: Path):
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.system.resume_process"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        self._process.stdin.write(pickle.dumps((order, place)))
+        self._process.stdin.close()
+        self.acknowledged = []
+
+    def lives_for(self, items, kind=""):
+        """Whether it still lives when it has published so many more, of that kind."""
+        for line in self._process.stdout:
+            name, *times_ns = line.decode().split()
+            self.acknowledged += map(int, times_ns)
+            items -= not kind or kind == name
+            if items <= 0:
+                return True
+        return False
+
+    def kill(self):
+        """Dead when this returns; what it had acknowledged meanwhile counts, too."""
+        self._process.kill()
+        self.wait()
+
+    def wait(self):
+        """Its exit code."""
+        self.lives_for(sys.maxsize)
+        self._process.stdout.close()
+        return self._process.wait()
+
+
+if __name__ == "__main__":
+    main()
