@@ -59,5 +59,7 @@ async def cool_down(
     waited = f"after {(now_ns - begin_ns) / NS_PER_S:.0f} s the camera should be {excess_K:+.2f} K from the air"
     if abs(excess_K) <= band_K:
         hub.publish(Event(now_ns, "info", "cooled_down", f"{waited}, within {band_K:g} K"))
-    else:
-        hub.publish(Event(now_ns, "warning", "cool_down_unsure", f"{waited}, more than {band_K:g} K; going on"))
+        return
+    if math.isinf(excess_K):
+        waited = "the air near the camera is not measured"
+    hub.publish(Event(now_ns, "warning", "cool_down_unsure", f"{waited}; going on without being within {band_K:g} K"))

@@ -51,12 +51,17 @@ async def ready(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: H
     """Before a capture: approach anew, from below, each axis whose position cannot be relied upon.
 
     `commanded`: where the plan put each axis it moved (mm or deg); the others are left alone. An axis is in doubt when
-    its motor is without current or its scale is lost; event "re-approached" with the reason. DeviceFault in an alarm.
+    its motor is without current, its scale is lost, or it stands a step or more elsewhere (somebody stopped it); event
+    "re-approached" with the reason. DeviceFault in an alarm.
     """
     for name, position in commanded.items():
-        reading, *_ = await axes[name].read()
+        axis = axes[name]
+        reading, *_ = await axis.read()
+        reason = reading.reason
         if reading.quality is Quality.GOOD:
-            continue
-        await approach(axes[name], position)
-        text = f"{name}: {reading.reason}; approached {position:g} {reading.unit} again"
+            if abs(reading.value - position) < axis.profile.unit_per_step:
+                continue
+            reason = f"stands at {reading.value:.4f} {reading.unit}"
+        await approach(axis, position)
+        text = f"{name}: {reason}; approached {position:g} {reading.unit} again"
         hub.publish(Event(clock.now_ns(), "info", "re-approached", text))
