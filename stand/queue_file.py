@@ -1,0 +1,219 @@
+"""The file of a queue of runs, `queue.json` in the recording directory, and its locks.
+
+The file is replaced as a whole, and what it was before stays beside it as `queue.json.last`. `.queue.lock` is locked
+(flock) while it is read or changed, `.queue.worker` as long as somebody works the queue: a run that is marked as
+running when nobody does was interrupted.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, ValidationError
+
+from drivers.documents import Document
+from drivers.interface import SessionError
+from stand.recording.sink import sync_folder
+
+QUEUE_NAME = "queue.json"
+LAST_NAME = "queue.json.last"
+_LOCK_NAME = ".queue.lock"
+_WORKER_NAME = ".queue.worker"
+
+
+class State(StrEnum):
+    """Where a queued run is. Waiting and interrupted ones are still to be done, the interrupted one first."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+
+class Entry(Document):
+    """One run. The texts are those of the files when it was added: a later edit does not change what is queued.
+
+    config: the file its text is from, for messages. Instants are ns since the epoch on the host's clock. session: the
+    name of its folder in the recording directory, "" before it has one. reason: why it failed or was interrupted.
+    """
+
+    id: int = Field(ge=1)
+    recipe: str
+    config: str
+    config_text: str
+    recipe_text: str
+    target_text: str
+    state: State = State.WAITING
+    added_ns: int
+    began_ns: int | None = None
+    ended_ns: int | None = None
+    session: str = ""
+    reason: str = ""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is still to be done."""
+        return self.state in (State.WAITING, State.INTERRUPTED)
+
+
+class Queue(Document):
+    """The whole file. entries: what has ended, then the running one, then what is to be done in its order.
+
+    next_id: no number is given twice. halted: why nothing is begun until an operator says so, "" when it may be.
+    """
+
+    version: Literal[1] = 1
+    next_id: int = Field(default=1, ge=1)
+    halted: str = ""
+    entries: tuple[Entry, ...] = ()
+
+
+class Draft:
+    """A queue that is being changed; `queue` is written when the block ends well."""
+
+    def __init__(self, queue: Queue) -> None:
+        self.queue = queue
+
+    def entry(self, number: int) -> Entry:
+        """The entry of this number; SessionError when there is none."""
+        for entry in self.queue.entries:
+            if entry.id == number:
+                return entry
+        raise SessionError(f"no run {number} in the queue; `stand queue list` shows those there are")
+
+    def put(self, entry: Entry) -> None:
+        """Replace the entry of the same number."""
+        self.set(entries=tuple(entry if old.id == entry.id else old for old in self.queue.entries))
+
+    def set(self, **changes: object) -> None:
+        """Other fields of the queue."""
+        self.queue = self.queue.model_copy(update=changes)
+
+
+def read_queue(directory: Path) -> Queue:
+    """The queue of a recording directory, an empty one when there is none; SessionError when it cannot be read."""
+    if not (directory / QUEUE_NAME).exists():
+        return Queue()
+    with _locked(directory):
+        return _settled(directory, _load(directory))
+
+
+@contextmanager
+def changing(directory: Path) -> Generator[Draft]:
+    """Change the queue: nobody else does meanwhile, and all of it is on the disk at the end, or nothing."""
+    with _locked(directory):
+        before = _load(directory)
+        draft = Draft(_settled(directory, before))
+        yield draft
+        if draft.queue != before:
+            _store(directory, draft.queue)
+
+
+@contextmanager
+def working(directory: Path) -> Generator[None]:
+    """Be the one who works this queue; SessionError when somebody else is. What the one before had under way is
+    interrupted from now on."""
+    with _opened(directory / _WORKER_NAME) as worker:
+        with _locked(directory):  # whoever only looks if the queue is worked does so inside the same lock
+            if not _try_lock(worker):
+                raise SessionError(f"{directory}: its queue is being worked already")
+            found = _load(directory)
+            if _running(found):
+                _store(directory, _interrupted(found))
+        yield
+
+
+def _settled(directory: Path, queue: Queue) -> Queue:
+    """What is marked as running while nobody works the queue was interrupted."""
+    if not _running(queue):
+        return queue
+    with _opened(directory / _WORKER_NAME) as worker:
+        return _interrupted(queue) if _try_lock(worker) else queue
+
+
+def _running(queue: Queue) -> bool:
+    return any(entry.state is State.RUNNING for entry in queue.entries)
+
+
+def _interrupted(queue: Queue) -> Queue:
+    cut = {"state": State.INTERRUPTED, "reason": "its daemon was killed"}
+    entries = (entry.model_copy(update=cut) if entry.state is State.RUNNING else entry for entry in queue.entries)
+    return queue.model_copy(update={"entries": tuple(entries)})
+
+
+def _load(directory: Path) -> Queue:
+    path = directory / QUEUE_NAME
+    try:
+        return Queue.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return Queue()
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValidationError as error:
+        remedy = f"{LAST_NAME} beside it is the queue before its last change: put it in its place, or move both away"
+        raise SessionError(f"{path}: is damaged ({_first_fault(error)}); {remedy}") from error
+
+
+def _first_fault(error: ValidationError) -> str:
+    fault = error.errors()[0]
+    where = ".".join(map(str, fault["loc"]))
+    return f"{where}: {fault['msg']}" if where else fault["msg"]
+
+
+def _store(directory: Path, queue: Queue) -> None:
+    path = directory / QUEUE_NAME
+    try:
+        if path.exists():
+            _replace(directory / LAST_NAME, path.read_bytes())
+        _replace(path, queue.model_dump_json(indent=1).encode() + b"\n")
+        sync_folder(directory)
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be written ({error.strerror}); the queue is as it was") from error
+
+
+def _replace(path: Path, data: bytes) -> None:
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        with suppress(OSError):
+            part.unlink()
+        raise
+
+
+@contextmanager
+def _locked(directory: Path) -> Generator[None]:
+    with _opened(directory / _LOCK_NAME) as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+@contextmanager
+def _opened(path: Path) -> Generator[int]:
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise SessionError(f"{path.parent}: its queue cannot be locked ({error.strerror})") from error
+    try:
+        yield file
+    finally:
+        os.close(file)
+
+
+def _try_lock(file: int) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

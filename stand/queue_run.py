@@ -1,0 +1,104 @@
+"""How one run of a queue is performed: begun, or resumed in the session it has."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+from drivers.interface import SessionError, StandError, StandTripped
+from stand.estimate import price
+from stand.follow import Follow
+from stand.hub import Event, Hub, Item, StepMark
+from stand.journal import JOURNAL_NAME, Ended, Journal
+from stand.progress import progress
+from stand.queue import order_of
+from stand.queue_file import Entry
+from stand.queue_work import Halt
+from stand.resume import Interruption, interruption
+from stand.run import resume, run_real, run_virtual
+from stand.session_setup import Order
+from stand.stop import Interrupted
+
+
+async def run_entry(
+    directory: Path, entry: Entry, begun: Callable[[Path], None], tell: Callable[[str], None], *, virtual_time: bool
+) -> Path:
+    """Run `entry` into a session below `directory`, or go on in the one it has; progress is shown, `tell` gets
+    warnings.
+
+    Returns the session's folder; `begun` is told it at the first step. Halt when an interrupted run cannot be resumed,
+    or one that failed has left the stand not confirmed safe; else raises as a run does.
+    """
+    session = directory / entry.session if entry.session else None
+    if session is not None and await asyncio.to_thread(_is_complete, session):
+        return session  # killed between its end and the note of it
+    order = order_of(entry)
+    before = None if session is None else await asyncio.to_thread(_interruption, session)
+    watch = _Watch(directory, order.recipe.name, begun)
+    try:
+        with _followed(order, before, tell) as follow:
+
+            def subscribe(hub: Hub) -> None:
+                hub.subscribe(follow)
+                hub.subscribe(watch)
+
+            if before is not None:
+                return await resume(before, subscribe)
+            if virtual_time:
+                return await run_virtual(order, directory, None, subscribe)
+            return await run_real(order, directory, subscribe)
+    except (Interrupted, StandTripped):
+        raise
+    except StandError as error:
+        if watch.unsafe:
+            raise Halt(f"{error}; NOT SAFE: {'; '.join(watch.unsafe)}") from error
+        raise
+
+
+class _Watch:
+    """Finds the folder of a run that begins, and keeps which actuators have not confirmed their safe state."""
+
+    def __init__(self, directory: Path, recipe: str, begun: Callable[[Path], None]) -> None:
+        self.unsafe: list[str] = []
+        self._journals = f"*-{recipe}/{JOURNAL_NAME}"
+        self._directory = directory
+        self._known = set(directory.glob(self._journals))
+        self._begun: Callable[[Path], None] | None = begun
+
+    def __call__(self, item: Item) -> None:
+        if isinstance(item, Event) and item.kind == "not_confirmed_safe":
+            self.unsafe.append(item.text)
+        if isinstance(item, StepMark) and self._begun is not None:  # the journal has been begun just before
+            begun, self._begun = self._begun, None
+            for journal in set(self._directory.glob(self._journals)) - self._known:
+                begun(journal.parent)
+
+
+@contextmanager
+def _followed(order: Order, before: Interruption | None, tell: Callable[[str], None]) -> Generator[Follow]:
+    steps = price(order.recipe.plan(), order.config)
+    with progress("run", sum(step.duration_s for step in steps)) as report:
+        if before is None:
+            yield Follow(steps, report, tell)
+        else:
+            yield Follow(steps, report, tell, before.progress.done, before.progress.earned_s)
+
+
+def _interruption(session: Path) -> Interruption:
+    try:
+        return interruption(session)
+    except SessionError as error:
+        raise Halt(str(error)) from error
+
+
+def _is_complete(session: Path) -> bool:
+    """Whether the run recorded in `session` came to its end; Halt when its journal cannot tell."""
+    try:
+        journal, entries = Journal.open(session)
+    except SessionError as error:
+        raise Halt(str(error)) from error
+    journal.release()
+    last = entries[-1] if entries else None
+    return isinstance(last, Ended) and last.status == "complete"

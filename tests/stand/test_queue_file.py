@@ -1,0 +1,260 @@
+"""The persistent queue against a plain list, several processes, and a disk that has damaged it."""
+
+import subprocess
+import sys
+import tempfile
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from drivers.interface import ConfigError, SessionError, StandTripped
+from stand import queue
+from stand.queue_file import LAST_NAME, QUEUE_NAME, State, working
+from stand.session_setup import Order
+
+ORDER = queue.load_order("warm-up", "simulated")
+
+
+def add(directory: Path, order: Order = ORDER) -> int:
+    return queue.add(directory, order, "simulated", 1).id
+
+
+def states(directory: Path) -> list[tuple[int, str]]:
+    return [(entry.id, entry.state) for entry in queue.queued(directory).entries]
+
+
+class QueueAgainstAList(RuleBasedStateMachine):
+    """ended: [id, state]; running: an id; open: ids in the order they will be run."""
+
+    @initialize()
+    def begin(self) -> None:
+        self.folder = tempfile.TemporaryDirectory()
+        self.directory = Path(self.folder.name)
+        self.ended: list[tuple[int, str]] = []
+        self.running: int | None = None
+        self.open: list[int] = []
+        self.interrupted: set[int] = set()
+        self.added = 0
+        self.worker: AbstractContextManager[None] | None = None
+
+    def teardown(self) -> None:
+        if self.worker is not None:
+            self.worker.__exit__(None, None, None)
+        self.folder.cleanup()
+
+    def anyone(self, data: st.DataObject) -> int:
+        return data.draw(st.integers(1, self.added + 1))
+
+    @rule()
+    def add(self) -> None:
+        self.added += 1
+        assert add(self.directory) == self.added
+        self.open.append(self.added)
+
+    @precondition(lambda self: self.added)
+    @rule(data=st.data(), position=st.integers(0, 6))
+    def move(self, data: st.DataObject, position: int) -> None:
+        number = self.anyone(data)
+        if number in self.open and position >= 1:
+            queue.move(self.directory, number, position)
+            self.open.remove(number)
+            self.open.insert(position - 1, number)
+        else:
+            with pytest.raises(SessionError):
+                queue.move(self.directory, number, position)
+
+    @precondition(lambda self: self.added)
+    @rule(data=st.data())
+    def remove(self, data: st.DataObject) -> None:
+        number = self.anyone(data)
+        there = {*self.open, *(other for other, _ in self.ended)}
+        if number in there:
+            queue.remove(self.directory, number)
+            self.open = [other for other in self.open if other != number]
+            self.ended = [entry for entry in self.ended if entry[0] != number]
+            self.interrupted.discard(number)
+        else:
+            with pytest.raises(SessionError):
+                queue.remove(self.directory, number)
+
+    @precondition(lambda self: self.worker is None and self.added)
+    @rule()
+    def daemon_starts(self) -> None:
+        self.worker = working(self.directory)
+        self.worker.__enter__()
+
+    @precondition(lambda self: self.worker is not None and self.running is None)
+    @rule()
+    def take(self) -> None:
+        entry = queue.take(self.directory, 2)
+        if not self.open:
+            assert entry is None
+            return
+        self.running = self.open.pop(0)
+        assert entry is not None
+        assert entry.id == self.running
+        assert (entry.state is State.INTERRUPTED) == (self.running in self.interrupted)
+
+    @precondition(lambda self: self.running is not None)
+    @rule(state=st.sampled_from([State.DONE, State.FAILED]))
+    def finish(self, state: State) -> None:
+        assert self.running is not None
+        queue.finish(self.directory, self.running, state, 3)
+        self.ended.append((self.running, state))
+        self.interrupted.discard(self.running)
+        self.running = None
+
+    @precondition(lambda self: self.worker is not None)
+    @rule()
+    def daemon_is_killed(self) -> None:
+        assert self.worker is not None
+        self.worker.__exit__(None, None, None)
+        self.worker = None
+        if self.running is not None:
+            self.open.insert(0, self.running)
+            self.interrupted.add(self.running)
+            self.running = None
+
+    @invariant()
+    def the_file_says_what_the_list_says(self) -> None:
+        running = [] if self.running is None else [(self.running, "running")]
+        waiting = [(number, "interrupted" if number in self.interrupted else "waiting") for number in self.open]
+        assert states(self.directory) == [*self.ended, *running, *waiting]
+
+
+TestQueueAgainstAList = QueueAgainstAList.TestCase
+TestQueueAgainstAList.settings = settings(max_examples=25, stateful_step_count=25, deadline=None, derandomize=True)
+
+
+def test_what_is_queued_is_what_the_files_were_when_they_were_added(tmp_path: Path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("name: mine\nexperiments: [{warm_up: {}}]\n")
+    number = add(tmp_path, queue.load_order(str(recipe), "simulated"))
+    recipe.write_text("name: other\n")
+    entry = queue.queued(tmp_path).entries[0]
+    order = queue.order_of(entry)
+    assert (entry.id, entry.recipe, order.recipe.name) == (number, "mine", "mine")
+    assert (order.config, order.target_text) == (ORDER.config, ORDER.target_text)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("name: bad\nexperiments: [{warm_upp: {}}]\n", "unknown key"),
+        ("name: bad\nexperiments: [{thermal_cycle: {set_points_degC: [65]}}]\n", r"outside limits\.chamber_degC"),
+    ],
+)
+def test_a_typo_is_told_when_a_recipe_is_added_not_at_night(tmp_path: Path, text: str, sentence: str):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(text)
+    with pytest.raises(ConfigError, match=sentence):
+        queue.load_order(str(recipe), "simulated")
+
+
+def test_what_this_version_refuses_is_named_with_its_run(tmp_path: Path):
+    add(tmp_path)
+    entry = queue.queued(tmp_path).entries[0].model_copy(update={"recipe_text": "name: x\n"})
+    with pytest.raises(ConfigError, match=r"run 1 of the queue: warm-up: experiments"):
+        queue.order_of(entry)
+
+
+def test_an_interrupted_run_keeps_its_session_and_comes_first(tmp_path: Path):
+    add(tmp_path)
+    add(tmp_path)
+    with working(tmp_path):
+        queue.take(tmp_path, 5)
+        queue.note_session(tmp_path, 1, tmp_path / "night")
+    interrupted, _ = queue.queued(tmp_path).entries
+    assert (interrupted.state, interrupted.session, interrupted.began_ns) == ("interrupted", "night", 5)
+    assert interrupted.reason == "its daemon was killed"
+    with working(tmp_path):
+        again = queue.take(tmp_path, 9)
+        assert again is not None
+        assert (again.id, again.session) == (1, "night")
+        running = queue.queued(tmp_path).entries[0]
+        assert (running.state, running.began_ns, running.reason) == ("running", 5, "")
+        with pytest.raises(SessionError, match="run 1 is running; one at a time"):
+            queue.take(tmp_path, 9)
+        with pytest.raises(SessionError, match=r"run 1 is running; `stand stop` ends it"):
+            queue.remove(tmp_path, 1)
+        with pytest.raises(SessionError, match="run 1 is running; only a run that is still to be done"):
+            queue.move(tmp_path, 1, 1)
+
+
+def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
+    add(tmp_path)
+    add(tmp_path)
+    with working(tmp_path):
+        queue.take(tmp_path, 2)
+        queue.finish(tmp_path, 1, State.FAILED, 3, "air is too warm", halt=True)
+        with pytest.raises(StandTripped, match=r"halted: run 1: air is too warm; see to it"):
+            queue.take(tmp_path, 4)
+        assert states(tmp_path) == [(1, "failed"), (2, "waiting")]
+        queue.clear(tmp_path)
+        assert queue.take(tmp_path, 4) is not None
+
+
+def test_only_one_works_a_queue(tmp_path: Path):
+    with working(tmp_path), pytest.raises(SessionError, match="its queue is being worked already"), working(tmp_path):
+        pass
+    with working(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("number", [2, -1])
+def test_a_number_that_is_not_there_is_said_to(tmp_path: Path, number: int):
+    add(tmp_path)
+    with pytest.raises(SessionError, match=f"no run {number} in the queue"):
+        queue.remove(tmp_path, number)
+
+
+ADDING = """
+import sys
+from pathlib import Path
+from stand import queue
+order = queue.load_order("warm-up", "simulated")
+for _ in range(20):
+    number = queue.add(Path(sys.argv[1]), order, "simulated", 1).id
+    queue.move(Path(sys.argv[1]), number, 1)
+"""
+
+
+def test_two_processes_at_once_lose_nothing(tmp_path: Path):
+    processes = [subprocess.Popen([sys.executable, "-c", ADDING, str(tmp_path)]) for _ in range(2)]
+    assert [process.wait(60) for process in processes] == [0, 0]
+    assert sorted(number for number, _ in states(tmp_path)) == list(range(1, 41))
+
+
+@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: b"\xff" + data])
+def test_a_damaged_file_is_named_left_alone_and_can_be_put_right(tmp_path: Path, damage):
+    add(tmp_path)
+    add(tmp_path)
+    path = tmp_path / QUEUE_NAME
+    damaged = damage(path.read_bytes())
+    path.write_bytes(damaged)
+    for attempt in (lambda: add(tmp_path), lambda: queue.queued(tmp_path), lambda: queue.take(tmp_path, 1)):
+        with pytest.raises(SessionError, match=r"queue\.json: is damaged .*queue\.json\.last beside it is") as caught:
+            attempt()
+        assert "\n" not in str(caught.value)
+    assert path.read_bytes() == damaged
+    path.write_bytes((tmp_path / LAST_NAME).read_bytes())
+    assert states(tmp_path) == [(1, "waiting")]
+
+
+def test_a_disk_that_refuses_leaves_the_queue_as_it_was(tmp_path: Path):
+    add(tmp_path)
+    (tmp_path / f".{LAST_NAME}.part").mkdir()  # in the way of the new file, as a full disk would be
+    with pytest.raises(SessionError, match=r"cannot be written \(Is a directory\); the queue is as it was"):
+        add(tmp_path)
+    assert states(tmp_path) == [(1, "waiting")]
+
+
+def test_looking_at_a_folder_without_a_queue_leaves_nothing_there(tmp_path: Path):
+    assert states(tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SessionError, match="its queue cannot be locked"):
+        queue.remove(tmp_path / "nowhere", 1)
