@@ -46,16 +46,22 @@ _EDGES = 0x3  # of GPIOFlags
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """unit per full step, the way (in units) that every move ends upwards at least."""
+    """unit per full step, the way (in units) that every move ends upwards at least.
+
+    `home_from`: from where the homing procedure, which seeks its switch downwards, has a short way to it; None: from
+    anywhere. The rotary table's switch is 12.5 deg above its zero (HomeDelta -1250): from below it would go all the way
+    round, and its cables with it.
+    """
 
     unit: Literal["mm", "deg"]
     unit_per_step: float
     overshoot: float
+    home_from: float | None = None
 
 
 PROFILES: dict[str, Profile] = {
     "8MT160-300": Profile("mm", 0.0025, 0.5),
-    "8MR151": Profile("deg", 0.01, 1.0),
+    "8MR151": Profile("deg", 0.01, 1.0, home_from=16.0),
 }
 
 

@@ -36,6 +36,8 @@ async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HO
         text = f"{axis.name} had lost its scale and was homed; captures since its last home are suspect"
         hub.publish(Event(clock.now_ns(), "warning", "homed", text))
         return float("nan")
+    if profile.home_from is not None:
+        await axis.move_to(profile.home_from)
     residual = await axis.home()
     steps = residual / profile.unit_per_step
     text = f"{axis.name}: home was at {residual:.5f} {profile.unit} ({steps:.2f} steps)"

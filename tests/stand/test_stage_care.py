@@ -63,6 +63,19 @@ async def test_a_home_check_tells_lost_steps_in_units_and_steps(
     assert bench.mechanical == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("kind", ["rotary"])
+@pytest.mark.parametrize("place", [-40.0, -5.0, 0.0, 12.0, 40.0])
+async def test_a_home_check_never_turns_the_table_round(bench: Bench, place: float) -> None:
+    axis, told = await bench.ready(), Told()
+    await axis.move_to(place)
+    bench.trajectory, began_s = [], bench.now_s
+    await check_home(axis, told.hub, bench.clock)
+    assert told.events == [("info", "home_residual")]
+    assert min(bench.trajectory) >= min(place, 0.0) - 1.01
+    assert max(bench.trajectory) <= max(place, 16.0) + 0.01
+    assert bench.now_s - began_s < 60.0
+
+
 async def test_the_limit_of_a_home_check_is_the_callers(bench: Bench) -> None:
     axis, told = await bench.ready(), Told()
     await axis.move_to(30.0)
