@@ -69,7 +69,7 @@ def test_what_has_ended_and_why_nothing_is_begun_are_listed(tmp_path: Path):
         (["add", "demo", "--config", "nowhere"], 2, "nowhere: no such file"),
         (["move", "9", "1"], 1, "no run 9 in the queue; `stand queue list` shows those there are"),
         (["move", "1", "0"], 1, "position 0: the next run has position 1"),
-        (["move", "one", "1"], 2, "'one' is not a valid int"),
+        (["move", "one", "1"], 2, "Invalid value for 'ID'"),
         (["remove", "9"], 1, "no run 9 in the queue"),
     ],
 )
