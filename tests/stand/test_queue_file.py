@@ -1,5 +1,6 @@
 """The persistent queue against a plain list, several processes, and a disk that has damaged it."""
 
+import contextlib
 import subprocess
 import sys
 import tempfile
@@ -217,6 +218,8 @@ import sys
 from pathlib import Path
 from stand import queue
 order = queue.load_order("warm-up", "simulated")
+print("ready", flush=True)
+sys.stdin.readline()
 for _ in range(20):
     number = queue.add(Path(sys.argv[1]), order, "simulated", 1).id
     queue.move(Path(sys.argv[1]), number, 1)
@@ -224,8 +227,19 @@ for _ in range(20):
 
 
 def test_two_processes_at_once_lose_nothing(tmp_path: Path):
-    processes = [subprocess.Popen([sys.executable, "-c", ADDING, str(tmp_path)]) for _ in range(2)]
-    assert [process.wait(60) for process in processes] == [0, 0]
+    with contextlib.ExitStack() as stack:
+        command = [sys.executable, "-c", ADDING, str(tmp_path)]
+        processes = [
+            stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+            for _ in range(2)
+        ]
+        for process in processes:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+        for process in processes:
+            assert process.stdin is not None
+            process.stdin.close()
+    assert [process.returncode for process in processes] == [0, 0]
     assert sorted(number for number, _ in states(tmp_path)) == list(range(1, 41))
 
 
