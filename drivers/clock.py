@@ -17,6 +17,9 @@ from typing import Protocol
 
 NS_PER_S = 1_000_000_000
 
+# The event loop's timers come up to a ms late (epoll counts whole ms), and a host that slept wakes later still.
+_TIMER_LATE_NS = 2_000_000
+
 
 class Now(Protocol):
     """The part of a clock that a fake device needs."""
@@ -55,8 +58,10 @@ class WallClock:
         return self._epoch_ns + time.monotonic_ns()
 
     async def sleep_until(self, time_ns: int) -> None:
-        """Sleep to an absolute deadline."""
-        await asyncio.sleep(max(0, time_ns - self.now_ns()) / NS_PER_S)
+        """Sleep to an absolute deadline, the last two ms awake: frames are to be punctual."""
+        await asyncio.sleep(max(0, time_ns - _TIMER_LATE_NS - self.now_ns()) / NS_PER_S)
+        while self.now_ns() < time_ns:  # noqa: ASYNC110 - no event comes with the time
+            await asyncio.sleep(0)
 
     def hold(self) -> AbstractContextManager[None]:
         """Real time cannot be held."""

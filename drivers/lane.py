@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -10,6 +11,10 @@ from typing import TypeVar
 from drivers.clock import Clock, VirtualClock
 
 Result = TypeVar("Result")
+
+# How long a lane's thread that computes (encoding, checksums) may keep the event loop from its turn; Python's own 5 ms
+# would make frames late by as much.
+_SWITCH_S = 0.0005
 
 
 class Lane:
@@ -26,6 +31,7 @@ class Lane:
         self._clock = clock
         self._executor: ThreadPoolExecutor | None = None
         if not isinstance(clock, VirtualClock):
+            sys.setswitchinterval(_SWITCH_S)
             self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
 
     async def call(self, function: Callable[..., Result], *args: object) -> Result:
