@@ -10,22 +10,18 @@ from __future__ import annotations
 import asyncio
 import itertools
 import shutil
-import socket
 import time
 from pathlib import Path
-
-import yaml
 
 from drivers.aravis_library import library
 from drivers.clock import NS_PER_S, seconds_ns
 from drivers.interface import StandError
-from stand.config import load_config, packaged
 from stand.hub import Hub, Item, StepMark, StepState
-from stand.recipe import load_recipe
 from stand.run import run_virtual
 from stand.session_setup import Order
-from stand.simulator import ControlSocket, Simulator, laboratory_of
+from stand.simulator import ControlSocket, Simulator, laboratory_of, one_cpu
 from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
+from tests.bench.orders import simulated_order
 
 ROUNDS = 5
 SOAK_s = 1800.0
@@ -35,7 +31,6 @@ name: bench
 experiments:
   - thermal_cycle: {{equilibrium_s: {SOAK_s}, set_points_degC: [30], dwell_s: {SOAK_s}, reference_frames: 1}}
 """
-CAMERA_ADDRESS = "127.0.0.92"
 
 
 def figures(directory: Path) -> list[Figure]:
@@ -45,7 +40,7 @@ def figures(directory: Path) -> list[Figure]:
         library()
     except StandError as error:
         return [skipped(what, error)]
-    order = _order(directory)
+    order = simulated_order(directory, RECIPE)
     sessions = (directory / f"run-{number}" for number in itertools.count())
     trips_per_s: list[float] = []
 
@@ -54,7 +49,8 @@ def figures(directory: Path) -> list[Figure]:
         return _soaked_per_second(order, next(sessions))
 
     def limit() -> float:
-        trips_per_s.append(asyncio.run(_round_trips_per_second(order)))
+        with one_cpu():  # as the run does
+            trips_per_s.append(asyncio.run(_round_trips_per_second(order)))
         return trips_per_s[-1] * STEP_s
 
     ours, bare = in_turns(run, limit, ROUNDS)
@@ -103,24 +99,3 @@ async def _round_trips_per_second(order: Order) -> float:
     finally:
         await control.close()
         simulator.stop()
-
-
-def _order(directory: Path) -> Order:
-    """The recipe on the installed simulated stand, at addresses of its own."""
-    data = yaml.safe_load(packaged("", "simulated").read_text())
-    data["bus"]["address"] = f"tcp:127.0.0.1:{_free_port()}"
-    for name, axis in data["axes"].items():
-        axis["address"] = f"serial:{directory / name}"
-    data["flap"]["backend_address"] = f"tcp:127.0.0.1:{_free_port()}"
-    data["camera"]["address"] = CAMERA_ADDRESS
-    data["simulation"]["control"] = f"tcp:127.0.0.1:{_free_port()}"
-    config_file, recipe_file = directory / "config.yaml", directory / "recipe.yaml"
-    config_file.write_text(yaml.safe_dump(data))
-    recipe_file.write_text(RECIPE)
-    target = packaged("targets", "paper-9x6").read_text()
-    return Order(load_config(config_file), load_recipe(recipe_file), config_file.read_text(), RECIPE, target)
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]

@@ -1,0 +1,185 @@
+"""From the operator's Ctrl-C, and from the guard's look at a value above its limit, to the heater confirmed off.
+
+A whole stand in real time against the simulator in a process of its own, heating, polled ten times as often as in a
+night, so that a trip finds the bus busy. Confirmed means: the relay driver has read the coil back. After
+every trip the simulator is asked, too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import random
+import signal
+import statistics
+import time
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from drivers.clock import WallClock, seconds_ns
+from drivers.interface import StandTripped
+from drivers.registers import load_register_map
+from drivers.relays import Relays
+from stand.assembly import Assembly, assemble
+from stand.compressor import CompressorLimits
+from stand.config import StandConfig, packaged
+from stand.guard import Guard
+from stand.hub import Hub
+from stand.interlocks import Watch, over_temperature
+from stand.simulator import ControlSocket, Simulator, laboratory_of
+from stand.stand import Devices, Limits, Stand
+from stand.stop import Interrupted, Stop
+from stand.tasks import cancelled
+from tests.bench.figures import Figure, at_most, progress
+from tests.bench.orders import simulated_order
+
+TRIPS = 60  # of each kind
+LIMIT_ms = 20.0
+POLL_s = 0.1
+RECIPE = """
+name: bench
+experiments:
+  - thermal_cycle: {set_points_degC: [30]}
+"""
+HEATER = "heater_enable"
+
+Trip = Callable[[Stand, Assembly], Awaitable[float]]
+
+
+def figures(directory: Path) -> list[Figure]:
+    """99th percentiles of both, ms."""
+    config = simulated_order(directory, RECIPE, POLL_s).config
+    progress(f"abort, {TRIPS} times by the operator and {TRIPS} times by the guard")
+    with asyncio.Runner() as runner:
+        by_operator, by_guard = runner.run(_measured(config))
+    return [_figure("Ctrl-C", by_operator), _figure("guard's trip", by_guard)]
+
+
+def _figure(what: str, times_ms: list[float]) -> Figure:
+    p99_ms = statistics.quantiles(times_ms, n=100, method="inclusive")[98]
+    seen = f"p99 of {len(times_ms)}; median {statistics.median(times_ms):.1f}, longest {max(times_ms):.1f} ms"
+    return at_most(LIMIT_ms, Figure(f"{what} to heater confirmed off", "ms", p99_ms, seen))
+
+
+class WatchedRelays(Relays):
+    """Relays that note when the heater's was confirmed off, the first time after `heater_off_s` was set to NaN."""
+
+    heater_off_s = math.nan
+
+    async def switch(self, channel: str, on: bool) -> None:
+        """As ever."""
+        await super().switch(channel, on)
+        if channel == HEATER and not on and math.isnan(self.heater_off_s):
+            self.heater_off_s = time.perf_counter()
+
+
+async def _measured(config: StandConfig) -> tuple[list[float], list[float]]:
+    """ms of each trip by the operator, and by the guard."""
+    draw = random.Random(1)
+    async with _polled(config) as (assembly, control):
+        times_ms = [
+            [await _trip_ms(assembly, control, trip, draw.uniform(0.0, POLL_s)) for trip in (_by_operator, _by_guard)]
+            for _ in range(TRIPS)
+        ]
+    by_operator, by_guard = zip(*times_ms, strict=True)
+    return list(by_operator), list(by_guard)
+
+
+async def _trip_ms(assembly: Assembly, control: ControlSocket, trip: Trip, delay_s: float) -> float:
+    """One trip, `delay_s` after a stand never tripped before has begun to heat."""
+    relays = assembly.devices.relays
+    config = assembly.config
+    compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
+    limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor)
+    stand = Stand(assembly.devices, limits, assembly.hub, assembly.clock)
+    await stand.start_chamber(40.0)
+    await _expect_heater(control, 1)
+    await assembly.clock.sleep_until(assembly.clock.now_ns() + seconds_ns(delay_s))
+    relays.heater_off_s = math.nan
+    begun_s = await trip(stand, assembly)
+    await _expect_heater(control, 0)
+    return 1e3 * (relays.heater_off_s - begun_s)
+
+
+async def _by_operator(stand: Stand, assembly: Assembly) -> float:
+    """When the signal was sent."""
+    begun_s = math.nan
+    with suppress(Interrupted):
+        async with Stop() as stop:
+            stop.watch(stand)
+            begun_s = time.perf_counter()
+            os.kill(os.getpid(), signal.SIGINT)
+            await asyncio.Event().wait()
+    return begun_s
+
+
+async def _by_guard(stand: Stand, assembly: Assembly) -> float:
+    """When the guard began to look."""
+    begun_s, watching = math.nan, []
+    with suppress(StandTripped):
+        async with Stop() as stop:
+            stop.watch(stand)
+            watches = (Watch(over_temperature("regulator.pv", -273.15)),)
+            guard = Guard(stand, watches, assembly.hub, assembly.clock, 1.0, 5.0, stop)
+            begun_s = time.perf_counter()
+            watching.append(asyncio.create_task(guard.run()))
+            await asyncio.Event().wait()
+    await asyncio.gather(*watching)
+    return begun_s
+
+
+async def _expect_heater(control: ControlSocket, enabled: int) -> None:
+    state = await control.request({"do": "state"})
+    if state["heater_enabled"] != enabled:
+        raise ValueError(f"the simulated heater's relay is {state['heater_enabled']}, not {enabled}")
+
+
+@asynccontextmanager
+async def _polled(config: StandConfig) -> AsyncGenerator[tuple[Assembly, ControlSocket]]:
+    """A stand with its laboratory in real time, opened (but for the camera) and polled."""
+    simulation = config.simulation
+    if simulation is None:
+        raise ValueError("the bench's configuration has lost its simulation section")
+    simulator = await asyncio.to_thread(Simulator, laboratory_of(config, virtual=False, seed=None))
+    control = ControlSocket(simulation.control)
+    assembly = _watched(assemble(config, Hub(), WallClock()))
+    polling: list[asyncio.Task[None]] = []
+    try:
+        await control.open()
+        await _open(assembly)
+        for poller in assembly.pollers():
+            await poller.first()
+            polling.append(asyncio.create_task(poller.run()))
+        yield assembly, control
+    finally:
+        await cancelled(polling)
+        await _close(assembly)
+        await control.close()
+        await asyncio.to_thread(simulator.stop)
+
+
+def _watched(assembly: Assembly) -> Assembly:
+    section = assembly.config.relays
+    register_map = load_register_map(packaged("registers", section.registers)).at_unit(section.unit)
+    channels = {str(name): number for name, number in section.channels.items()}
+    relays = WatchedRelays("relays", assembly.bus, register_map, channels)
+    return replace(assembly, devices=replace(assembly.devices, relays=relays))
+
+
+def _sensors(devices: Devices):
+    return (devices.relays, devices.regulator, devices.thermometers, devices.flap, *devices.axes.values())
+
+
+async def _open(assembly: Assembly) -> None:
+    await assembly.bus.open()
+    for device in _sensors(assembly.devices):
+        await device.open()
+
+
+async def _close(assembly: Assembly) -> None:
+    for device in _sensors(assembly.devices):
+        await device.close()
+    await assembly.bus.close()

@@ -1,0 +1,73 @@
+"""How punctual frames are in real time: 2 frames/s for 20 s by the whole daemon, polled at 1 Hz, guarded and recording.
+
+A frame's instant is the trigger's on the stand's clock. The grid begins with the most punctual frame, none can be
+early. The simulator renders and sends 5 MP frames on the same machine meanwhile.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import statistics
+from pathlib import Path
+
+from drivers.aravis_library import library
+from drivers.clock import seconds_ns
+from drivers.interface import Frame, StandError
+from stand.hub import Hub, Item
+from stand.run import run_real
+from stand.session_setup import Order
+from stand.simulator import Simulator, laboratory_of
+from tests.bench.figures import Figure, at_most, progress, skipped
+from tests.bench.orders import simulated_order
+
+FRAMES = 40
+INTERVAL_s = 0.5
+LIMIT_ms = 2.0
+RECIPE = f"""
+name: bench
+experiments:
+  - thermal_cycle:
+      equilibrium_s: 1
+      set_points_degC: [24]
+      dwell_s: 1
+      reference_frames: {FRAMES}
+      interval_s: {INTERVAL_s}
+"""
+
+
+def figures(directory: Path) -> list[Figure]:
+    """99th percentile of the deviation from the grid, ms."""
+    what = f"frame schedule at {1 / INTERVAL_s:g} fps, deviation"
+    try:
+        library()
+    except StandError as error:
+        return [skipped(what, error)]
+    progress(f"{FRAMES} frames in real time")
+    order = simulated_order(directory, RECIPE, poll_s=1.0)
+    simulator = Simulator(laboratory_of(order.config, virtual=False, seed=None))
+    try:
+        late_ms = _deviations_ms(order, directory / "jitter")
+    finally:
+        simulator.stop()
+    p99_ms = statistics.quantiles(late_ms, n=100, method="inclusive")[98]
+    seen = f"p99 of {len(late_ms)} frames; median {statistics.median(late_ms):.2f}, last {max(late_ms):.2f} ms late"
+    return [at_most(LIMIT_ms, Figure(what, "ms", p99_ms, seen))]
+
+
+def _deviations_ms(order: Order, out: Path) -> list[float]:
+    """How late each frame of the first capture was triggered."""
+    triggered_ns: list[int] = []
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Frame) and len(triggered_ns) < FRAMES:
+            triggered_ns.append(item.time_ns - seconds_ns(item.exposure_s / 2))
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(follow)
+
+    asyncio.run(run_real(order, out, watch))
+    shutil.rmtree(out)
+    since_first_ns = [time_ns - triggered_ns[0] for time_ns in triggered_ns]
+    off_ms = [(time_ns - seconds_ns(number * INTERVAL_s)) / 1e6 for number, time_ns in enumerate(since_first_ns)]
+    return [each_ms - min(off_ms) for each_ms in off_ms]

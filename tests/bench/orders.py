@@ -1,0 +1,39 @@
+"""Orders for a simulated stand at addresses of its own, which the benchmarks run."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import yaml
+
+from stand.config import load_config, packaged
+from stand.recipe import load_recipe
+from stand.session_setup import Order
+
+CAMERA_ADDRESS = "127.0.0.92"
+
+
+def simulated_order(directory: Path, recipe: str, poll_s: float | None = None) -> Order:
+    """The recipe on the installed simulated stand; every device is polled each `poll_s`, None for as configured."""
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["bus"]["address"] = f"tcp:127.0.0.1:{_free_port()}"
+    for name, axis in data["axes"].items():
+        axis["address"] = f"serial:{directory / name}"
+    data["flap"]["backend_address"] = f"tcp:127.0.0.1:{_free_port()}"
+    data["camera"]["address"] = CAMERA_ADDRESS
+    data["simulation"]["control"] = f"tcp:127.0.0.1:{_free_port()}"
+    if poll_s is not None:
+        sections = [data[name] for name in ("regulator", "thermometers", "relays", "flap", "camera")]
+        for section in [*sections, *data["axes"].values()]:
+            section["poll_s"] = poll_s
+    config_file, recipe_file = directory / "config.yaml", directory / "recipe.yaml"
+    config_file.write_text(yaml.safe_dump(data))
+    recipe_file.write_text(recipe)
+    target = packaged("targets", "paper-9x6").read_text()
+    return Order(load_config(config_file), load_recipe(recipe_file), config_file.read_text(), recipe, target)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
