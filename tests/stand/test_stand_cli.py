@@ -31,17 +31,17 @@ def test_plan_lists_steps_and_totals():
 def test_the_json_plan_adds_up():
     result = runner.invoke(app, ["plan", "warm-up", "--json"])
     plan = json.loads(result.stdout)
-    assert plan["frames"] == 3600
+    assert plan["frames"] == 2 * 3600  # upright and rolled
     assert plan["duration_s"] == pytest.approx(sum(step["duration_s"] for step in plan["steps"]))
-    assert plan["duration_s"] == pytest.approx(7200 + 3599 * 0.5, rel=0.02)
-    assert plan["bytes"] == pytest.approx(3600 * 2448 * 2048 * 0.47, rel=0.05)
+    assert plan["duration_s"] == pytest.approx(2 * (4427 + 3599 * 0.5), rel=0.02)
+    assert plan["bytes"] == pytest.approx(2 * 3600 * 2448 * 2048 * 0.47, rel=0.05)
     assert [step["index"] for step in plan["steps"]] == list(range(len(plan["steps"])))
 
 
 def test_a_plan_counts_the_cameras_own_boot_time():
     plan = json.loads(runner.invoke(app, ["plan", "warm-up", "--json"]).stdout)
     boot = [step["duration_s"] for step in plan["steps"] if step["parameters"] == {"on": True}]
-    assert boot == [4.0]  # camera.boot_s of the simulated stand
+    assert boot == [4.0, 4.0]  # camera.boot_s of the simulated stand
 
 
 def recipe_file(tmp_path: Path, **parameters: object) -> str:
