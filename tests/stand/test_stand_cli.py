@@ -75,7 +75,10 @@ def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["plan", "no-such-recipe"], "no-such-recipe: no such file, and not one of those installed: demo,"),
+        (
+            ["plan", "no-such-recipe"],
+            "no-such-recipe: no such file, and not one of those installed: calibration, demo,",
+        ),
         (["plan", "demo", "--config", "nowhere.yaml"], "nowhere.yaml: no such file"),
         (["run", "demo", "--seed", "3"], "--seed belongs to --virtual-time"),
         (["run", "demo", "--virtual-time", "--seed", "-1"], "--seed is 0 or more, not -1"),
