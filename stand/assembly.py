@@ -11,7 +11,7 @@ import usb.backend
 
 from drivers.bus import Bus, LineSettings
 from drivers.camera import Camera, CameraSettings, TemperatureFeature
-from drivers.clock import Clock
+from drivers.clock import Clock, VirtualClock
 from drivers.flap import Flap, FlapSettings
 from drivers.interface import ConfigError, Sensor
 from drivers.registers import RegisterMap, load_register_map
@@ -91,7 +91,12 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         camera=Camera("camera", camera_settings(config.camera), clock),
     )
     compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
-    limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor)
+    state_file = config.compressor.state_file
+    if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces
+        state_file = config.recording.directory / "compressor.json"
+    limits = Limits(
+        config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor, state_file
+    )
     return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock))
 
 

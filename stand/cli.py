@@ -8,28 +8,33 @@ import json
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated
 
 import typer
 
 from compensation.target import load_target
 from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import ConfigError
+from drivers.interface import ConfigError, SessionError
 from experiments.steps import kind_of, parameters_of
-from stand import session_cli
+from stand import control_cli, queue_cli, session_cli
 from stand.config import StandConfig, load_config, packaged
 from stand.demo import run_demo
 from stand.estimate import PricedStep, price
 from stand.exit_codes import INTERRUPTED, one_line_errors
-from stand.hub import Event, Hub, Item, StepMark, StepState
+from stand.follow import Follow, parameters_text
+from stand.hub import Hub
+from stand.learned import learn, load_learned
 from stand.progress import progress
 from stand.recipe import Recipe, load_recipe
-from stand.run import Interrupted, run_real, run_virtual
+from stand.resume import interruption
+from stand.run import Interrupted, resume, run_real, run_virtual
 from stand.session_setup import Order
+from stand.session_text import salvage_line
 from stand.simulator import Simulator, laboratory_of
 from stand.usage import OneLineUsage, one_line
 
@@ -42,6 +47,8 @@ app = typer.Typer(
 )
 
 app.add_typer(session_cli.app, name="session")
+app.add_typer(control_cli.app)
+app.add_typer(queue_cli.app, name="queue")
 
 _ENDING = {signal.SIGINT, signal.SIGTERM}
 
@@ -99,7 +106,9 @@ def plan(
     Example: stand plan thermal-cycle --json
     """
     with one_line_errors():
-        steps = price(_recipe(recipe)[0].plan(), _config(config)[0])
+        stand_config, _ = _config(config)
+        learned = load_learned(stand_config.recording.directory)
+        steps = price(_recipe(recipe)[0].plan(), stand_config, learned)
         total_s = sum(step.duration_s for step in steps)
         now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
         end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
@@ -118,6 +127,7 @@ def plan(
             f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
             f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
         )
+        typer.echo(str(learned))
 
 
 @app.command()
@@ -143,9 +153,36 @@ def run(
         order = _order(config_file, recipe_file)
         directory = out or config_file[0].recording.directory
         _check_writable(directory)
-        with _run_progress(price(recipe_file[0].plan(), config_file[0])) as watch:
+        steps = price(recipe_file[0].plan(), config_file[0], load_learned(directory))
+        with _run_progress(steps) as watch:
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
             session = asyncio.run(work)
+        _learn(directory, config_file[0])
+        typer.echo(session)
+
+
+@app.command("resume")
+def resume_run(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="The session of a run that did not end.")],
+    clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
+) -> None:
+    """Go on with a run that was killed or interrupted, in its session: what is done is not done again.
+
+    Example: stand resume sessions/20260101T180000Z-thermal-cycle
+    """
+    with _run_errors():
+        before = interruption(directory, clear=clear)
+        try:
+            for segment in before.salvaged:
+                typer.echo(salvage_line(segment), err=True)
+            order, folder = before.order, before.directory.parent
+            steps = price(order.recipe.plan(), order.config, load_learned(folder))
+        except BaseException:
+            before.release()
+            raise
+        with _run_progress(steps, before.progress.done, before.progress.earned_s) as watch:
+            session = asyncio.run(resume(before, watch))
+        _learn(folder, order.config)
         typer.echo(session)
 
 
@@ -184,22 +221,21 @@ def _order(config: tuple[StandConfig, str], recipe: tuple[Recipe, str]) -> Order
 
 
 @contextmanager
-def _run_progress(steps: tuple[PricedStep, ...]) -> Generator[Callable[[Hub], None]]:
-    """Progress in expected seconds of the plan, moved on by the steps' marks; warnings and errors as they come."""
+def _run_progress(
+    steps: tuple[PricedStep, ...], done: Collection[str] = (), earned_s: Mapping[str, float] = MappingProxyType({})
+) -> Generator[Callable[[Hub], None]]:
+    """Progress in expected seconds of the plan, the time left as the run goes; warnings and errors as they come."""
     with progress("run", sum(step.duration_s for step in steps)) as report:
-        done_s = 0.0
-
-        def follow(item: Item) -> None:
-            nonlocal done_s
-            if isinstance(item, StepMark) and item.state is StepState.DONE:
-                done_s += steps[item.index].duration_s
-            if isinstance(item, StepMark):
-                report(done_s, f"{item.index + 1}/{len(steps)} {item.kind} {_parameters(item.parameters)}")
-            if isinstance(item, Event) and item.level != "info":
-                at = datetime.fromtimestamp(item.time_ns / NS_PER_S, UTC)
-                typer.echo(f"{item.level}: {at:%H:%M:%S} UTC {item.text}", err=True)
-
+        follow = Follow(steps, report, lambda line: typer.echo(line, err=True), done, earned_s)
         yield lambda hub: hub.subscribe(follow)
+
+
+def _learn(directory: Path, config: StandConfig) -> None:
+    """The next plan's durations; what cannot be kept is no reason for a run to fail."""
+    try:
+        learn(directory, config)
+    except (SessionError, OSError) as error:
+        typer.echo(f"warning: {one_line(error)}", err=True)
 
 
 @contextmanager
@@ -217,13 +253,11 @@ def _line(step: PricedStep) -> str:
     planned = step.planned
     return (
         f"{planned.index:4d}  {planned.step_id}  {kind_of(planned.step):<15s}"
-        f"{_parameters(parameters_of(planned.step)):<72s}{_hours(step.duration_s):>12s}"
+        f"{parameters_text(parameters_of(planned.step)):<72s}{_hours(step.duration_s):>12s}"
         + (f"{step.frames:6d} frames {step.size_bytes / 1e6:8.1f} MB" if step.frames else "")
+        + (f"   in band after {_hours(step.in_band_after_s)}" if step.in_band_after_s else "")
+        + (f"   {step.warning}" if step.warning else "")
     )
-
-
-def _parameters(parameters: dict[str, object]) -> str:
-    return " ".join(f"{name}={value}" for name, value in parameters.items())
 
 
 def _hours(duration_s: float) -> str:

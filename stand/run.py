@@ -25,7 +25,9 @@ from stand.tasks import cancelled, watched
 
 __all__ = ["Interrupted", "resume", "run_real", "run_virtual"]
 
-_ORPHAN_S = 300.0  # of stand time that a simulator may be ahead of what its killed daemon had recorded
+# Stand time that a simulator may be behind (a frame's time is the middle of its exposure) and ahead of what its killed
+# daemon has recorded.
+_ORPHAN_BEHIND_S, _ORPHAN_AHEAD_S = 10.0, 300.0
 _ORPHAN_TRIES, _ORPHAN_PAUSE_S = 40, 0.25  # real time that it takes to let go of its addresses
 
 
@@ -101,7 +103,7 @@ async def _run_virtual(job: _Job, start_ns: int) -> Path:
     laboratory = {**laboratory_of(job.order.config, virtual=True, seed=job.seed), "start_ns": start_ns}
     async with Stop() as stop, AsyncExitStack() as stack:
         address = str(laboratory["control"])
-        tries = 1 if job.before is None else await _orphan_ended(address, job.before.last_ns)
+        tries = 1 if job.before is None else await _orphan_ended(address, job.before.last_ns, start_ns)
         simulator = await _started(laboratory, tries)
         stack.push_async_callback(asyncio.to_thread, simulator.stop)
         control = ControlSocket(address)
@@ -111,14 +113,16 @@ async def _run_virtual(job: _Job, start_ns: int) -> Path:
         return await _run(job, clock, clock.run, stop)
 
 
-async def _orphan_ended(address: str, last_ns: int) -> int:
+async def _orphan_ended(address: str, last_ns: int, start_ns: int) -> int:
     """End the simulator that a killed daemon has left, which would go on for a minute and knows nothing of the time
-    since; one at another instant than this run's is somebody else's. Returns how often to try to start a new one."""
+    since; one at another instant than this run's last or next is somebody else's. Returns how often to try to start a
+    new one."""
     control = ControlSocket(address)
     try:
         await control.open()
         now_ns = (await control.request({"do": "state"}))["now_ns"]
-        if isinstance(now_ns, int) and 0 <= now_ns - last_ns <= seconds_ns(_ORPHAN_S):
+        first_ns, end_ns = last_ns - seconds_ns(_ORPHAN_BEHIND_S), start_ns + seconds_ns(_ORPHAN_AHEAD_S)
+        if isinstance(now_ns, int) and first_ns <= now_ns <= end_ns:
             await control.request({"do": "quit"})
             return _ORPHAN_TRIES
     except Unreachable:
@@ -163,8 +167,7 @@ async def _run(job: _Job, clock: Clock, time: Callable[[], Coroutine[None, None,
         stack.push_async_callback(stop.settled)
         stop.watch(assembly.stand)
         await _opened(assembly, background, stop, camera_on=job.before is None or job.before.set_up.camera_on)
-        recorder = recorder_of(job.order, directory, job.info(directory, assembly), assembly)
-        recorder.start()
+        recorder = await _recording(job, directory, assembly, stop)
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording)
         await perform(Performance(job.order, job.seed, job.before, assembly, recorder, stop, (*background, recording)))
@@ -181,6 +184,18 @@ async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop
         stop.taking_down()
         await assembly.stand.make_safe()
         raise
+
+
+async def _recording(job: _Job, directory: Path, assembly: Assembly, stop: Stop) -> Recorder:
+    """The recorder, started; a disk that refuses it leaves the stand safe, as everything after this does."""
+    try:
+        recorder = recorder_of(job.order, directory, job.info(directory, assembly), assembly)
+        recorder.start()
+    except BaseException:
+        stop.taking_down()
+        await assembly.stand.make_safe()
+        raise
+    return recorder
 
 
 async def _open(assembly: Assembly, *, camera_on: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from drivers.camera import Camera
 from drivers.clock import Clock, seconds_ns
@@ -15,7 +16,7 @@ from drivers.relays import Relays
 from drivers.stage import Axis
 from drivers.thermometers import Thermometers
 from stand.camera_cooling import Cooling, cool_down, last_word
-from stand.compressor import CompressorLimits, CompressorState, decide
+from stand.compressor import CompressorLimits, CompressorState, decide, keep, restored
 from stand.gate import CAMERA_LOST, INTERLOCK, Gate
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
@@ -52,6 +53,7 @@ class Limits:
     hold_s: float
     camera_boot_s: float
     compressor: CompressorLimits
+    compressor_file: Path | None = None  # what the compressor did last, for the next daemon
 
 
 class Stand:
@@ -66,8 +68,7 @@ class Stand:
         self._hub = hub
         self._clock = clock
         self._permitted = False
-        # After a start nobody knows when the compressor last ran: assume it was switched off just now.
-        self._compressor = CompressorState(running=False, since_ns=clock.now_ns())
+        self._compressor = restored(limits.compressor_file, clock.now_ns())
         self._compressor_until_ns = 0  # when its timed-on relay drops unless renewed
         self._making_safe = asyncio.Lock()
         self._commanded: dict[str, float] = {}  # axis -> mm or deg, where the plan put it last
@@ -100,7 +101,7 @@ class Stand:
         await self.devices.regulator.stop()
         await self.devices.relays.switch("heater_enable", on=False)
         await self.devices.relays.switch("compressor", on=False)
-        self._compressor_is_off()
+        await self._compressor_is_off()
 
     async def renew_permits(self) -> None:
         """Re-arm the timed-on relays of the heater and the compressor; only the guard calls this, while all is well.
@@ -116,7 +117,7 @@ class Stand:
         now_ns = self._clock.now_ns()
         if self._compressor.running and now_ns >= self._compressor_until_ns:
             # It could not be renewed in time and has dropped by itself: its rest began there.
-            self._compressor = CompressorState(False, self._compressor_until_ns, self._compressor.starts_ns)
+            await self._keep(CompressorState(False, self._compressor_until_ns, self._compressor.starts_ns))
         wanted = decide(
             self._compressor,
             self._limits.compressor,
@@ -132,7 +133,7 @@ class Stand:
         if wanted.running != self._compressor.running:
             text = "compressor started" if wanted.running else "compressor stopped"
             self._hub.publish(Event(self._clock.now_ns(), "info", "compressor", text))
-        self._compressor = wanted
+        await self._keep(wanted)
 
     async def open_flap(self) -> None:
         """Open the flap and confirm it."""
@@ -226,7 +227,7 @@ class Stand:
             actuators = (devices.regulator, devices.relays, devices.flap, *devices.axes.values())
             failures = await asyncio.gather(*(self._safely(actuator) for actuator in actuators))
             self.unconfirmed = tuple(failure for failure in failures if failure)
-            self._compressor_is_off()
+            await self._compressor_is_off()
 
     async def _safely(self, actuator: Actuator) -> str:
         """Why the actuator's safe state is not confirmed, "" when it is; a lost answer is worth a second try."""
@@ -255,9 +256,21 @@ class Stand:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(retry_s))
             retry_s = min(2 * retry_s, longest_retry_s)
 
-    def _compressor_is_off(self) -> None:
+    async def _compressor_is_off(self) -> None:
         if self._compressor.running:
-            self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
+            await self._keep(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
+
+    async def _keep(self, compressor: CompressorState) -> None:
+        """From now on the compressor is in this state; that it was switched is kept for the next daemon."""
+        was, self._compressor = self._compressor, compressor
+        if compressor.running == was.running or self._limits.compressor_file is None:
+            return
+        try:
+            with self._clock.hold():
+                await asyncio.to_thread(keep, self._limits.compressor_file, compressor)
+        except OSError as error:
+            text = f"the next start will not know when the compressor last ran: {error}"
+            self._hub.publish(Event(self._clock.now_ns(), "warning", "compressor_not_kept", text))
 
     def _axis(self, axis: str) -> Axis:
         self._check()

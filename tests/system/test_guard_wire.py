@@ -7,7 +7,7 @@ chamber can be started again.
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +15,7 @@ import pytest
 from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
 from drivers.interface import Quality
 from stand.assembly import Assembly, assemble
-from stand.config import StandConfig, packaged
+from stand.config import CompressorConfig, StandConfig, packaged
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
 from stand.recording.session import Session
@@ -85,13 +85,23 @@ async def _cancel(tasks: list[asyncio.Task[None]]) -> None:
 
 @asynccontextmanager
 async def bench_of(order: Order, start: Start) -> AsyncIterator[Bench]:
+    """A bench against a simulator of its own."""
     simulation = order.config.simulation
     assert simulation is not None
     await asyncio.to_thread(start, order.config, True)
+    async with bench_from(order, seconds_ns(simulation.start.timestamp())) as bench:
+        yield bench
+
+
+@asynccontextmanager
+async def bench_from(order: Order, start_ns: int) -> AsyncIterator[Bench]:
+    """A bench, which begins at that instant, against the simulator that runs."""
+    simulation = order.config.simulation
+    assert simulation is not None
     driver, faults = ControlSocket(simulation.control), ControlSocket(simulation.control)
     await driver.open()
     await faults.open()
-    clock, hub = VirtualClock(seconds_ns(simulation.start.timestamp()), driver.advance), Hub()
+    clock, hub = VirtualClock(start_ns, driver.advance), Hub()
     assembly = assemble(order.config, hub, clock)
     events: list[Event] = []
     bench = Bench(assembly, clock, faults, events)  # which the hub must not know: pyusb closes what nobody refers to
@@ -229,6 +239,37 @@ async def test_heat_that_does_not_come_or_comes_unasked_and_sensors_that_lie_are
         reading = bench.assembly.hub.latest("thermometers.air")
         assert reading is not None
         assert reading.quality is Quality.BAD
+
+
+async def test_a_daemon_that_starts_again_spares_the_compressor_as_one_that_goes_on(
+    tmp_path: Path, order: Callable[..., Order], simulator: Start
+):
+    """Off for 100 s before the restart leaves 200 of the 300 s; the starts of the last hour count, too."""
+    ordered = order()
+    compressor = CompressorConfig(state_file=tmp_path / "state" / "compressor.json", max_starts_per_h=2)
+    ordered = replace(ordered, config=ordered.config.model_copy(update={"compressor": compressor}))
+    async with bench_of(ordered, simulator) as bench:
+        await bench.start(10, 290)
+        assert await bench.plant("compressor_on") == 0
+        await bench.wait(20)
+        assert await bench.plant("compressor_on") == 1
+        await bench.end()
+        await bench.assembly.stand.make_safe()
+        await bench.wait(100)
+        restart_ns = bench.clock.now_ns()
+    async with bench_from(ordered, restart_ns) as bench:
+        await bench.start(10, 190)
+        assert await bench.plant("compressor_on") == 0
+        await bench.wait(20)
+        assert await bench.plant("compressor_on") == 1
+        await bench.end()
+        await bench.assembly.stand.make_safe()
+        await bench.wait(900)
+        restart_ns = bench.clock.now_ns()
+    async with bench_from(ordered, restart_ns) as bench:
+        await bench.start(10, 1000)
+        assert await bench.plant("compressor_on") == 0  # a third start within the hour
+        await bench.end()
 
 
 @pytest.fixture
