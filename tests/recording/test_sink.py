@@ -146,6 +146,7 @@ def test_a_torn_block_that_cannot_be_cut_off_yet_is_cut_off_later(tmp_path, limi
         limited(1500)
         with pytest.raises(OSError, match="too large"):
             sink.append([b"b" * 1000])
+        limited()  # before pytest writes its own output, which may be a longer file
         assert (folder / "file").stat().st_size == 1500
         with pytest.raises(PermissionError):
             sink.settle()
