@@ -86,18 +86,20 @@ class Camera:
         """Stop acquisition."""
         await self._call(self._usable().stop)
 
-    async def grab(self, exposure_s: float | None = None) -> Frame:
+    async def grab(self, exposure_s: float | None = None, due_ns: int = 0) -> Frame:
         """One complete frame that was exposed after the call; starts acquisition when it is not running.
 
-        `exposure_s` holds for this frame, the configured one otherwise. Incomplete frames are never used, the next
-        one is tried. Unreachable: control lost, or 3 failures in a row; Refused: exposure not taken.
+        `exposure_s` holds for this frame, the configured one otherwise. A software trigger is sent at `due_ns` when
+        that is still ahead, which in virtual time it must not be: who comes some ms early finds everything prepared.
+        Incomplete frames are never used, the next one is tried. Unreachable: control lost, or 3 failures in a row;
+        Refused: exposure not taken.
         """
         connection = self._usable()
         wanted_s = self._settings.exposure_s if exposure_s is None else exposure_s
         if not connection.running:
             await self._call(connection.start)
         if self._settings.trigger == "software":
-            shot = await self._grab_triggered(connection, wanted_s)
+            shot = await self._grab_triggered(connection, wanted_s, due_ns)
         else:
             shot = await self._grab_free_running(connection, wanted_s)
         return Frame(
@@ -125,9 +127,9 @@ class Camera:
             return (bad_reading(channel, "degC", time_ns, reason),)
         return (Reading(channel, value_degC, "degC", time_ns),)
 
-    async def _grab_triggered(self, connection: Connection, exposure_s: float) -> Shot:
+    async def _grab_triggered(self, connection: Connection, exposure_s: float, due_ns: int) -> Shot:
         for _ in range(ATTEMPTS):
-            shot = await self._call(connection.trigger, exposure_s)
+            shot = await self._call(connection.trigger, exposure_s, due_ns)
             self._usable()
             if shot is not None:
                 return shot

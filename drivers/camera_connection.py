@@ -35,7 +35,7 @@ from drivers.camera_settings import (
     read_temperature,
     set_exposure,
 )
-from drivers.clock import NS_PER_S, Clock, seconds_ns
+from drivers.clock import NS_PER_S, Clock, block_until, seconds_ns
 from drivers.interface import Refused
 
 # Aravis' stream: ask again for a missing packet after 1 ms, then every 40 ms, for as much of a frame as was lost.
@@ -196,9 +196,10 @@ class Connection:
             self._latch()
         self._give_one_away = self._free_run and self._offset_ns is None  # its exposure may have begun before the call
 
-    def trigger(self, exposure_s: float) -> Shot | None:
-        """One software trigger and its frame, or None when it did not come complete."""
+    def trigger(self, exposure_s: float, due_ns: int = 0) -> Shot | None:
+        """One software trigger, not before `due_ns`, and its frame, or None when it did not come complete."""
         self.prepare(exposure_s)
+        block_until(self._clock, due_ns)
         trigger_ns = self._clock.now_ns()
         self._device.software_trigger()
         self._counts["triggers"] += 1

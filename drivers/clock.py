@@ -17,8 +17,7 @@ from typing import Protocol
 
 NS_PER_S = 1_000_000_000
 
-# The event loop's timers come up to a ms late (epoll counts whole ms), and a host that slept wakes later still.
-_TIMER_LATE_NS = 2_000_000
+_AWAKE_NS = 2_000_000  # timers, and threads that sleep, may be this late
 
 
 class Now(Protocol):
@@ -59,7 +58,7 @@ class WallClock:
 
     async def sleep_until(self, time_ns: int) -> None:
         """Sleep to an absolute deadline, the last two ms awake: frames are to be punctual."""
-        await asyncio.sleep(max(0, time_ns - _TIMER_LATE_NS - self.now_ns()) / NS_PER_S)
+        await asyncio.sleep(max(0, time_ns - _AWAKE_NS - self.now_ns()) / NS_PER_S)
         while self.now_ns() < time_ns:  # noqa: ASYNC110 - no event comes with the time
             await asyncio.sleep(0)
 
@@ -149,6 +148,15 @@ class VirtualClock:
                 await asyncio.sleep(0)
             else:
                 return
+
+
+def block_until(clock: Now, time_ns: int) -> None:
+    """Keep the calling thread until `time_ns`, which is some ms ahead, to a tenth of a ms; for lanes. ValueError in
+    virtual time, which would never get there."""
+    if isinstance(clock, VirtualClock) and clock.now_ns() < time_ns:
+        raise ValueError("virtual time does not pass while a thread waits for it")
+    while (left_ns := time_ns - clock.now_ns()) > 0:
+        time.sleep(max(0, left_ns - _AWAKE_NS) / NS_PER_S)  # noqa: TID251 - the one place that sleeps
 
 
 def _about_to_run(loop: asyncio.AbstractEventLoop) -> Sized:

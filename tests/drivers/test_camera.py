@@ -11,7 +11,7 @@ from drivers.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from drivers.camera import Camera, CameraSettings, TemperatureFeature
 from drivers.camera_connection import FrameCount
 from drivers.camera_settings import device_error
-from drivers.clock import NS_PER_S, WallClock
+from drivers.clock import NS_PER_S, WallClock, seconds_ns
 from drivers.interface import DeviceError, Quality, Refused, Unreachable
 from tests.stock_camera import ADDRESS, SERIAL
 
@@ -126,6 +126,13 @@ async def test_a_software_trigger_gives_one_frame_pixel_by_pixel():
 
 
 @pytest.mark.usefixtures("stock_camera")
+async def test_a_due_trigger_waits_for_its_instant_with_everything_prepared():
+    async with Opened() as camera:
+        due_ns = WallClock().now_ns() + NS_PER_S // 5
+        frame = await camera.grab(due_ns=due_ns)
+        assert 0 <= frame.time_ns - seconds_ns(EXPOSURE_S / 2) - due_ns < NS_PER_S // 10
+
+
 async def test_an_exposure_holds_for_one_frame():
     async with Opened() as camera:
         long = await camera.grab(2 * EXPOSURE_S)

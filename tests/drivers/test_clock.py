@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
+from drivers.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, block_until, seconds_ns
 
 
 async def driven(clock: VirtualClock, *work: object) -> None:
@@ -131,6 +131,16 @@ async def test_the_wall_clock_never_goes_back_and_sleeps_to_a_deadline():
     await clock.sleep_until(before_ns + seconds_ns(0.001))
     assert clock.now_ns() >= before_ns + seconds_ns(0.001)
     await clock.sleep_until(0)  # a past deadline returns
+
+
+def test_a_thread_waits_for_an_instant_but_never_for_virtual_time():
+    clock = WallClock()
+    due_ns = clock.now_ns() + seconds_ns(0.005)
+    block_until(clock, due_ns)
+    assert clock.now_ns() >= due_ns
+    block_until(VirtualClock(5), 5)
+    with pytest.raises(ValueError, match="virtual time does not pass"):
+        block_until(VirtualClock(5), 6)
 
 
 def test_a_followed_clock_refuses_to_go_back():
