@@ -1,0 +1,18 @@
+"""The paper's whole protocol, 15.8 h with every device polled at 1 Hz, in virtual time."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.bench.night import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes
+from tests.bench.orders import simulated_order
+from tests.system.conftest import require_aravis
+
+
+@pytest.mark.nightly
+def test_three_whole_nights_are_the_same_to_the_byte_and_leave_nothing_in_memory(tmp_path: Path):
+    require_aravis()
+    nights = outcomes(simulated_order(tmp_path, PROTOCOL, POLL_s), tmp_path, 3)
+    assert len({night.digest for night in nights}) == 1
+    assert all(night.simulated_s > 15.5 * 3600 for night in nights)
+    assert max(night.end_MB - night.settled_MB for night in nights) < GROWTH_LIMIT_MB
