@@ -10,11 +10,28 @@ from pathlib import Path
 
 import cv2
 
-from tests.bench import camera, codec, line_rate, markers, modbus, reading, recorder, simulator, virtual_time, ximc
+from tests.bench import (
+    abort,
+    camera,
+    codec,
+    jitter,
+    line_rate,
+    markers,
+    modbus,
+    night,
+    reading,
+    recorder,
+    simulator,
+    virtual_time,
+    ximc,
+)
 from tests.bench.figures import Figure, progress, table
 
 BENCHMARKS = {
     "virtual_time": virtual_time.figures,
+    "night": night.figures,
+    "abort": abort.figures,
+    "jitter": jitter.figures,
     "modbus": modbus.figures,
     "ximc": ximc.figures,
     "camera": camera.figures,
