@@ -11,16 +11,16 @@ from typing import Annotated
 
 import typer
 
-from compensation.detections import DetectedImage, write_detections
-from compensation.drift import MAX_DEGREE, CompensationModel
+from compensation.drift.fitting import check_degree
+from compensation.drift.fitting import fit as fit_model
+from compensation.drift.model import MAX_DEGREE, CompensationModel
+from compensation.drift.validation import evaluate, table
 from compensation.files import check_writable
-from compensation.fitting import check_degree
-from compensation.fitting import fit as fit_model
-from compensation.markers import Detection, DetectionError, Image, detect, nothing_found, read_image
+from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found, read_image
+from compensation.markers.table import DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
-from compensation.report import write_report
+from compensation.report.report import write_report
 from compensation.target import Target, load_target
-from compensation.validation import evaluate, table
 from drivers.interface import ConfigError, StandError
 from stand.progress import progress
 from stand.recording.session import Session

@@ -1,6 +1,6 @@
 """Recorded session -> arrays over frames: marker centres, temperatures, what each frame was taken for.
 
-Pixels as in compensation/markers.py: x = column = I to the right, y = row = J down, integers are pixel centres.
+Pixels as in compensation/markers/detection.py: x = column = I to the right, y = row = J down, integers are centres.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.markers import Detection, DetectionError, detect
+from compensation.markers.detection import Detection, DetectionError, detect
 from compensation.target import Target
 from drivers.documents import parse_document
 from drivers.interface import Frame, SessionError

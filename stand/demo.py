@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from compensation.report import analyse
-from compensation.validation import table
+from compensation.drift.validation import table
+from compensation.report.report import analyse
 from stand.progress import progress
 
 

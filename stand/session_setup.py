@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from compensation.markers.windows import marker_windows
 from compensation.target import Target
-from compensation.windows import marker_windows
 from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.documents import parse_document
 from drivers.interface import ConfigError

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.markers.windows import marker_windows
 from compensation.target import load_target
-from compensation.windows import marker_windows
 from drivers.clock import NS_PER_S
 from drivers.interface import Frame
 from stand.config import packaged

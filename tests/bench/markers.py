@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.markers import Detection, detect
+from compensation.markers.detection import Detection, detect
 from compensation.target import Target, load_target
 from stand.config import packaged
 from tests.bench.figures import Figure, in_turns, milliseconds, progress, side_by_side

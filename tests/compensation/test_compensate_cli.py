@@ -15,10 +15,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from compensation import cli
-from compensation.detections import COLUMNS
-from compensation.drift import CompensationModel
-from compensation.report import analyse
-from compensation.validation import table
+from compensation.drift.model import CompensationModel
+from compensation.drift.validation import table
+from compensation.markers.table import COLUMNS
+from compensation.report.report import analyse
 from drivers.interface import SessionError
 from stand.progress import progress
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.displacements import displacements
-from compensation.drift import CompensationModel, DegreeScore
+from compensation.drift.displacements import displacements
+from compensation.drift.fitting import choose, convex_hull, fit
+from compensation.drift.model import CompensationModel, DegreeScore
+from compensation.drift.polynomial import condense, design, solve
 from compensation.files import write_whole
-from compensation.fitting import choose, convex_hull, fit
 from compensation.observations import Observations, Role, concatenate
-from compensation.polynomial import condense, design, solve
 from drivers.interface import SessionError
 
 from .synthetic import CAMERA_ABOVE_CHAMBER_K, FIT_DEGC, facts, observations, places_px, polynomial_drift, quadratic

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from compensation.edge_fit import EdgeFit, Flag, fit_edges
-from compensation.edge_model import (
+from compensation.markers.edge_fit import EdgeFit, Flag, fit_edges
+from compensation.markers.edge_model import (
     B0,
     BX,
     BY,
@@ -28,7 +28,7 @@ from compensation.edge_model import (
     normal_cdf,
     normal_equations,
 )
-from compensation.noise import Noise
+from compensation.markers.noise import Noise
 
 from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
 

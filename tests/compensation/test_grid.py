@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.bootstrap import Candidates
-from compensation.grid import DetectionError, Identified, identify, roll_deg
+from compensation.markers.bootstrap import Candidates
+from compensation.markers.grid import DetectionError, Identified, identify, roll_deg
 from compensation.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, true_centres_px

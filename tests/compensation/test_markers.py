@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from compensation.detections import COLUMNS, DetectedImage, flags_text, write_detections
-from compensation.markers import Detection, DetectionError, Flag, Noise, detect, grey_image, read_image
+from compensation.markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image, read_image
+from compensation.markers.table import COLUMNS, DetectedImage, flags_text, write_detections
 from compensation.target import OddMarker, Target, load_target
 from drivers.interface import SessionError
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.displacements import displacements, reference_centres
-from compensation.markers import Flag
+from compensation.drift.displacements import displacements, reference_centres
+from compensation.markers.detection import Flag
 from compensation.observations import Observations, Role, concatenate, observe, session_target
 from drivers.interface import ConfigError, Frame, SessionError
 from stand.recording.session import Session

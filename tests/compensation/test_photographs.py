@@ -13,8 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation import cli
-from compensation.grid import project
-from compensation.markers import Detection, detect, read_image
+from compensation.markers.detection import Detection, detect, read_image
+from compensation.markers.grid import project
 from compensation.target import load_target
 
 ROOT = Path(__file__).parents[2]

@@ -10,12 +10,12 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from compensation import figures
-from compensation.drift import CompensationModel
-from compensation.fitting import fit
+from compensation.drift.fitting import fit
+from compensation.drift.model import CompensationModel
+from compensation.drift.validation import Evaluation, evaluate
 from compensation.observations import Observations, Role, concatenate
-from compensation.report import report_page, write_report
-from compensation.validation import Evaluation, evaluate
+from compensation.report import figures
+from compensation.report.report import report_page, write_report
 from drivers.interface import SessionError
 
 from .synthetic import facts, observations, quadratic

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.drift import CompensationModel
-from compensation.fitting import fit
+from compensation.drift.fitting import fit
+from compensation.drift.model import CompensationModel
+from compensation.drift.validation import evaluate, improvement_percent, table
 from compensation.observations import Observations
-from compensation.validation import evaluate, improvement_percent, table
 from drivers.interface import SessionError
 
 from .synthetic import HELD_OUT_DEGC, facts, observations, places_px, quadratic

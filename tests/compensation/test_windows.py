@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.markers import Flag, detect
+from compensation.markers.detection import Flag, detect
+from compensation.markers.windows import MARGIN_px, marker_windows
 from compensation.target import load_target
-from compensation.windows import MARGIN_px, marker_windows
 from drivers.interface import Frame
 from stand.recording.images import decode_image
 from stand.recording.roi import RoiEncoder

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from compensation.report import analyse
-from compensation.validation import Evaluation
+from compensation.drift.validation import Evaluation
+from compensation.report.report import analyse
 from stand.config import packaged
 from stand.progress import progress
 from stand.run import run_virtual

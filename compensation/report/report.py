@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from compensation import figures
-from compensation.drift import CompensationModel
-from compensation.files import check_writable, write_whole
-from compensation.fitting import fit
-from compensation.markers import Flag
-from compensation.observations import Mask, Observations, Progress, Role, observe_sessions
-from compensation.page import facts, figure, heading, page, paragraph, table
-from compensation.validation import (
+from compensation.drift.fitting import fit
+from compensation.drift.model import CompensationModel
+from compensation.drift.validation import (
     PAPER_AFTER_PX,
     PAPER_BEFORE_PX,
     Evaluation,
     evaluate,
     improvement_percent,
 )
+from compensation.files import check_writable, write_whole
+from compensation.markers.detection import Flag
+from compensation.observations import Mask, Observations, Progress, Role, observe_sessions
+from compensation.report import figures
+from compensation.report.page import facts, figure, heading, page, paragraph, table
 
 _LISTED_FRAMES = 20
 _LEAST_COVERAGE = 0.9

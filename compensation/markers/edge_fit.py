@@ -13,7 +13,7 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.edge_model import (
+from compensation.markers.edge_model import (
     B0,
     BX,
     BY,
@@ -33,7 +33,7 @@ from compensation.edge_model import (
     normal_equations,
     set_start_levels,
 )
-from compensation.noise import Image, Noise, full_scale_DN
+from compensation.markers.noise import Image, Noise, full_scale_DN
 
 _BAND_SIGMA = 7.0
 """Half width of the fitted band in blurs. Scatter of the centres over the Cramer-Rao limit, even light, R = 35 px:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.noise import Image, full_scale_DN
+from compensation.markers.noise import Image, full_scale_DN
 from compensation.target import Target
 
 _CELLS_PER_DISC = 9.5

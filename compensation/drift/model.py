@@ -2,7 +2,7 @@
 
 The paper's form (section 6.1), one polynomial per coordinate of total degree n in the measured position (I, J) and the
 camera's own temperature T, fitted to the displacement (reference minus measured). For n >= 1 the position itself is in
-the space, so this is the same fit as that of the reference positions. compensation/fitting.py makes the model.
+the space, so this is the same fit as that of the reference positions. compensation/drift/fitting.py makes the model.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from compensation.drift.polynomial import Float, Scaling, design, exponents
 from compensation.files import write_whole
-from compensation.polynomial import Float, Scaling, design, exponents
 from drivers.documents import Document
 from drivers.interface import SessionError
 

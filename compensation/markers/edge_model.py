@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.noise import Noise
+from compensation.markers.noise import Noise
 
 CX, CY, M11, M12, M22, SIGMA, B0, BX, BY, F0, FX, FY = range(12)
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.bootstrap import Candidates
-from compensation.lattice import Cell, largest_lattice
+from compensation.markers.bootstrap import Candidates
+from compensation.markers.lattice import Cell, largest_lattice
 from compensation.target import Target
 from drivers.interface import StandError
 

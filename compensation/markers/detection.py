@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.bootstrap import Candidates, disc_sizes_px, find_candidates
-from compensation.edge_fit import EdgeFit, Flag, fit_edges
-from compensation.edge_model import B0, CX, CY, F0, M11, M12, M22, SIGMA, EdgeState
-from compensation.grid import DetectionError, Identified, fit_homography, identify, pitch_px
-from compensation.noise import Image, Noise
+from compensation.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
+from compensation.markers.edge_fit import EdgeFit, Flag, fit_edges
+from compensation.markers.edge_model import B0, CX, CY, F0, M11, M12, M22, SIGMA, EdgeState
+from compensation.markers.grid import DetectionError, Identified, fit_homography, identify, pitch_px
+from compensation.markers.noise import Image, Noise
 from compensation.target import Target
 
 __all__ = [

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.bootstrap import Candidates, disc_sizes_px, find_candidates
-from compensation.grid import DetectionError, Identified, identify, project
-from compensation.noise import Image
+from compensation.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
+from compensation.markers.grid import DetectionError, Identified, identify, project
+from compensation.markers.noise import Image
 from compensation.target import Target
 
 MARGIN_px = 20

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.displacements import Displacements, displacements
-from compensation.drift import CompensationModel
-from compensation.fitting import degrees_for, left_out, scaling_of
+from compensation.drift.displacements import Displacements, displacements
+from compensation.drift.fitting import degrees_for, left_out, scaling_of
+from compensation.drift.model import CompensationModel
 from compensation.observations import Float, Observations, Role
 from drivers.interface import SessionError
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.displacements import Displacements, displacements, reference_centres
-from compensation.drift import MAX_DEGREE, CompensationModel, DegreeScore, is_area
+from compensation.drift.displacements import Displacements, displacements, reference_centres
+from compensation.drift.model import MAX_DEGREE, CompensationModel, DegreeScore, is_area
+from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from compensation.observations import Mask, Observations, Role
-from compensation.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from drivers.interface import SessionError
 
 _LEAST_TEMPERATURES = 3

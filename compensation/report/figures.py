@@ -15,9 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from compensation.displacements import reference_centres
+from compensation.drift.displacements import reference_centres
+from compensation.drift.validation import Evaluation, improvement_percent
 from compensation.observations import Float, Mask, Observations, Role
-from compensation.validation import Evaluation, improvement_percent
 
 I_COLOUR, J_COLOUR = "#0072B2", "#D55E00"
 _GREY = "#6b6b6b"

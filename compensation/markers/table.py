@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from compensation.files import whole_file
-from compensation.markers import Detection, Flag
+from compensation.markers.detection import Detection, Flag
 from compensation.target import Target
 
 COLUMNS = (

@@ -1,0 +1,1 @@
+"""Marker centres over temperature -> drift model, and what it gains."""
