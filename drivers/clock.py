@@ -17,7 +17,7 @@ from typing import Protocol
 
 NS_PER_S = 1_000_000_000
 
-_AWAKE_NS = 2_000_000  # timers, and threads that sleep, may be this late
+_AWAKE_NS = 2_000_000  # a thread that sleeps may be woken this late
 
 
 class Now(Protocol):
@@ -30,6 +30,11 @@ class Now(Protocol):
 
 class Clock(Now, Protocol):
     """Time as the stand sees it."""
+
+    @property
+    def lead_ns(self) -> int:
+        """How long before an instant to begin with what must be ready at it; 0 where nothing takes long."""
+        ...
 
     async def sleep_until(self, time_ns: int) -> None:
         """Return at or after `time_ns`; at once when it has passed."""
@@ -49,6 +54,8 @@ class WallClock:
     """The host's clock: the epoch read once, then the monotonic counter, so that a step of the host's time is not
     a step of ours."""
 
+    lead_ns = 20_000_000  # a late timer of the event loop, and a camera that starts its acquisition
+
     def __init__(self) -> None:
         self._epoch_ns = time.time_ns() - time.monotonic_ns()  # noqa: TID251 - the one place that reads time
 
@@ -57,10 +64,10 @@ class WallClock:
         return self._epoch_ns + time.monotonic_ns()
 
     async def sleep_until(self, time_ns: int) -> None:
-        """Sleep to an absolute deadline, the last two ms awake: frames are to be punctual."""
-        await asyncio.sleep(max(0, time_ns - _AWAKE_NS - self.now_ns()) / NS_PER_S)
-        while self.now_ns() < time_ns:  # noqa: ASYNC110 - no event comes with the time
-            await asyncio.sleep(0)
+        """Sleep to an absolute deadline; the event loop's timers come up to some ms late."""
+        await asyncio.sleep(0)
+        while (left_ns := time_ns - self.now_ns()) > 0:  # noqa: ASYNC110 - a timer may come a ns too early
+            await asyncio.sleep(left_ns / NS_PER_S)
 
     def hold(self) -> AbstractContextManager[None]:
         """Real time cannot be held."""
@@ -93,6 +100,8 @@ class VirtualClock:
 
     Before time moves, `advance(time_ns)` tells the simulator and waits for its answer.
     """
+
+    lead_ns = 0
 
     def __init__(self, start_ns: int, advance: Callable[[int], Awaitable[None]] | None = None) -> None:
         self._now_ns = start_ns

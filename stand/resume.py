@@ -165,8 +165,9 @@ def _info(metadata: Mapping[str, str]) -> SessionInfo:
     )
 
 
-def _progress(session: Session, entries: Iterable[Entry], recipe: Recipe) -> Progress:
-    done = {mark.step_id for mark in session.steps() if mark.state is StepState.DONE}
+def journaled(entries: Iterable[Entry]) -> tuple[frozenset[str], dict[str, float]]:
+    """The ids of the steps that are done, and what others, or soaks that began anew, have earned (s)."""
+    done: set[str] = set()
     earned_s: dict[str, float] = {}
     for entry in entries:
         if isinstance(entry, Dwell):
@@ -174,8 +175,14 @@ def _progress(session: Session, entries: Iterable[Entry], recipe: Recipe) -> Pro
         if isinstance(entry, Step) and entry.state == "done":
             done.add(entry.step_id)
             earned_s.pop(entry.step_id, None)
+    return frozenset(done), earned_s
+
+
+def _progress(session: Session, entries: Iterable[Entry], recipe: Recipe) -> Progress:
+    done, earned_s = journaled(entries)
+    done |= {mark.step_id for mark in session.steps() if mark.state is StepState.DONE}
     begun = {planned.step_id for planned in recipe.plan() if isinstance(planned.step, Capture)} - done
-    return Progress(frozenset(done), earned_s, _frames(session, begun))
+    return Progress(done, earned_s, _frames(session, begun))
 
 
 def _frames(session: Session, step_ids: set[str]) -> dict[str, int]:

@@ -19,7 +19,7 @@ from stand.recording.settings import SessionInfo
 from stand.resume import Interruption
 from stand.session_setup import Order, info_of, recorder_of, session_directory
 from stand.session_text import salvage_line
-from stand.simulator import ControlSocket, Simulator, laboratory_of
+from stand.simulator import ControlSocket, Simulator, laboratory_of, one_cpu
 from stand.stop import Interrupted, Stop
 from stand.tasks import cancelled, watched
 
@@ -102,6 +102,7 @@ async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s:
 async def _run_virtual(job: _Job, start_ns: int) -> Path:
     laboratory = {**laboratory_of(job.order.config, virtual=True, seed=job.seed), "start_ns": start_ns}
     async with Stop() as stop, AsyncExitStack() as stack:
+        stack.enter_context(one_cpu())
         address = str(laboratory["control"])
         tries = 1 if job.before is None else await _orphan_ended(address, job.before.last_ns, start_ns)
         simulator = await _started(laboratory, tries)

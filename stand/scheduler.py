@@ -154,15 +154,16 @@ class Scheduler:
         lost camera opened anew are skipped, not made up for by a burst."""
         step_id = planned.step_id
         await self._stand.approach_again()
-        due_ns, interval_ns = self._clock.now_ns(), seconds_ns(capture.interval_s)
+        lead_ns = self._clock.lead_ns  # the camera is told of a frame before its instant, and prepared when it comes
+        due_ns, interval_ns = self._clock.now_ns() + lead_ns, seconds_ns(capture.interval_s)
         while self._frames.get(step_id, 0) < capture.frames:
-            await self._clock.sleep_until(due_ns)
+            await self._clock.sleep_until(due_ns - lead_ns)
             if self._stand.gate.reasons or self._disturbed:
                 await self._ready(planned, set_up)
                 await self._stand.approach_again()
                 due_ns += max(0, math.ceil((self._clock.now_ns() - due_ns) / interval_ns)) * interval_ns
                 continue
-            await self._stand.take_frame(capture.exposure_s, step_id)
+            await self._stand.take_frame(capture.exposure_s, step_id, due_ns)
             self._frames[step_id] = self._frames.get(step_id, 0) + 1
             # To the latest deadline that has passed: a free-running camera gives its frame up to a period late.
             due_ns += max(1, (self._clock.now_ns() - due_ns) // interval_ns) * interval_ns

@@ -47,17 +47,24 @@ def laboratory_of(config: StandConfig, *, virtual: bool, seed: int | None) -> di
 
 @contextmanager
 def one_cpu() -> Generator[None]:
-    """Inside, this thread and whatever it starts (the simulator) run on one of the CPUs it may use.
+    """Inside, this process and whatever it starts (the simulator) run on one of the CPUs they may use.
 
     In virtual time daemon and simulator take turns, a dozen in each polled second, and never work at once. On one CPU a
     turn is a switch of context; on two it is waking an idle CPU, which takes longer than the answer.
     """
     usable = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {sorted(usable)[os.getpid() % len(usable)]})
+    _use({sorted(usable)[os.getpid() % len(usable)]})
     try:
         yield
     finally:
-        os.sched_setaffinity(0, usable)
+        _use(usable)
+
+
+def _use(cpus: set[int]) -> None:
+    """Every thread of this process: one that waits for work in a pool would start the simulator elsewhere."""
+    for thread in os.listdir("/proc/self/task"):
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            os.sched_setaffinity(int(thread), cpus)
 
 
 class Simulator:

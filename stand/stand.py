@@ -149,21 +149,21 @@ class Stand:
         self._check()
         await ready(self.devices.axes, self._commanded, self._hub, self._clock)
 
-    async def take_frame(self, exposure_s: float, step_id: str) -> None:
-        """One frame of the step, published. A camera lost meanwhile holds the gate until it has answered again and
-        given the frame; Unreachable after 30 min."""
+    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0) -> None:
+        """One frame of the step, published; exposed at `due_ns` when that is still ahead. A camera lost meanwhile holds
+        the gate until it has answered again and given the frame; Unreachable after 30 min."""
         self._check()
         deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_LOST_LIMIT_S)
         try:
-            frame = await self._grab(exposure_s, deadline_ns)
+            frame = await self._grab(exposure_s, due_ns, deadline_ns)
         finally:
             self.gate.clear(CAMERA_LOST)
         self._hub.publish(replace(frame, step_id=step_id))
 
-    async def _grab(self, exposure_s: float, deadline_ns: int) -> Frame:
+    async def _grab(self, exposure_s: float, due_ns: int, deadline_ns: int) -> Frame:
         while True:
             try:
-                return await self.devices.camera.grab(exposure_s)
+                return await self.devices.camera.grab(exposure_s, due_ns)
             except Unreachable as error:
                 if self._clock.now_ns() >= deadline_ns:
                     raise

@@ -42,6 +42,11 @@ class ReplayClock:
         self._wall_start_ns = self._wall.now_ns()
         self._speed = speed
 
+    @property
+    def lead_ns(self) -> int:
+        """That of the wall clock, in the session's time."""
+        return round(self._wall.lead_ns * self._speed)
+
     def now_ns(self) -> int:
         """The instant of the session, ns since the epoch."""
         return self._start_ns + round((self._wall.now_ns() - self._wall_start_ns) * self._speed)

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -24,6 +25,17 @@ def test_what_is_started_inside_shares_the_cpu_and_afterwards_all_are_usable_aga
         thread.join()
     assert of_thread == [{cpu}]
     assert os.sched_getaffinity(0) == usable
+
+
+def test_a_thread_that_was_there_before_and_one_that_stays_behind_follow():
+    usable = os.sched_getaffinity(0)
+    with ThreadPoolExecutor(1) as before, ThreadPoolExecutor(1) as within:
+        assert before.submit(os.sched_getaffinity, 0).result() == usable
+        with one_cpu():
+            assert len(before.submit(os.sched_getaffinity, 0).result()) == 1
+            assert len(within.submit(os.sched_getaffinity, 0).result()) == 1
+        assert before.submit(os.sched_getaffinity, 0).result() == usable
+        assert within.submit(os.sched_getaffinity, 0).result() == usable
 
 
 def test_the_cpus_are_given_back_also_after_an_error():

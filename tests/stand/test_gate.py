@@ -1,0 +1,80 @@
+"""The gate's reasons, and the phases of a run."""
+
+import asyncio
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stand.gate import Gate, Phase, Turn, next_phase
+
+REASONS = st.sampled_from(["operator", "interlock", "camera_lost", "disk_low"])
+
+
+@given(st.lists(st.tuples(REASONS, st.booleans()), max_size=20))
+def test_the_gate_is_open_exactly_when_no_reason_is_left_and_no_reason_clears_another(changes):
+    gate, standing, told = Gate(), set(), []
+    gate.subscribe(lambda reason, held: told.append((reason, held)))
+    expected = []
+    for reason, held in changes:
+        if held != (reason in standing):
+            expected.append((reason, held))
+        (standing.add if held else standing.discard)(reason)
+        (gate.hold if held else gate.clear)(reason)
+        assert gate.reasons == standing
+        assert told == expected
+
+
+async def test_whoever_waits_passes_when_the_last_reason_goes():
+    gate = Gate()
+    await gate.passed()
+    gate.hold("operator")
+    gate.hold("disk_low")
+    waiting = asyncio.create_task(gate.passed())
+    gate.clear("operator")
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    gate.clear("disk_low")
+    await waiting
+
+
+async def test_a_gate_that_closes_again_before_the_waiter_runs_keeps_it_waiting():
+    gate = Gate()
+    gate.hold("operator")
+    waiting = asyncio.create_task(gate.passed())
+    await asyncio.sleep(0)
+    gate.clear("operator")
+    gate.hold("disk_low")
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    gate.clear("disk_low")
+    await waiting
+
+
+async def test_a_hold_for_a_moment_is_not_missed():
+    gate = Gate()
+    waiting = asyncio.create_task(gate.closed())
+    await asyncio.sleep(0)
+    gate.hold("operator")
+    gate.clear("operator")
+    await waiting
+
+
+@pytest.mark.parametrize("phase", Phase)
+def test_stop_ends_a_run_from_every_phase_and_nothing_brings_it_back(phase: Phase):
+    stopped = next_phase(phase, Turn.STOP)
+    assert stopped in (Phase.ABORTING, Phase.ENDED)
+    for turns in itertools.product((Turn.START, Turn.HOLD, Turn.RELEASE, Turn.STOP), repeat=2):
+        after = stopped
+        for turn in turns:
+            after = next_phase(after, turn)
+        assert after is stopped
+    assert next_phase(stopped, Turn.END) is Phase.ENDED
+
+
+def test_a_run_is_held_and_released_only_between_its_start_and_its_stop():
+    assert next_phase(Phase.IDLE, Turn.HOLD) is Phase.IDLE
+    assert next_phase(Phase.IDLE, Turn.START) is Phase.RUNNING
+    assert next_phase(Phase.RUNNING, Turn.HOLD) is Phase.HELD
+    assert next_phase(Phase.HELD, Turn.RELEASE) is Phase.RUNNING
