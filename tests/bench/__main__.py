@@ -23,6 +23,7 @@ from tests.bench import (
     recorder,
     simulator,
     virtual_time,
+    warp,
     ximc,
 )
 from tests.bench.figures import Figure, progress, table
@@ -40,6 +41,7 @@ BENCHMARKS = {
     "line_rate": line_rate.figures,
     "reading": reading.figures,
     "markers": markers.figures,
+    "warp": warp.figures,
     "simulator": simulator.figures,
 }
 

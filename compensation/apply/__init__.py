@@ -1,0 +1,1 @@
+"""A drift model put to use: on points, on images, and in other people's programs."""

@@ -1,0 +1,59 @@
+"""Images moved by a drift, beside cv2.remap with its best interpolation: time, and what happens to the markers.
+
+The frame is rendered with 16 bits and without noise, so that the error is the interpolation's own.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.apply.warp import source_offset, warp
+from compensation.markers.detection import detect
+from compensation.target import load_target
+from stand.config import packaged
+from tests.bench.figures import Figure, at_most, in_turns, milliseconds, progress, side_by_side
+from tests.compensation.rendered import Scene, render
+
+ROUNDS = 7
+PEER = "cv2.remap, Lanczos 8x8"
+
+Float = NDArray[np.float64]
+
+
+def figures(directory: Path) -> list[Figure]:
+    """ms per 5 MP frame, and mpx RMS of the markers."""
+    progress("warp, rendering the frame")
+    scene = Scene(psf_px=0.8, tilt_y_deg=4, roll_deg=1)
+    image = (256 * render(scene)).astype(np.uint16)
+    width, height = scene.size
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    at = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    at = (at + source_offset(_drift, at)).astype(np.float32).reshape(height, width, 2)
+    own, other = in_turns(
+        lambda: milliseconds(lambda: warp(image, _drift)),
+        lambda: milliseconds(lambda: cv2.remap(image, at, None, cv2.INTER_LANCZOS4)),
+        ROUNDS,
+    )
+    target = load_target(packaged("targets", "paper-9x6"))
+    before = detect(image, target).centres_px
+    expected = before + _drift(before)
+    errors = [
+        1e3 * float(np.sqrt(((detect(moved, target).centres_px - expected) ** 2).mean()))
+        for moved in (
+            np.round(warp(image, _drift)).astype(np.uint16),
+            cv2.remap(image, at, None, cv2.INTER_LANCZOS4),
+        )
+    ]
+    return [
+        at_most(100, side_by_side("warp, 5 MP frame", "ms/frame", PEER, own, other)),
+        at_most(0.5, side_by_side("warp, error of the markers", "mpx RMS", PEER, errors[:1], errors[1:])),
+    ]
+
+
+def _drift(xy_px: Float) -> Float:
+    x, y = (xy_px[:, 0] - 1223.5) / 1224, (xy_px[:, 1] - 1023.5) / 1224
+    return np.stack([0.42 + 0.05 * x - 0.03 * x * y, -0.55 + 0.06 * y + 0.02 * y * y], axis=1)

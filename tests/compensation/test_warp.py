@@ -1,0 +1,87 @@
+"""Images moved by a drift: as exact as a spline is, also near the border, and no marker goes astray."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from compensation.apply.spline import coefficients
+from compensation.apply.warp import source_offset, warp
+from compensation.markers.detection import detect
+from compensation.target import load_target
+from stand.config import packaged
+from tests.compensation.rendered import Scene, render
+
+SMALL = (200, 160)
+
+
+def drift(xy_px):
+    """As a camera's: half a pixel, a little larger at one side, bent."""
+    x, y = (xy_px[:, 0] - 1223.5) / 1224, (xy_px[:, 1] - 1023.5) / 1224
+    return np.stack([0.42 + 0.05 * x - 0.03 * x * y, -0.55 + 0.06 * y + 0.02 * y * y], axis=1)
+
+
+def across_zero(xy_px):
+    """Changes its sign, and so the whole pixel that is read, every few pixels."""
+    return np.stack([1.6 * np.sin(xy_px[:, 0] / 60), 1.3 * np.cos(xy_px[:, 1] / 45)], axis=1)
+
+
+def noise(shape, dtype=np.uint8):
+    return np.random.default_rng(5).integers(0, np.iinfo(dtype).max, shape, endpoint=True).astype(dtype)
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (61, 131), (160, 200)])
+def test_the_coefficients_are_those_of_the_mirrored_spline(shape):
+    image = noise(shape)
+    expected = ndimage.spline_filter(np.pad(image.astype(float), 40, mode="reflect"), mode="mirror")
+    assert coefficients(image) == pytest.approx(expected[36:-36, 36:-36], abs=2e-3)
+
+
+@pytest.mark.parametrize("shift", [drift, across_zero])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_every_pixel_is_that_of_an_exact_spline_at_the_place_it_comes_from(shift, dtype):
+    image = noise((150, 210), dtype)
+    moved = warp(image, shift)
+    places = np.stack(np.meshgrid(np.arange(0, 256, 32.0), np.arange(0, 192, 32.0)), axis=-1)
+    offset = source_offset(shift, places.reshape(-1, 2)).reshape(places.shape)
+    rows, columns = np.mgrid[:150, :210].astype(float)
+    dx, dy = (ndimage.map_coordinates(offset[:, :, i], [rows / 32, columns / 32], order=1) for i in (0, 1))
+    padded = np.pad(image.astype(float), 40, mode="reflect")
+    expected = ndimage.map_coordinates(padded, [rows + dy + 40, columns + dx + 40], order=3, mode="mirror")
+    assert moved.dtype == np.float32
+    assert moved == pytest.approx(expected, abs=2e-5 * np.iinfo(dtype).max)
+
+
+def test_the_place_a_point_comes_from_is_the_inverse_of_the_shift():
+    points = np.random.default_rng(1).uniform(0, 2000, (500, 2))
+    source = points + source_offset(drift, points)
+    assert source + drift(source) == pytest.approx(points, abs=1e-9)
+
+
+def test_markers_are_found_where_the_shift_puts_them_within_half_a_thousandth_of_a_pixel():
+    target = load_target(packaged("targets", "paper-9x6"))
+    image = (256 * render(Scene(psf_px=0.8, tilt_y_deg=4, roll_deg=1))).astype(np.uint16)
+    before = detect(image, target).centres_px
+    after = detect(np.round(warp(image, drift)).astype(np.uint16), target).centres_px
+    error_px = after - before - drift(before)
+    assert np.sqrt((error_px**2).mean()) < 5e-4
+
+
+def test_no_shift_leaves_the_image_as_it_is():
+    image = noise(SMALL[::-1])
+    assert np.array_equal(np.round(warp(image, np.zeros_like)), image)
+
+
+def test_what_was_outside_is_the_image_mirrored_about_its_outermost_pixels():
+    image = noise(SMALL[::-1])
+    moved = warp(image, lambda xy_px: np.full_like(xy_px, 3.0))
+    assert moved[:3, 3:] == pytest.approx(image[3:0:-1, :-3].astype(float), abs=2e-3)
+
+
+def test_a_shift_that_is_not_known_everywhere_is_refused():
+    with pytest.raises(ValueError, match="the shift is not finite everywhere in the image"):
+        warp(noise(SMALL), lambda xy_px: np.where(xy_px > 100, np.nan, 0 * xy_px))
+
+
+def test_an_image_that_is_too_small_is_refused():
+    with pytest.raises(ValueError, match=r"at least 16 x 16 pixels, not \(15, 40\)"):
+        warp(noise((15, 40)), np.zeros_like)
