@@ -37,11 +37,15 @@ Model = TypeVar("Model", bound=BaseModel)
 
 def load_document(path: Path, model: type[Model]) -> Model:
     """The file as `model`; raises ConfigError that names file and path of every fault."""
+    return parse_document(read_document(path), model, str(path))
+
+
+def read_document(path: Path) -> str:
+    """The file's text; ConfigError when it cannot be read, or is not UTF-8."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
-    return parse_document(text, model, str(path))
 
 
 def parse_document(text: str, model: type[Model], where: str) -> Model:

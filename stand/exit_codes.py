@@ -1,4 +1,5 @@
-"""How a command ends: 0 as asked, 1 failed or damaged, 2 bad input, 130 interrupted; each with one sentence."""
+"""How a command ends, each with one sentence: 0 as asked, 1 failed or damaged, 2 bad input, 3 a run that is complete
+and recorded but could not be reported, 130 interrupted."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from stand.usage import tell
 
 FAILED = 1
 BAD_INPUT = 2
+NOT_REPORTED = 3
 INTERRUPTED = 130
 
 

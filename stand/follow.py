@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from types import MappingProxyType
 
 from drivers.clock import NS_PER_S, seconds_ns
@@ -42,11 +41,7 @@ class Follow:
         self._next_ns = 0
 
     def __call__(self, item: Item) -> None:
-        """Follow one item; a terminal that is gone is no reason for a run to end."""
-        with suppress(OSError):
-            self._follow(item)
-
-    def _follow(self, item: Item) -> None:
+        """Follow one item."""
         if isinstance(item, Event):
             if item.level != "info":
                 self._warn(f"{item.level}: {date_time(item.time_ns)[11:]} UTC {item.text}")

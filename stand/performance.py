@@ -6,6 +6,7 @@ import asyncio
 import importlib.metadata
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 from drivers.clock import NS_PER_S
 from drivers.interface import SessionError, StandTripped
@@ -35,11 +36,13 @@ _RELEASING = {"frames_resumed": DISK_LOW, "telemetry_saved_again": NOT_RECORDED}
 
 @dataclass(frozen=True, slots=True)
 class Performance:
-    """What is run, by what, and what it goes on from. `background`: tasks without which nothing goes on."""
+    """What is run, by what, and what it goes on from. `begun` is told the folder when its journal is on the disk,
+    `background` are tasks without which nothing goes on."""
 
     order: Order
     seed: int | None
     before: Interruption | None
+    begun: Callable[[Path], None]
     assembly: Assembly
     recorder: Recorder
     stop: Stop
@@ -65,11 +68,9 @@ async def perform(work: Performance) -> None:
         ended = _ending(stop.fault, error)
         raise
     finally:
+        log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
         stop.taking_down()
-        try:
-            log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
-        finally:  # also when somebody who listens fails
-            await assembly.stand.make_safe()
+        await assembly.stand.make_safe()
         await cancelled(watchers)
         # One more look at every device, so that the recording ends with the safe state as the wire tells it.
         for poller in pollers:
@@ -92,12 +93,10 @@ async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log
     before = work.before
     journal = Journal.create(work.recorder.directory) if before is None else before.journal
     await log.begin(journal, *_first_entries(work))
+    work.begun(work.recorder.directory)
     gate = work.assembly.stand.gate
     gate.subscribe(log.held)
     gate.subscribe(lambda reason, held: _forget_cleared(guard, reason, held))
-    if guard.held is not None:  # by the first look, when there was no journal yet
-        log.tripped(guard.held)
-        log.held(INTERLOCK, True)
     work.assembly.hub.subscribe(_hold_while_not_recorded(gate))
     if before is not None and not before.set_up.camera_on:
         work.assembly.stand.camera_is_off(before.cooling)

@@ -8,42 +8,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from compensation.target import Target
-from drivers.documents import parse_document
 from drivers.interface import SessionError, StandTripped
-from drivers.registers import load_register_map
-from stand.config import StandConfig, load_config, packaged
 from stand.estimate import price
+from stand.order_files import parse_order
 from stand.queue_file import Entry, Queue, State, changing, read_queue
-from stand.recipe import Recipe, load_recipe
 from stand.session_setup import Order
-
-
-def load_order(recipe: str, config: str) -> Order:
-    """The files (or installed names), read and checked as far as can be without the stand: ConfigError names what is
-    wrong in which of them."""
-    config_path, recipe_path = packaged("", config), packaged("recipes", recipe)
-    stand_config, stand_recipe = load_config(config_path), load_recipe(recipe_path)
-    target_path = packaged("targets", stand_config.target)
-    texts = (path.read_text(encoding="utf-8") for path in (config_path, recipe_path, target_path))
-    order = Order(stand_config, stand_recipe, *texts)
-    parse_document(order.target_text, Target, str(target_path))
-    for name in (stand_config.regulator.registers, stand_config.relays.registers, stand_config.thermometers.registers):
-        load_register_map(packaged("registers", name))
-    price(stand_recipe.plan(), stand_config)
-    return order
 
 
 def order_of(entry: Entry) -> Order:
     """What an entry asks for; ConfigError when this version of the program refuses it."""
-    where = f"run {entry.id} of the queue: "
-    order = Order(
-        parse_document(entry.config_text, StandConfig, f"{where}{entry.config}"),
-        parse_document(entry.recipe_text, Recipe, f"{where}{entry.recipe}"),
-        entry.config_text,
-        entry.recipe_text,
-        entry.target_text,
-    )
+    texts = {"config.yaml": entry.config_text, "recipe.yaml": entry.recipe_text, "target.yaml": entry.target_text}
+    names = {"config.yaml": entry.config, "recipe.yaml": entry.recipe, "target.yaml": "its target"}
+    order = parse_order(texts, {key: f"run {entry.id} of the queue: {name}" for key, name in names.items()})
     price(order.recipe.plan(), order.config)
     return order
 
@@ -111,8 +87,13 @@ def take(directory: Path, now_ns: int) -> Entry | None:
             raise SessionError(f"run {running.id} is running; one at a time")
         entry = next((entry for entry in queue.entries if entry.is_open), None)
         if entry is not None:
-            began_ns = entry.began_ns if entry.session else now_ns
-            draft.put(entry.model_copy(update={"state": State.RUNNING, "began_ns": began_ns, "reason": ""}))
+            changes = {
+                "state": State.RUNNING,
+                "began_ns": entry.began_ns if entry.session else now_ns,
+                "reason": "",
+                "fruitless_starts": entry.fruitless_starts + 1,
+            }
+            draft.put(entry.model_copy(update=changes))
     return entry
 
 
@@ -122,11 +103,19 @@ def note_session(directory: Path, number: int, session: Path) -> None:
         draft.put(draft.entry(number).model_copy(update={"session": session.name}))
 
 
+def note_step(directory: Path, number: int) -> None:
+    """The run under way has finished a step that it had not finished before."""
+    with changing(directory) as draft:
+        draft.put(draft.entry(number).model_copy(update={"fruitless_starts": 0}))
+
+
 def finish(directory: Path, number: int, state: State, now_ns: int, reason: str = "", *, halt: bool = False) -> None:
     """The run under way has ended; with `halt` nothing is begun before an operator says so."""
     with changing(directory) as draft:
-        entry = draft.entry(number)
-        draft.put(entry.model_copy(update={"state": state, "ended_ns": now_ns, "reason": reason}))
+        changes = {"state": state, "ended_ns": now_ns, "reason": reason}
+        if state is State.INTERRUPTED:
+            changes["fruitless_starts"] = 0  # by an operator, who may do so as often as he likes
+        draft.put(draft.entry(number).model_copy(update=changes))
         if halt:
             draft.set(halted=f"run {number}: {reason}")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -14,9 +13,10 @@ from drivers.clock import WallClock
 from stand import queue
 from stand.config import load_config, packaged
 from stand.exit_codes import INTERRUPTED, one_line_errors
+from stand.order_files import load_order
 from stand.queue_file import Entry, Queue
 from stand.queue_run import run_entry
-from stand.queue_work import work
+from stand.queue_work import Notes, work
 from stand.recording.instants import date_time, duration
 from stand.stop import Interrupted
 from stand.usage import OneLineUsage, one_line
@@ -49,7 +49,7 @@ def add(
     Example: stand queue add thermal-cycle --config laboratory.yaml --out /data/sessions
     """
     with one_line_errors():
-        order = queue.load_order(recipe, config)
+        order = load_order(recipe, config)
         directory = out or order.config.recording.directory
         typer.echo(queue.add(directory, order, config, WallClock().now_ns()).id)
 
@@ -122,8 +122,8 @@ def start(
         if clear:
             queue.clear(directory)
 
-        async def run_one(entry: Entry, begun: Callable[[Path], None]) -> Path:
-            return await run_entry(directory, entry, begun, _say, virtual_time=virtual_time)
+        async def run_one(entry: Entry, notes: Notes) -> Path:
+            return await run_entry(directory, entry, notes, _say, virtual_time=virtual_time)
 
         try:
             asyncio.run(work(directory, run_one, WallClock(), _say))

@@ -42,6 +42,7 @@ class Entry(Document):
 
     config: the file its text is from, for messages. Instants are ns since the epoch on the host's clock. session: the
     name of its folder in the recording directory, "" before it has one. reason: why it failed or was interrupted.
+    fruitless_starts: how often in a row it was begun or gone on with and has not finished one more step.
     """
 
     id: int = Field(ge=1)
@@ -56,6 +57,7 @@ class Entry(Document):
     ended_ns: int | None = None
     session: str = ""
     reason: str = ""
+    fruitless_starts: int = Field(default=0, ge=0)
 
     @property
     def is_open(self) -> bool:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Collection, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
 from drivers.interface import SessionError, StandError, StandTripped
 from stand.estimate import price
 from stand.follow import Follow
-from stand.hub import Event, Hub, Item, StepMark
-from stand.journal import JOURNAL_NAME, Ended, Journal
+from stand.hub import Event, Hub, Item, StepMark, StepState
+from stand.journal import Ended, Journal
 from stand.progress import progress
 from stand.queue import order_of
 from stand.queue_file import Entry
-from stand.queue_work import Halt
+from stand.queue_work import Halt, Notes
 from stand.resume import Interruption, interruption
 from stand.run import resume, run_real, run_virtual
 from stand.session_setup import Order
@@ -23,20 +23,20 @@ from stand.stop import Interrupted
 
 
 async def run_entry(
-    directory: Path, entry: Entry, begun: Callable[[Path], None], tell: Callable[[str], None], *, virtual_time: bool
+    directory: Path, entry: Entry, notes: Notes, tell: Callable[[str], None], *, virtual_time: bool
 ) -> Path:
     """Run `entry` into a session below `directory`, or go on in the one it has; progress is shown, `tell` gets
     warnings.
 
-    Returns the session's folder; `begun` is told it at the first step. Halt when an interrupted run cannot be resumed,
-    or one that failed has left the stand not confirmed safe; else raises as a run does.
+    Returns the session's folder. Halt when an interrupted run cannot be resumed, or one that failed has left the stand
+    not confirmed safe; else raises as a run does.
     """
     session = directory / entry.session if entry.session else None
     if session is not None and await asyncio.to_thread(_is_complete, session):
         return session  # killed between its end and the note of it
     order = order_of(entry)
     before = None if session is None else await asyncio.to_thread(_interruption, session)
-    watch = _Watch(directory, order.recipe.name, begun)
+    watch = _Watch(frozenset() if before is None else before.progress.done, notes.step_done)
     try:
         with _followed(order, before, tell) as follow:
 
@@ -47,8 +47,8 @@ async def run_entry(
             if before is not None:
                 return await resume(before, subscribe)
             if virtual_time:
-                return await run_virtual(order, directory, None, subscribe)
-            return await run_real(order, directory, subscribe)
+                return await run_virtual(order, directory, None, subscribe, notes.begun)
+            return await run_real(order, directory, subscribe, notes.begun)
     except (Interrupted, StandTripped):
         raise
     except StandError as error:
@@ -58,22 +58,18 @@ async def run_entry(
 
 
 class _Watch:
-    """Finds the folder of a run that begins, and keeps which actuators have not confirmed their safe state."""
+    """Tells of steps that were not done before, and keeps which actuators have not confirmed their safe state."""
 
-    def __init__(self, directory: Path, recipe: str, begun: Callable[[Path], None]) -> None:
+    def __init__(self, done: Collection[str], step_done: Callable[[], None]) -> None:
         self.unsafe: list[str] = []
-        self._journals = f"*-{recipe}/{JOURNAL_NAME}"
-        self._directory = directory
-        self._known = set(directory.glob(self._journals))
-        self._begun: Callable[[Path], None] | None = begun
+        self._done = done
+        self._step_done = step_done
 
     def __call__(self, item: Item) -> None:
         if isinstance(item, Event) and item.kind == "not_confirmed_safe":
             self.unsafe.append(item.text)
-        if isinstance(item, StepMark) and self._begun is not None:  # the journal has been begun just before
-            begun, self._begun = self._begun, None
-            for journal in set(self._directory.glob(self._journals)) - self._known:
-                begun(journal.parent)
+        if isinstance(item, StepMark) and item.state is StepState.DONE and item.step_id not in self._done:
+            self._step_done()
 
 
 @contextmanager

@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
-from compensation.target import Target
-from drivers.documents import parse_document
 from drivers.interface import SessionError
 from experiments.steps import Capture, PlannedStep
 from stand.camera_cooling import Cooling
-from stand.config import StandConfig
 from stand.hub import StepState
 from stand.journal import Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
+from stand.order_files import parse_order
 from stand.recipe import Recipe
 from stand.recording.overview import glance
 from stand.recording.salvage import Salvaged, salvage_unfinished
@@ -136,17 +134,11 @@ def _order(session: Session, first: Begun) -> Order:
     texts = dict(session.attachments)
     if _text_hashes(texts) != first.texts:
         raise SessionError(f"{session.path}: the attached files are not those its run began with")
-    where = f"{session.path}: "
-    order = Order(
-        parse_document(texts["config.yaml"], StandConfig, f"{where}config.yaml"),
-        parse_document(texts["recipe.yaml"], Recipe, f"{where}recipe.yaml"),
-        texts["config.yaml"],
-        texts["recipe.yaml"],
-        texts["target.yaml"],
-    )
-    parse_document(order.target_text, Target, f"{where}target.yaml")
+    order = parse_order(texts, {name: f"{session.path}: {name}" for name in texts})
     if plan_hash(order.recipe.plan()) != first.plan:
-        raise SessionError(f"{where}this version of thermostand makes another plan of its recipe; begin a new run")
+        raise SessionError(
+            f"{session.path}: this version of thermostand makes another plan of its recipe; begin a new run"
+        )
     return order
 
 

@@ -25,10 +25,8 @@ from stand.tasks import cancelled, watched
 
 __all__ = ["Interrupted", "resume", "run_real", "run_virtual"]
 
-# Stand time that a simulator may be behind (a frame's time is the middle of its exposure) and ahead of what its killed
-# daemon has recorded.
-_ORPHAN_BEHIND_S, _ORPHAN_AHEAD_S = 10.0, 300.0
-_ORPHAN_TRIES, _ORPHAN_PAUSE_S = 40, 0.25  # real time that it takes to let go of its addresses
+# Real time that an orphaned simulator takes to answer, and to let go of its addresses.
+_ORPHAN_ANSWERS_S, _ORPHAN_TRIES, _ORPHAN_PAUSE_S = 5.0, 40, 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +37,7 @@ class _Job:
     out: Path
     seed: int | None
     watch: Callable[[Hub], None]
+    begun: Callable[[Path], None]
     before: Interruption | None = None
 
     async def salvaged(self) -> tuple[Salvaged, ...]:
@@ -62,22 +61,35 @@ class _Job:
         return self.before.info
 
 
-async def run_virtual(order: Order, out: Path, seed: int | None, watch: Callable[[Hub], None]) -> Path:
+def _nobody(_: Path) -> None:
+    """Is told of the session and does nothing."""
+
+
+async def run_virtual(
+    order: Order,
+    out: Path,
+    seed: int | None,
+    watch: Callable[[Hub], None],
+    begun: Callable[[Path], None] = _nobody,
+) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
-    The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start.
+    The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start;
+    `begun` is told the folder as soon as a run that is killed could be resumed in it.
     Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
     """
     simulation = order.config.simulation
     if simulation is None:
         raise ConfigError(f"{order.config.name}: virtual time needs a `simulation` section")
-    return await _run_virtual(_Job(order, out, seed, watch), seconds_ns(simulation.start.timestamp()))
+    return await _run_virtual(_Job(order, out, seed, watch, begun), seconds_ns(simulation.start.timestamp()))
 
 
-async def run_real(order: Order, out: Path, watch: Callable[[Hub], None]) -> Path:
+async def run_real(
+    order: Order, out: Path, watch: Callable[[Hub], None], begun: Callable[[Path], None] = _nobody
+) -> Path:
     """Run on the host's clock, against whatever answers at the configured addresses; else as run_virtual."""
     async with Stop() as stop:
-        return await _run(_Job(order, out, None, watch), WallClock(), None, stop)
+        return await _run(_Job(order, out, None, watch, begun), WallClock(), None, stop)
 
 
 async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0) -> Path:
@@ -87,7 +99,7 @@ async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s:
     `downtime_s` after the last recorded instant. SessionError when the host's clock is before that instant.
     """
     try:
-        job = _Job(before.order, before.directory.parent, before.seed, watch, before)
+        job = _Job(before.order, before.directory.parent, before.seed, watch, _nobody, before)
         if before.info.clock_source == "virtual":
             return await _run_virtual(job, before.last_ns + seconds_ns(downtime_s))
         clock = WallClock()
@@ -104,8 +116,7 @@ async def _run_virtual(job: _Job, start_ns: int) -> Path:
     async with Stop() as stop, AsyncExitStack() as stack:
         stack.enter_context(one_cpu())
         address = str(laboratory["control"])
-        tries = 1 if job.before is None else await _orphan_ended(address, job.before.last_ns, start_ns)
-        simulator = await _started(laboratory, tries)
+        simulator = await _started(laboratory, await _orphan_ended(address))
         stack.push_async_callback(asyncio.to_thread, simulator.stop)
         control = ControlSocket(address)
         stack.push_async_callback(control.close)
@@ -114,23 +125,18 @@ async def _run_virtual(job: _Job, start_ns: int) -> Path:
         return await _run(job, clock, clock.run, stop)
 
 
-async def _orphan_ended(address: str, last_ns: int, start_ns: int) -> int:
+async def _orphan_ended(address: str) -> int:
     """End the simulator that a killed daemon has left, which would go on for a minute and knows nothing of the time
-    since; one at another instant than this run's last or next is somebody else's. Returns how often to try to start a
-    new one."""
+    since. Returns how often to try to start a new one, which it keeps from its addresses until it is gone."""
     control = ControlSocket(address)
     try:
-        await control.open()
-        now_ns = (await control.request({"do": "state"}))["now_ns"]
-        first_ns, end_ns = last_ns - seconds_ns(_ORPHAN_BEHIND_S), start_ns + seconds_ns(_ORPHAN_AHEAD_S)
-        if isinstance(now_ns, int) and first_ns <= now_ns <= end_ns:
-            await control.request({"do": "quit"})
-            return _ORPHAN_TRIES
-    except Unreachable:
-        pass  # nobody is there, or is any more
+        async with asyncio.timeout(_ORPHAN_ANSWERS_S):
+            await control.open()
+            return _ORPHAN_TRIES if (await control.request({"do": "quit_if_orphaned"}))["quits"] else 1
+    except (Unreachable, TimeoutError, ValueError):
+        return 1  # nobody is there, or is any more, or no simulator: starting one will say so
     finally:
         await control.close()
-    return 1
 
 
 async def _started(laboratory: Mapping[str, object], tries: int) -> Simulator:
@@ -171,7 +177,8 @@ async def _run(job: _Job, clock: Clock, time: Callable[[], Coroutine[None, None,
         recorder = await _recording(job, directory, assembly, stop)
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording)
-        await perform(Performance(job.order, job.seed, job.before, assembly, recorder, stop, (*background, recording)))
+        tasks = (*background, recording)
+        await perform(Performance(job.order, job.seed, job.before, job.begun, assembly, recorder, stop, tasks))
     if recorder.frames_lost:
         raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
     return directory
@@ -200,12 +207,11 @@ async def _recording(job: _Job, directory: Path, assembly: Assembly, stop: Stop)
 
 
 async def _open(assembly: Assembly, *, camera_on: bool) -> None:
-    """Connect everything; heat and cold lose what permission somebody left them, the flap is closed and the camera
-    switched on before anything else may happen, but for a run that goes on with the camera off."""
+    """Connect everything; the flap is closed and the camera switched on before anything else may happen, but for a run
+    that goes on with the camera off."""
     devices = assembly.devices
     await assembly.bus.open()
     await devices.relays.open()
-    await assembly.stand.withdraw_permits()
     await devices.regulator.open()
     await devices.regulator.stop()
     await devices.thermometers.open()

@@ -2,7 +2,7 @@
 
 Prints `ready` when every fake answers; ends on SIGTERM, SIGINT or the control socket's `quit`; exits with 2 and one
 line when it cannot start. When whoever started it dies, it lives on for a minute, as a real laboratory would: long
-enough to see the heater's dead-man drop.
+enough to see the heater's dead-man drop; whoever needs its addresses may end it earlier (`quit_if_orphaned`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ _ORPHAN_LIMIT_S = 60
 
 def main() -> int:
     """Build the laboratory, serve it, take it down."""
-    stop = threading.Event()
+    stop, parent = threading.Event(), os.getppid()
+
+    def is_orphaned() -> bool:
+        return os.getppid() != parent
 
     def end(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -36,11 +39,11 @@ def main() -> int:
     except (ConfigError, OSError) as error:
         print(f"{error}", file=sys.stderr)  # noqa: T201 - the process' answer to who started it
         return 2
-    control = serve_control(laboratory, stop.set)
+    control = serve_control(laboratory, stop.set, is_orphaned)
     print("ready", flush=True)  # noqa: T201 - the process' answer to who started it
-    parent, orphaned_s = os.getppid(), 0
+    orphaned_s = 0
     while not stop.wait(1.0) and orphaned_s < _ORPHAN_LIMIT_S:
-        orphaned_s += os.getppid() != parent
+        orphaned_s += is_orphaned()
     control.close()
     laboratory.close()
     return 0

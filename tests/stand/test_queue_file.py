@@ -14,10 +14,11 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from drivers.interface import ConfigError, SessionError, StandTripped
 from stand import queue
+from stand.order_files import load_order
 from stand.queue_file import LAST_NAME, QUEUE_NAME, State, working
 from stand.session_setup import Order
 
-ORDER = queue.load_order("warm-up", "simulated")
+ORDER = load_order("warm-up", "simulated")
 
 
 def add(directory: Path, order: Order = ORDER) -> int:
@@ -134,7 +135,7 @@ TestQueueAgainstAList.settings = settings(max_examples=25, stateful_step_count=2
 def test_what_is_queued_is_what_the_files_were_when_they_were_added(tmp_path: Path):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("name: mine\nexperiments: [{warm_up: {}}]\n")
-    number = add(tmp_path, queue.load_order(str(recipe), "simulated"))
+    number = add(tmp_path, load_order(str(recipe), "simulated"))
     recipe.write_text("name: other\n")
     entry = queue.queued(tmp_path).entries[0]
     order = queue.order_of(entry)
@@ -153,7 +154,14 @@ def test_a_typo_is_told_when_a_recipe_is_added_not_at_night(tmp_path: Path, text
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(text)
     with pytest.raises(ConfigError, match=sentence):
-        queue.load_order(str(recipe), "simulated")
+        load_order(str(recipe), "simulated")
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path: Path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_bytes(b"name: \xff\xfe")
+    with pytest.raises(ConfigError, match=r"recipe\.yaml: cannot be read"):
+        load_order(str(recipe), "simulated")
 
 
 def test_what_this_version_refuses_is_named_with_its_run(tmp_path: Path):
@@ -217,7 +225,8 @@ ADDING = """
 import sys
 from pathlib import Path
 from stand import queue
-order = queue.load_order("warm-up", "simulated")
+from stand.order_files import load_order
+order = load_order("warm-up", "simulated")
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(20):

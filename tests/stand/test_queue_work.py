@@ -1,7 +1,9 @@
 """The queue is worked with runs that do as they are told."""
 
 import asyncio
-from collections.abc import Callable
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,11 +11,12 @@ import pytest
 from drivers.clock import FollowedClock
 from drivers.interface import DeviceFault, SessionError, StandTripped, Unreachable
 from stand import queue
+from stand.order_files import load_order
 from stand.queue_file import Entry, working
-from stand.queue_work import Halt, work
+from stand.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, work
 from stand.stop import Interrupted
 
-ORDER = queue.load_order("warm-up", "simulated")
+ORDER = load_order("warm-up", "simulated")
 
 
 class Runs:
@@ -28,11 +31,11 @@ class Runs:
         for _ in ends:
             queue.add(directory, ORDER, "simulated", 1)
 
-    async def run(self, entry: Entry, begun: Callable[[Path], None]) -> Path:
+    async def run(self, entry: Entry, notes: Notes) -> Path:
         self.seen.append((entry.id, entry.session))
         session = self.directory / f"session-{entry.id}"
         if self.session_first:
-            begun(session)
+            notes.begun(session)
         await asyncio.sleep(0)
         end = self.ends.pop(0)
         if end is not None:
@@ -60,7 +63,7 @@ async def test_all_that_is_queued_is_run_in_turn(tmp_path: Path):
 async def test_what_is_added_while_a_run_is_under_way_has_its_turn(tmp_path: Path):
     runs = Runs(tmp_path, None)
 
-    async def run(entry: Entry, begun: Callable[[Path], None]) -> Path:
+    async def run(entry: Entry, notes: Notes) -> Path:
         if entry.id == 1:
             queue.add(tmp_path, ORDER, "simulated", 1)
         return tmp_path / str(entry.id)
@@ -115,10 +118,10 @@ async def test_a_run_that_an_operator_stops_is_resumed_first_next_time(tmp_path:
 async def test_a_queue_that_cannot_be_noted_in_does_not_end_a_run(tmp_path: Path):
     runs = Runs(tmp_path, None)
 
-    async def run(entry: Entry, begun: Callable[[Path], None]) -> Path:
+    async def run(entry: Entry, notes: Notes) -> Path:
         good = (tmp_path / "queue.json").read_bytes()
         (tmp_path / "queue.json").write_bytes(b"")
-        begun(tmp_path / "night")
+        notes.begun(tmp_path / "night")
         (tmp_path / "queue.json").write_bytes(good)
         return tmp_path / "night"
 
@@ -131,3 +134,54 @@ async def test_a_second_worker_is_refused(tmp_path: Path):
     runs = Runs(tmp_path, None)
     with working(tmp_path), pytest.raises(SessionError, match="being worked already"):
         await runs.work()
+
+
+KILLED = """
+import asyncio, os, signal, sys
+from pathlib import Path
+from drivers.clock import WallClock
+from stand.queue_work import work
+
+async def run(entry, notes):
+    notes.begun(Path(sys.argv[1]) / "night")
+    for _ in range(int(sys.argv[2])):
+        notes.step_done()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+asyncio.run(work(Path(sys.argv[1]), run, WallClock(), print))
+"""
+
+
+def worker_killed(directory: Path, steps_done: int) -> None:
+    """A process that works the queue is killed when its run has finished so many steps."""
+    command = [sys.executable, "-c", KILLED, str(directory), str(steps_done)]
+    assert subprocess.run(command, check=False, timeout=60).returncode == -signal.SIGKILL
+
+
+async def test_a_run_whose_daemon_dies_three_times_before_another_step_is_set_aside(tmp_path: Path):
+    runs = Runs(tmp_path, None)
+    queue.add(tmp_path, ORDER, "simulated", 1)
+    for steps_done in (0, 0, 2, 0, 0, 0):  # what the third has done begins the count anew
+        worker_killed(tmp_path, steps_done)
+        assert runs.entries()[0] == ("interrupted", "night", "its daemon was killed")
+    await runs.work()
+    assert runs.seen == [(2, "")]
+    failed, done = runs.entries()
+    assert failed[:2] == ("failed", "night")
+    assert failed[2] == (
+        "its daemon was killed 3 times in a row before one more step was done; "
+        f"`stand resume {tmp_path / 'night'}` tries again"
+    )
+    assert done == ("done", "session-2", "")
+    assert runs.lines[0] == f"run 1 (warm-up) failed: {failed[2]}"
+
+
+async def test_an_operator_may_stop_a_run_as_often_as_he_likes(tmp_path: Path):
+    stops = [Interrupted("stopped; the stand is safe") for _ in range(MOST_FRUITLESS_STARTS + 1)]
+    runs = Runs(tmp_path, *stops)
+    for number in range(2, len(stops) + 1):
+        queue.remove(tmp_path, number)
+    for _ in stops:
+        with pytest.raises(Interrupted):
+            await runs.work()
+    assert [entry[0] for entry in runs.entries()] == ["interrupted"]

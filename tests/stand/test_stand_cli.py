@@ -8,7 +8,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from stand.cli import app
+from stand.commands import app
 from stand.config import packaged
 
 runner = CliRunner()

@@ -9,6 +9,8 @@ from pathlib import Path
 from experiments.steps import Capture
 from stand import queue
 from stand.hub import StepState
+from stand.order_files import load_order
+from stand.queue_work import MOST_FRUITLESS_STARTS
 from stand.recording.session import Session
 from tests.system.conftest import require_aravis
 
@@ -38,6 +40,14 @@ def kill_under_way(directory: Path) -> None:
     assert daemon.returncode == -signal.SIGKILL
 
 
+def kill_at_once(directory: Path) -> None:
+    """Start the queue and kill it when it has told that its run goes on."""
+    with subprocess.Popen([*COMMAND, str(directory)], stderr=subprocess.PIPE, text=True) as daemon:
+        assert daemon.stderr is not None
+        assert "goes on in" in daemon.stderr.readline()
+        daemon.kill()
+
+
 def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path, config_text: Callable[..., str]):
     require_aravis()
     config, recipe, out = tmp_path / "stand.yaml", tmp_path / "recipe.yaml", tmp_path / "sessions"
@@ -45,7 +55,7 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
     recipe.write_text(RECIPE)
     for name in ("queued", "second"):
         recipe.write_text(RECIPE.replace("name: queued", f"name: {name}"))
-        queue.add(out, queue.load_order(str(recipe), str(config)), str(config), 1)
+        queue.add(out, load_order(str(recipe), str(config)), str(config), 1)
     recipe.write_text("this is no recipe any more")
 
     kill_under_way(out)
@@ -65,3 +75,25 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
         assert session.frame_count == sum(captures.values()) == 4
         done = [step.step_id for step in session.steps() if step.state is StepState.DONE and step.kind == "Capture"]
         assert sorted(done) == sorted(captures)
+
+
+def test_a_run_that_dies_whenever_it_goes_on_makes_way_for_the_next(tmp_path: Path, config_text: Callable[..., str]):
+    require_aravis()
+    config, recipe, out = tmp_path / "stand.yaml", tmp_path / "recipe.yaml", tmp_path / "sessions"
+    config.write_text(config_text())
+    for name in ("queued", "second"):
+        recipe.write_text(RECIPE.replace("name: queued", f"name: {name}"))
+        queue.add(out, load_order(str(recipe), str(config)), str(config), 1)
+
+    kill_under_way(out)
+    for _ in range(MOST_FRUITLESS_STARTS):
+        kill_at_once(out)
+    ended = subprocess.run([*COMMAND, str(out)], capture_output=True, text=True, check=False, timeout=60)
+    assert ended.returncode == 0, ended.stderr
+    first, second = queue.queued(out).entries
+    assert (first.state, second.state) == ("failed", "done")
+    assert first.reason.startswith("its daemon was killed 3 times in a row before one more step was done")
+    assert Session.open(out / second.session).frame_count == 4
+    resumed = [sys.executable, "-m", "stand.cli", "resume", str(out / first.session)]
+    assert subprocess.run(resumed, capture_output=True, check=False, timeout=60).returncode == 0
+    assert Session.open(out / first.session).frame_count == 4

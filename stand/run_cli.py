@@ -1,0 +1,176 @@
+"""The commands that run a recipe: demo, run, resume."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import tempfile
+from collections.abc import Callable, Collection, Generator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated
+
+import typer
+
+from drivers.interface import ConfigError, SessionError
+from stand.config import StandConfig
+from stand.estimate import PricedStep, price
+from stand.exit_codes import INTERRUPTED, NOT_REPORTED, one_line_errors
+from stand.follow import Follow
+from stand.hub import Hub
+from stand.learned import learn, load_learned
+from stand.order_files import load_order
+from stand.progress import progress
+from stand.resume import interruption
+from stand.run import resume, run_real, run_virtual
+from stand.session_report import NotReported, check_reportable, report_session
+from stand.session_text import salvage_line
+from stand.stop import Interrupted
+from stand.usage import one_line, tell
+
+app = typer.Typer(add_completion=False)
+
+ReportOption = Annotated[
+    bool, typer.Option("--report", help="Then fit the drift: model.json and report.html, in the session's folder.")
+]
+
+
+@app.command()
+def demo(
+    out: Annotated[
+        Path, typer.Option(help="Where the session and the report go; numbered when there is a demo already.")
+    ] = Path("demo"),
+) -> None:
+    """Run a simulated thermal cycle, fit the drift, and print what compensation gains.
+
+    Example: stand demo --out /tmp/demo
+    """
+    with _run_errors():
+        order = load_order("demo", "simulated")
+        directory = _unused(out)
+        _check_writable(directory)
+        with _run_progress(price(order.recipe.plan(), order.config)) as watch:
+            session = asyncio.run(run_virtual(order, directory, None, watch))
+        typer.echo(f"session  {session}")
+        _report(session, directory)
+
+
+@app.command()
+def run(
+    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
+    config: Annotated[
+        str, typer.Option("--config", help="A configuration file, or the name of an installed one.")
+    ] = "simulated",
+    out: Annotated[Path | None, typer.Option(help="Where the session goes; else recording.directory.")] = None,
+    virtual_time: Annotated[
+        bool, typer.Option("--virtual-time", help="As fast as it goes, with a simulated laboratory of its own.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="The simulated laboratory's seed (with --virtual-time).")] = None,
+    report: ReportOption = False,
+) -> None:
+    """Run a recipe and record it; prints the session's folder.
+
+    Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions --report
+    """
+    with _run_errors():
+        if seed is not None and not virtual_time:
+            raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
+        if seed is not None and seed < 0:
+            raise ConfigError(f"--seed is 0 or more, not {seed}")
+        order = load_order(recipe, config)
+        if report:
+            check_reportable(order.recipe.plan())
+        directory = out or order.config.recording.directory
+        _check_writable(directory)
+        with _run_progress(price(order.recipe.plan(), order.config, load_learned(directory))) as watch:
+            work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
+            session = asyncio.run(work)
+        _finished(session, order.config, report=report)
+
+
+@app.command("resume")
+def resume_run(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="The session of a run that did not end.")],
+    clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
+    report: ReportOption = False,
+) -> None:
+    """Go on with a run that was killed or interrupted, in its session: what is done is not done again.
+
+    Example: stand resume sessions/20260101T180000Z-thermal-cycle
+    """
+    with _run_errors():
+        before = interruption(directory, clear=clear)
+        order = before.order
+        try:
+            if report:
+                check_reportable(order.recipe.plan())
+            for segment in before.salvaged:
+                typer.echo(salvage_line(segment), err=True)
+            steps = price(order.recipe.plan(), order.config, load_learned(before.directory.parent))
+        except BaseException:
+            before.release()
+            raise
+        with _run_progress(steps, before.progress.done, before.progress.earned_s) as watch:
+            session = asyncio.run(resume(before, watch))
+        _finished(session, order.config, report=report)
+
+
+def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
+    """What follows a complete run: the next plan's durations, its folder told, its report."""
+    try:
+        learn(session.parent, config)
+    except (SessionError, OSError) as error:  # what cannot be kept is no reason for a run to fail
+        typer.echo(f"warning: {one_line(error)}", err=True)
+    typer.echo(session)
+    if report:
+        _report(session, session)
+
+
+def _report(session: Path, folder: Path) -> None:
+    """Show the report's lines; status NOT_REPORTED when there is none: the run itself has gone well."""
+    try:
+        for line in report_session(session, folder):
+            typer.echo(line)
+    except NotReported as error:
+        tell(error)
+        raise typer.Exit(NOT_REPORTED) from error
+
+
+def _unused(out: Path) -> Path:
+    """`out`, or `out-2`, `out-3` ... when it exists: a second demo never touches the first."""
+    if not out.name:
+        raise ConfigError(f"--out {out}: a demo needs a folder of its own name")
+    candidates = (out.with_name(f"{out.name}-{number}") for number in itertools.count(2))
+    return out if not out.exists() else next(path for path in candidates if not path.exists())
+
+
+def _check_writable(directory: Path) -> None:
+    """ConfigError when no session could be made below `directory`: to be told before anything is opened."""
+    try:
+        places = (directory, *directory.absolute().parents)
+        existing = next(path for path in places if path.exists() or path.is_symlink())
+        Path(tempfile.mkdtemp(prefix=".writable-", dir=existing)).rmdir()
+    except OSError as error:
+        raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error
+
+
+@contextmanager
+def _run_progress(
+    steps: tuple[PricedStep, ...], done: Collection[str] = (), earned_s: Mapping[str, float] = MappingProxyType({})
+) -> Generator[Callable[[Hub], None]]:
+    """Progress in expected seconds of the plan, the time left as the run goes; warnings and errors as they come."""
+    with progress("run", sum(step.duration_s for step in steps)) as report:
+        follow = Follow(steps, report, lambda line: typer.echo(line, err=True), done, earned_s)
+        yield lambda hub: hub.subscribe(follow)
+
+
+@contextmanager
+def _run_errors() -> Generator[None]:
+    """As every error; an interrupted run says whether the stand is safe."""
+    with one_line_errors():
+        try:
+            yield
+        except Interrupted as error:
+            typer.echo(one_line(error), err=True)
+            raise typer.Exit(INTERRUPTED) from error
