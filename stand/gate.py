@@ -14,6 +14,7 @@ INTERLOCK = "interlock"  # the guard has made the chamber safe; only an operator
 CAMERA_LOST = "camera_lost"  # until it answers again
 DISK_LOW = "disk_low"  # until frames can be recorded again
 NOT_RECORDED = "not_recorded"  # until the disk takes telemetry again
+STOPPING = "stopping"  # the run is being ended; nobody clears it
 
 
 class Gate:

@@ -209,6 +209,7 @@ class Scheduler:
                 for soak in set_up.soaks:
                     if soak != planned:
                         await self._dwell(soak)
+                await self._stand.gate.passed()
                 if restored and set_up.flap_open and not self._disturbed:
                     await self._stand.open_flap()
                     restored = False
@@ -223,10 +224,13 @@ class Scheduler:
         stand = self._stand
         await stand.close_flap()
         for axis, position in set_up.positions.items():
+            await stand.gate.passed()
             await stand.move_to(axis, position)
+        await stand.gate.passed()
         if not set_up.camera_on:
             await stand.power_camera(on=False)
         if set_up.chamber_degC is not None:
+            await stand.gate.passed()
             await self._credit_soaks(set_up, set_up.chamber_degC)
             await stand.start_chamber(set_up.chamber_degC)
         self._tell("info", "restored", set_up.text)

@@ -17,7 +17,7 @@ from drivers.stage import Axis
 from drivers.thermometers import Thermometers
 from stand.camera_cooling import Cooling, cool_down, last_word
 from stand.compressor import CompressorLimits, CompressorState, decide, keep, restored
-from stand.gate import CAMERA_LOST, INTERLOCK, Gate
+from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
 from stand.stage_care import check_home, ready
@@ -76,8 +76,9 @@ class Stand:
         self.unconfirmed: tuple[str, ...] = ()  # what the last make_safe could not confirm
 
     def latch(self, fault: Fault) -> None:
-        """Close the gate until an operator clears it; the first fault stays."""
+        """Close the gate for good; the first fault stays. Nothing earns time while the stand is being made safe."""
         self.fault = self.fault or fault
+        self.gate.hold(STOPPING)
         self._permitted = False
 
     async def start_chamber(self, chamber_degC: float) -> None:

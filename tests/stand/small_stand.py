@@ -1,0 +1,219 @@
+"""A stand in memory, for the scheduler alone: a chamber, a flap, a camera and a disk, on a clock that goes on only
+while it is led. Each action takes a second; what is not allowed is noted in `wrong`."""
+
+import asyncio
+from collections import Counter
+from pathlib import Path
+
+from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
+from drivers.interface import Frame, Reading, StandTripped, Unreachable
+from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
+from stand.hub import Batch, Hub, StepMark, StepState
+from stand.journal import JOURNAL_NAME, Journal
+from stand.resume import journaled
+from stand.scheduler import Progress, Scheduler
+from stand.stand import Interlocked
+from stand.stop import Stop
+
+COMMIT_S = 0.2  # what the disk takes to have all that was published
+COMMIT_EVERY_S = 1.0  # and what was published before that, it has in any case
+
+
+class SmallStand:
+    """As stand.stand.Stand towards the scheduler. broken: the next action fails; camera_back_ns: until then it is
+    lost."""
+
+    def __init__(self, clock, hub, wrong):
+        self.gate = Gate()
+        self.fault = None
+        self.unconfirmed = ()
+        self.safe = self.heating = self.flap_open = self.broken = False
+        self.camera_back_ns = 0
+        self.started_at_degC = None  # what the chamber was at when it was last set going, None after a new set-point
+        self.set_ns = 0  # when that was
+        self._clock, self._hub, self._wrong = clock, hub, wrong
+        self._making_safe = asyncio.Lock()
+
+    def latch(self, fault):
+        self.fault = self.fault or fault
+        self.gate.hold(STOPPING)
+
+    async def _act(self, what):
+        if self.gate.reasons - {CAMERA_LOST, INTERLOCK, STOPPING}:
+            self._wrong.append(f"{what} while held by {sorted(self.gate.reasons)}")
+        self._check()
+        self.safe = False
+        await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
+        self._check()
+
+    def _check(self):
+        if self.fault is not None:
+            raise StandTripped("latched")
+        if INTERLOCK in self.gate.reasons:
+            raise Interlocked("held")
+        if self.broken:
+            self.broken = False
+            raise Unreachable("flap", "unplugged")
+
+    async def start_chamber(self, chamber_degC):
+        await self._act("start_chamber")
+        self.heating, self.set_ns = True, self._clock.now_ns()
+        self.started_at_degC = self._hub.latest("regulator.pv").value
+
+    async def set_temperature(self, chamber_degC):
+        await self._act("set_temperature")
+        self.started_at_degC, self.set_ns = None, self._clock.now_ns()
+
+    async def stop_chamber(self):
+        await self._act("stop_chamber")
+        self.heating = False
+
+    async def open_flap(self):
+        await self._act("open_flap")
+        self.flap_open = True
+
+    async def close_flap(self):
+        self.flap_open = False
+
+    async def approach_again(self):
+        self._check()
+
+    async def take_frame(self, exposure_s, step_id, due_ns):
+        try:
+            await self._act("take_frame")
+            while self._clock.now_ns() < self.camera_back_ns:
+                self.gate.hold(CAMERA_LOST)
+                await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
+                self._check()
+        finally:
+            self.gate.clear(CAMERA_LOST)
+        if not (self.flap_open and self.heating):
+            self._wrong.append("a frame of a stand that is not set up")
+        self._hub.publish(Frame("camera.image", None, self._clock.now_ns(), exposure_s, 0.0, 40.0, 1, 1, 0, step_id))
+
+    async def make_safe(self):
+        async with self._making_safe:
+            self.heating = self.flap_open = False
+            await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
+            self.heating = self.flap_open = False
+            self.safe = True
+
+
+class Life:
+    """One daemon, from its start to its death; what it leaves is in `folder`, and what it recorded in `disk`."""
+
+    def __init__(self, folder: Path, plan, start_ns, disk, chamber_degC):
+        self.loop = asyncio.new_event_loop()
+        self.wrong = []
+        self.hub, self.clock = Hub(), VirtualClock(start_ns)
+        self.stop = Stop()
+        self.stand = SmallStand(self.clock, self.hub, self.wrong)
+        self.stand.gate.subscribe(self._on_gate)
+        self.hub.subscribe(self._on_item)
+        self.begun = 0  # steps
+        self.interlocks = 0
+        self.cancelled_before_safe = False
+        self._open_since_ns, self._open_ns = start_ns, 0
+        self._plan, self._journal_path = plan, folder / JOURNAL_NAME
+        self._disk, self._unsaved = disk, []
+        self._resumes = self._journal_path.exists()
+        self.publish_pv(chamber_degC)
+        self._do(self._begin(folder))
+
+    async def _begin(self, folder):
+        progress = None
+        if self._resumes:
+            self._journal, entries = Journal.open(folder)
+            done, earned_s = journaled(entries)
+            marks = [item for item in self._disk if isinstance(item, StepMark)]
+            done |= {mark.step_id for mark in marks if mark.state is StepState.DONE}
+            progress = Progress(done, earned_s, Counter(i.step_id for i in self._disk if isinstance(i, Frame)))
+        else:
+            self._journal = Journal.create(folder)
+        self._journal.start(self.clock, self.wrong.append)
+        scheduler = Scheduler(self.stand, self.hub, self.clock, self._journal, self._flushed, progress)
+        self._time = asyncio.create_task(self.clock.run())
+        self.run = asyncio.create_task(self._run(scheduler))
+
+    async def _run(self, scheduler):
+        """As a performance has it."""
+        async with self.stop:
+            self.stop.watch(self.stand)
+            self.stop.started()
+            try:
+                await scheduler.run(self._plan)
+            except asyncio.CancelledError:
+                self.cancelled_before_safe = not self.stand.safe
+                raise
+            finally:
+                self.stop.taking_down()
+                await self.stand.make_safe()
+                self.stop.ended()
+                await self.stop.settled()
+
+    async def _flushed(self):
+        published = len(self._unsaved)
+        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(COMMIT_S))
+        self._disk.extend(self._unsaved[:published])
+        del self._unsaved[:published]
+
+    def _do(self, work):
+        return self.loop.run_until_complete(work)
+
+    def passes(self, duration_s):
+        """Let time go on; whatever is to happen meanwhile happens."""
+        self._do(self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s)))
+
+    def call(self, action):
+        """`action()` within the daemon."""
+
+        async def work():
+            return action()
+
+        return self._do(work())
+
+    def publish_pv(self, pv_degC):
+        reading = Reading("regulator.pv", pv_degC, "degC", self.clock.now_ns())
+        self.hub.publish(Batch("regulator", self.clock.now_ns(), (reading,)))
+
+    def interlock(self):
+        """As the guard does: hold, then make safe; the run waits."""
+        safe = []
+        self.call(lambda: (self.stand.gate.hold(INTERLOCK), safe.append(asyncio.create_task(self.stand.make_safe()))))
+        self._do(safe[0])
+
+    def kill(self):
+        """Nothing that happens from now on, here the end of its tasks, reaches the disk. The next life begins then."""
+        now_ns, journal = self.clock.now_ns(), self._journal_path.read_bytes()
+        self._disk.extend(item for item in self._unsaved if item.time_ns <= now_ns - seconds_ns(COMMIT_EVERY_S))
+        self._disk = []
+        self.call(self._cancel)
+        self.passes(30.0)
+        self._time.cancel()
+        self._do(asyncio.gather(self._time, self.run, return_exceptions=True))
+        self._do(self._journal.close())
+        self.loop.close()
+        self._journal_path.write_bytes(journal)
+        return now_ns
+
+    def _cancel(self):
+        self.stop.taking_down()
+        self.run.cancel()
+
+    def open_s(self):
+        """How long nothing has held the run, in all."""
+        since_ns = self.clock.now_ns() if self.stand.gate.reasons else self._open_since_ns
+        return (self._open_ns + self.clock.now_ns() - since_ns) / NS_PER_S
+
+    def _on_gate(self, reason, held):
+        self.interlocks += held and reason == INTERLOCK
+        if held and len(self.stand.gate.reasons) == 1:
+            self._open_ns += self.clock.now_ns() - self._open_since_ns
+        elif not self.stand.gate.reasons:
+            self._open_since_ns = self.clock.now_ns()
+
+    def _on_item(self, item):
+        if isinstance(item, StepMark):
+            self.begun += item.state is StepState.STARTED
+        if isinstance(item, StepMark | Frame):
+            self._unsaved.append(item)
