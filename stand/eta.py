@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from drivers.clock import NS_PER_S
 from stand.estimate import PricedStep
-from stand.hub import StepMark, StepState
+from stand.hub import Event, StepMark, StepState
 
 _REMEMBERED = 9  # the last measurements of a kind of work count
 
@@ -41,6 +41,7 @@ class Eta:
         self._seen_s = {work: deque([usual_s], _REMEMBERED) for work, usual_s in self._overhead_s.items()}
         self._running: PricedStep | None = None
         self._begun_ns = 0
+        self._reasons: set[str] = set()
         self._held_since_ns: int | None = None
         self._held_ns = 0  # of the running step
 
@@ -57,16 +58,16 @@ class Eta:
             seen_s.append(self._progress_s(mark.time_ns) - running.stated_s)
             self._overhead_s[running.work] = median_low(seen_s)
 
-    def hold(self, time_ns: int) -> None:
-        """The run is paused: the running step makes no progress."""
-        if self._held_since_ns is None:
-            self._held_since_ns = time_ns
-
-    def release(self, time_ns: int) -> None:
-        """The run goes on."""
-        if self._held_since_ns is not None:
-            self._held_ns += time_ns - self._held_since_ns
-            self._held_since_ns = None
+    def event(self, event: Event) -> None:
+        """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further."""
+        if event.kind == "held":
+            self._held_since_ns = event.time_ns if self._held_since_ns is None else self._held_since_ns
+            self._reasons.add(event.text)
+        elif event.kind == "released":
+            self._reasons.discard(event.text)
+            if self._held_since_ns is not None and not self._reasons:
+                self._held_ns += event.time_ns - self._held_since_ns
+                self._held_since_ns = None
 
     def left_s(self, now_ns: int) -> float:
         """From `now_ns` until the plan is done, s; a pause that is under way is taken to end now."""

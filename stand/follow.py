@@ -43,6 +43,7 @@ class Follow:
     def __call__(self, item: Item) -> None:
         """Follow one item."""
         if isinstance(item, Event):
+            self.eta.event(item)
             if item.level != "info":
                 self._warn(f"{item.level}: {date_time(item.time_ns)[11:]} UTC {item.text}")
             return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.clock import Clock
-from stand.gate import INTERLOCK
+from stand.gate import INTERLOCK, STOPPING
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
 from stand.journal import Cleared, Ended, Entry, Held, Journal, Tripped
@@ -38,7 +38,9 @@ class Logbook:
         self._note(Tripped(self._clock.now_ns(), fault.rule, fault.text))
 
     def held(self, reason: str, held: bool) -> None:
-        """A listener of the gate."""
+        """A listener of the gate; the end of a run is told by itself."""
+        if reason == STOPPING:
+            return
         self.tell("warning" if held else "info", "held" if held else "released", reason)
         now_ns = self._clock.now_ns()
         if reason == INTERLOCK and not held:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
+import os
 import platform
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,7 +15,6 @@ from compensation.markers.windows import marker_windows
 from compensation.target import Target
 from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.documents import parse_document
-from drivers.interface import ConfigError
 from stand.assembly import Assembly
 from stand.config import StandConfig
 from stand.recipe import Recipe
@@ -38,12 +39,12 @@ class Order:
 
 
 def session_directory(out: Path, order: Order, clock: Clock) -> Path:
-    """The session's folder below `out`, named for the instant and the recipe; ConfigError when it exists already."""
+    """A new folder for the session below `out`, named for the instant and the recipe; `-2`, `-3` ... when there is one
+    already: in virtual time every run of a recipe begins at the same instant."""
     started = datetime.fromtimestamp(clock.now_ns() / NS_PER_S, UTC)
-    directory = out / f"{started:%Y%m%dT%H%M%SZ}-{order.recipe.name}"
-    if directory.exists():
-        raise ConfigError(f"{directory}: this session exists already; choose another --out or move it away")
-    return directory
+    name = f"{started:%Y%m%dT%H%M%SZ}-{order.recipe.name}"
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(directory for directory in map(out.joinpath, names) if not os.path.lexists(directory))
 
 
 def info_of(order: Order, directory: Path, assembly: Assembly) -> SessionInfo:

@@ -63,8 +63,9 @@ class StatusBoard:
                 self._eta.mark(item)
                 self._step = item.index + 1
                 self._doing = f"{item.kind} {parameters_text(item.parameters)}".rstrip()
-            case Event() if item.level != "info":
-                self._warning = item.text
+            case Event():
+                self._eta.event(item)
+                self._warning = self._warning if item.level == "info" else item.text
             case Batch():
                 for reading in item.readings:
                     if reading.unit == "degC":
@@ -96,14 +97,8 @@ class StatusBoard:
 
     def _follow_state(self) -> None:
         state = _STATES[self._stop.phase]
-        if state == self._state:
-            return
-        now_ns = self._clock.now_ns()
-        if state == "held":
-            self._eta.hold(now_ns)
-        else:
-            self._eta.release(now_ns)
-        self._state, self._since_ns = state, now_ns
+        if state != self._state:
+            self._state, self._since_ns = state, self._clock.now_ns()
 
 
 def _free_bytes(recorder: Recorder) -> int:

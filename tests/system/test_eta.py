@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from drivers.clock import NS_PER_S
+from experiments.steps import Soak
 from stand.config import packaged
 from stand.estimate import price
 from stand.follow import Follow
-from stand.hub import Batch, Hub, Item, StepMark, StepState
+from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
 from stand.learned import learn
 from stand.recording.session import Session
 from stand.run import run_virtual
@@ -74,3 +75,26 @@ async def test_the_time_left_is_true_over_the_whole_demo_night(tmp_path: Path, o
     session, left = await followed(order(packaged("recipes", "demo").read_text()), tmp_path)
     assert len(left) > 10_000
     assert worst_share(left, session) < 0.05
+
+
+def test_the_console_shows_no_time_gained_in_a_pause(order: Callable[..., Order]):
+    ordered, texts, shares = order(), list[str](), list[float]()
+
+    def report(done: float, text: str) -> None:
+        texts.append(text)
+        shares.append(done)
+
+    steps = price(ordered.recipe.plan(), ordered.config)
+    follow = Follow(steps, report, lambda line: None)
+    soak = next(step.planned for step in steps if isinstance(step.planned.step, Soak))
+    follow(StepMark(0, soak.step_id, soak.index, "Soak", StepState.STARTED))
+    follow(Event(100 * NS_PER_S, "warning", "held", "operator"))
+    follow(Batch("regulator", 100 * NS_PER_S, ()))
+    left_s = follow.eta.left_s(100 * NS_PER_S)
+    follow(Batch("regulator", 4000 * NS_PER_S, ()))
+    assert follow.eta.left_s(4000 * NS_PER_S) == left_s
+    assert texts[-1].split("(")[1] == texts[-2].split("(")[1]  # as much stand time as at its beginning
+    follow(Event(4000 * NS_PER_S, "info", "released", "operator"))
+    follow(Batch("regulator", 4050 * NS_PER_S, ()))
+    assert follow.eta.left_s(4050 * NS_PER_S) == left_s - 50
+    assert shares[-1] > shares[-2]

@@ -279,6 +279,10 @@ async def test_an_existing_session_is_never_overwritten(tmp_path: Path, order: C
     ordered = order()
     taken = tmp_path / "out" / "20260101T180000Z-short"
     taken.mkdir(parents=True)
-    with pytest.raises(ConfigError, match="exists already"):
-        await run_virtual(ordered, tmp_path / "out", None, ignore)
+    (tmp_path / "out" / "20260101T180000Z-short-2").symlink_to("nowhere")
+    watch = at_step("MoveTo", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):
+        await run_virtual(ordered, tmp_path / "out", None, watch)
     assert not list(taken.iterdir())
+    session = Session.open(tmp_path / "out" / "20260101T180000Z-short-3")
+    assert session.metadata["session_id"] == session.path.name
