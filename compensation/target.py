@@ -1,7 +1,12 @@
 """The calibration target: what is printed on it and in which order its markers are numbered.
 
 Object frame: X to the right along the rows, Y up along the columns, mm, origin at marker 1. Marker 1 is bottom left;
-numbering runs along a row (the long side), then up. Arrays hold marker n at index n - 1.
+numbering runs along a row, then up. Arrays hold marker n at index n - 1.
+
+    square              staggered
+    7  8  9             7  8  9
+    4  5  6              4  5  6
+    1  2  3             1  2  3
 """
 
 from __future__ import annotations
@@ -32,13 +37,16 @@ class OddMarker(Document):
 class Target(Document):
     """A grid of round markers, read from configs/targets/*.yaml.
 
-    columns: markers in a row, the long side. polarity: discs darker or lighter than the ground. cmm_mm: measured
-    centres (X, Y) in mm, marker 1 first, in the object frame. nominal_roll_deg: counter-clockwise angle of the rows in
-    the image as the target is mounted; decides between the orientations a symmetrical grid leaves open.
-    minimum_markers: identification is refused below this count (default three quarters of the markers).
+    layout: in a staggered grid (OpenCV's asymmetric one) every second row is half a pitch further to the right, and
+    rows are half a pitch apart. columns: markers in a row; the long side of a square grid. pitch_mm: between
+    neighbours in a row. polarity: discs darker or lighter than the ground. cmm_mm: measured centres (X, Y) in mm,
+    marker 1 first, in the object frame. nominal_roll_deg: counter-clockwise angle of the rows in the image as the
+    target is mounted; decides between the orientations a symmetrical grid leaves open. minimum_markers: identification
+    is refused below this count (default three quarters of the markers).
     """
 
     name: str
+    layout: Literal["square", "staggered"] = "square"
     columns: Annotated[int, Field(ge=3)]
     rows: Annotated[int, Field(ge=3)]
     pitch_mm: Positive
@@ -51,9 +59,9 @@ class Target(Document):
 
     @model_validator(mode="after")
     def _consistent(self) -> Target:
-        if self.columns < self.rows:
+        if self.layout == "square" and self.columns < self.rows:
             raise ValueError(f"columns is the long side, found {self.columns} columns and {self.rows} rows")
-        if self.diameter_mm >= self.pitch_mm:
+        if self.diameter_mm >= self.spacing_mm:
             raise ValueError(f"discs of {self.diameter_mm} mm overlap at a pitch of {self.pitch_mm} mm")
         if self.odd_marker is not None:
             self._check_odd_marker(self.odd_marker)
@@ -69,7 +77,7 @@ class Target(Document):
         ratio = odd.diameter_mm / self.diameter_mm
         if 0.75 < ratio < 1.33:
             raise ValueError(f"odd_marker.diameter_mm differs too little from diameter_mm (ratio {ratio:.2f})")
-        if odd.diameter_mm + self.diameter_mm >= 2 * self.pitch_mm:
+        if odd.diameter_mm + self.diameter_mm >= 2 * self.spacing_mm:
             raise ValueError(f"the odd marker of {odd.diameter_mm} mm overlaps its neighbours")
 
     def _check_cmm(self, cmm_mm: tuple[tuple[float, float], ...]) -> None:
@@ -77,7 +85,7 @@ class Target(Document):
             raise ValueError(f"cmm_mm lists {len(cmm_mm)} centres, but the target has {self.count} markers")
         off_mm = np.linalg.norm(np.array(cmm_mm) - self.nominal_mm(), axis=1)
         worst = int(np.argmax(off_mm))
-        if off_mm[worst] > _CMM_TOLERANCE * self.pitch_mm:
+        if off_mm[worst] > _CMM_TOLERANCE * self.spacing_mm:
             raise ValueError(
                 f"cmm_mm puts marker {worst + 1} {off_mm[worst]:.3g} mm from its nominal place: wrong order or unit?"
             )
@@ -92,10 +100,27 @@ class Target(Document):
         """How many markers must be found before the target counts as identified."""
         return self.minimum_markers if self.minimum_markers is not None else math.ceil(0.75 * self.count)
 
+    @property
+    def spacing_mm(self) -> float:
+        """Between nearest neighbours, centre to centre."""
+        return self.pitch_mm * (math.sqrt(0.5) if self.layout == "staggered" else 1.0)
+
     def nominal_mm(self) -> NDArray[np.float64]:
         """Printed centres (N, 2), X and Y in mm, marker 1 at (0, 0)."""
         row, column = np.divmod(np.arange(self.count), self.columns)
+        if self.layout == "staggered":
+            return np.stack([column + row % 2 / 2, row / 2], axis=1) * self.pitch_mm
         return np.stack([column, row], axis=1) * self.pitch_mm
+
+    def cells(self) -> NDArray[np.intp]:
+        """Each marker's place (N, 2) on the square lattice of nearest neighbours, counter-clockwise axes: along rows
+        and columns, or, staggered, along the diagonals up right and up left.
+        """
+        row, column = np.divmod(np.arange(self.count), self.columns)
+        if self.layout == "staggered":
+            across = 2 * column + row % 2
+            return np.stack([(across + row) // 2, (row - across) // 2], axis=1)
+        return np.stack([column, row], axis=1)
 
     def coordinates_mm(self) -> NDArray[np.float64]:
         """Centres (N, 2), X right and Y up in mm: the CMM's where the file has them, else the nominal ones."""

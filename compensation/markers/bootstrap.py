@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from compensation.markers.noise import Image, full_scale_DN
 from compensation.target import Target
@@ -20,6 +21,8 @@ _CELLS_PER_DISC = 9.5
 """The surroundings are looked at on a coarse grid with about this many cells across the largest disc."""
 _LEAST_CONTRAST = 15 / 255
 _LEAST_SIDE_PX = 4
+_ENOUGH_PX = 12
+"""Across the smallest disc that is looked for: images with more are reduced, which takes a fifth of the time."""
 _GREATEST_ASPECT = 3.2
 _NEIGHBOUR_AREA_RATIO = 1.6
 
@@ -42,9 +45,8 @@ def disc_sizes_px(target: Target, shape: tuple[int, int]) -> Iterator[float]:
     the frame, then halves of it down to the smallest discs that can be found.
     """
     height, width = shape
-    ratio = target.pitch_mm / target.diameter_mm
-    longest, shortest = (target.columns - 1) * ratio + 1, (target.rows - 1) * ratio + 1
-    size = 1.25 * max(min(width / longest, height / shortest), min(height / longest, width / shortest))
+    shortest, longest = np.sort(np.ptp(target.nominal_mm(), axis=0)) / target.diameter_mm + 1
+    size = 1.25 * float(max(min(width / longest, height / shortest), min(height / longest, width / shortest)))
     while size > 1.5 * _LEAST_SIDE_PX:
         yield size
         size /= 2
@@ -54,9 +56,23 @@ def find_candidates(image: Image, target: Target, size_px: float) -> Candidates:
     """Ellipses between about a quarter of `size_px` and `size_px` across; an odd marker may be larger or smaller."""
     odd = target.odd_marker.diameter_mm / target.diameter_mm if target.odd_marker else 1.0
     largest, smallest = size_px * max(odd, 1.0), max(size_px / 4 * min(odd, 1.0), _LEAST_SIDE_PX)
-    inside = _darker_than_around(image if target.polarity == "dark" else ~image, largest, full_scale_DN(image))
-    found = _ellipses(inside, smallest, largest)
-    return _like_neighbours(found, odd**2)
+    factor = max(1, int(smallest / _ENOUGH_PX))
+    coarse = _reduced(image, factor)
+    dark = coarse if target.polarity == "dark" else ~coarse
+    inside = _darker_than_around(dark, largest / factor, full_scale_DN(image))
+    found = _ellipses(inside, smallest / factor, largest / factor)
+    # Pixel k of the coarse image covers k factor - 0.5 .. (k + 1) factor - 0.5 of the image.
+    centres_px = (found.centres_px + 0.5) * factor - 0.5
+    return _like_neighbours(Candidates(centres_px, found.areas_px2 * factor**2), odd**2)
+
+
+def _reduced(image: Image, factor: int) -> Image:
+    """Means over factor x factor pixels; what does not fill a whole one at the right and bottom is left out."""
+    if factor == 1:
+        return image
+    height, width = (side // factor for side in image.shape)
+    whole = image[: height * factor, : width * factor]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)  # pyright: ignore[reportReturnType] - type kept
 
 
 def _darker_than_around(image: Image, largest_px: float, full_scale: int) -> NDArray[np.uint8]:
@@ -106,8 +122,7 @@ def _like_neighbours(found: Candidates, odd_area_ratio: float) -> Candidates:
     """Without those whose area differs from the median of their 8 neighbours and from the odd marker's."""
     if len(found) < 9:
         return found
-    away = np.linalg.norm(found.centres_px[:, None] - found.centres_px[None], axis=2)
-    nearest = np.argsort(away, axis=1)[:, 1:9]
+    nearest = np.asarray(KDTree(found.centres_px).query(found.centres_px, 9)[1], dtype=np.intp)[:, 1:]
     ratio = found.areas_px2 / np.median(found.areas_px2[nearest], axis=1)
     keep = np.abs(np.log(ratio)) < np.log(_NEIGHBOUR_AREA_RATIO)
     keep |= np.abs(np.log(ratio / odd_area_ratio)) < np.log(_NEIGHBOUR_AREA_RATIO)

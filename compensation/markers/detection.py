@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from compensation.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
 from compensation.markers.edge_fit import EdgeFit, Flag, fit_edges
 from compensation.markers.edge_model import B0, CX, CY, F0, M11, M12, M22, SIGMA, EdgeState
-from compensation.markers.grid import DetectionError, Identified, fit_homography, identify, pitch_px
+from compensation.markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px
 from compensation.markers.noise import Image, Noise
 from compensation.target import Target
 
@@ -252,7 +252,8 @@ def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.
 def _in_its_place(state: EdgeState, homography: Float, target: Target, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Whether each ellipse has about the place and the size that the other markers imply."""
     expected = _expected_edges(homography, target)
-    off = np.linalg.norm(state.centres_px() - expected.centres_px(), axis=1)
+    known = np.where(good[:, None], state.centres_px(), np.nan)
+    off = np.linalg.norm(state.centres_px() - expected_px(target.coordinates_mm(), known, homography), axis=1)
     ratio = state.radii_px() / expected.radii_px()
     ratio = ratio / np.median(ratio[good])
     near = off < _PLACE_TOLERANCE_PITCH * pitch_px(homography, target)

@@ -6,16 +6,21 @@ lens distortion.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 _STEP_TOLERANCE = 0.22
 """A neighbour lies this close, in steps, to where the steps before predict it."""
 _CURVATURE = 0.8
+_NEIGHBOURS = 24
+"""The next marker is among a marker's nearest so many, also at a slant and with clutter between."""
 
 Float = NDArray[np.float64]
+Index = NDArray[np.intp]
 Cell = tuple[int, int]
 
 
@@ -25,10 +30,11 @@ def largest_lattice(points: Float, count: int) -> dict[Cell, int]:
     tried: set[int] = set()
     if len(points) < 4:
         return best
+    near: Index = np.asarray(KDTree(points).query(points, min(_NEIGHBOURS, len(points)))[1], dtype=np.intp)
     for seed in np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=1)):
         if int(seed) in tried:
             continue
-        lattice = _grow(points, int(seed))
+        lattice = _grow(points, near, int(seed))
         if len(lattice) > 3:
             tried.update(lattice.values())
         if len(lattice) > len(best):
@@ -38,14 +44,13 @@ def largest_lattice(points: Float, count: int) -> dict[Cell, int]:
     return best
 
 
-def _grow(points: Float, seed: int) -> dict[Cell, int]:
+def _grow(points: Float, near: Index, seed: int) -> dict[Cell, int]:
     """The lattice around a seed, empty when the seed has no two neighbours to begin with."""
-    base = _lattice_vectors(points, seed)
+    base = _lattice_vectors(points, near[seed])
     cells: dict[Cell, int] = {(0, 0): seed}
     if base is None:
         return {}
     used = {seed}
-    came_by: dict[tuple[Cell, Cell], Float] = {}
     queue = deque([(0, 0)])
     while queue:
         cell = queue.popleft()
@@ -53,25 +58,28 @@ def _grow(points: Float, seed: int) -> dict[Cell, int]:
             beyond = (cell[0] + direction[0], cell[1] + direction[1])
             if beyond in cells:
                 continue
-            step = _predicted_step(cell, direction, base, cells, came_by, points)
-            place = points[cells[cell]] + step
-            away = np.hypot(points[:, 0] - place[0], points[:, 1] - place[1])
-            nearest = int(np.argmin(away))
-            if nearest in used or away[nearest] > _STEP_TOLERANCE * np.hypot(step[0], step[1]):
+            step = _predicted_step(cell, direction, base, cells, points)
+            found = _nearest(points, near[cells[cell]], points[cells[cell]] + step)
+            if found in used or math.dist(points[found], points[cells[cell]] + step) > _STEP_TOLERANCE * math.hypot(
+                *step
+            ):
                 continue
-            cells[beyond] = nearest
-            used.add(nearest)
-            came_by[beyond, direction] = points[nearest] - points[cells[cell]]
+            cells[beyond] = found
+            used.add(found)
             queue.append(beyond)
     return cells
 
 
-def _lattice_vectors(points: Float, seed: int) -> tuple[Float, Float] | None:
-    """To the nearest neighbour, and to the nearest of the next 8 that is well off that line."""
-    offset = points - points[seed]
-    order = np.argsort(np.hypot(offset[:, 0], offset[:, 1]))[1:10]
-    first = offset[order[0]]
-    for other in offset[order[1:]]:
+def _nearest(points: Float, among: Index, place: Float) -> int:
+    offset = points[among] - place
+    return int(among[np.argmin(np.einsum("ij,ij->i", offset, offset))])
+
+
+def _lattice_vectors(points: Float, near: Index) -> tuple[Float, Float] | None:
+    """To the nearest neighbour, and to the nearest of the next 8 that is well off that line; near[0] is the seed."""
+    offset = points[near[1:10]] - points[near[0]]
+    first = offset[0]
+    for other in offset[1:]:
         if abs(_cross(first, other)) > 0.6 * np.hypot(*first) * np.hypot(*other):
             return first, other
     return None
@@ -82,7 +90,6 @@ def _predicted_step(
     direction: Cell,
     base: tuple[Float, Float],
     cells: dict[Cell, int],
-    came_by: dict[tuple[Cell, Cell], Float],
     points: Float,
 ) -> Float:
     """The step that led to `cell` plus 0.8 of its change; else a side neighbour's parallel step; else the seed's."""

@@ -14,6 +14,7 @@ from tests.bench import (
     abort,
     camera,
     codec,
+    identification,
     jitter,
     line_rate,
     markers,
@@ -42,6 +43,7 @@ BENCHMARKS = {
     "reading": reading.figures,
     "markers": markers.figures,
     "warp": warp.figures,
+    "identification": identification.figures,
     "simulator": simulator.figures,
 }
 

@@ -34,6 +34,8 @@ class Scene:
 
     columns: int = 9
     rows: int = 6
+    staggered: bool = False
+    """Every second row is half a pitch to the right, and rows are half a pitch apart."""
     pitch_mm: float = 30.0
     diameters_mm: dict[int, float] = field(default_factory=dict[int, float])
     diameter_mm: float = 8.0
@@ -61,8 +63,8 @@ class Scene:
         return np.array(
             [
                 (
-                    c * self.pitch_mm,
-                    r * self.pitch_mm,
+                    (c + (r % 2) / 2 * self.staggered) * self.pitch_mm,
+                    r * self.pitch_mm / (1 + self.staggered),
                     self.diameters_mm.get(r * self.columns + c + 1, self.diameter_mm),
                 )
                 for r in range(self.rows)
@@ -77,7 +79,9 @@ class Scene:
         ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
         rz = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
         rotation = np.diag([1.0, -1.0, -1.0]) @ rz @ ry @ rx
-        middle = np.array([(self.columns - 1) * self.pitch_mm / 2, (self.rows - 1) * self.pitch_mm / 2, 0])
+        middle = np.array(
+            [(self.columns - 1) * self.pitch_mm / 2, (self.rows - 1) * self.pitch_mm / (2 + 2 * self.staggered), 0]
+        )
         towards = np.array([self.shift_mm[0], -self.shift_mm[1], self.distance_mm])
         return rotation, towards - rotation @ middle
 

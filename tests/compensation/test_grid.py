@@ -131,6 +131,43 @@ def test_a_missing_column_is_refused_and_the_frame_before_settles_it():
     assert wrong(found, candidates, truth) == 0
 
 
+def test_a_side_that_clutter_hides_is_found_or_refused_and_never_read_one_column_off():
+    outcomes: list[int] = []
+    for seed in range(12):
+        candidates, truth = seen(Scene(roll_deg=5), seed, clutter=60)
+        try:
+            found = identify(candidates, PAPER)
+        except DetectionError:
+            continue
+        outcomes.append(wrong(found, candidates, truth))
+    assert len(outcomes) >= 10
+    assert set(outcomes) == {0}
+
+
+@pytest.mark.parametrize("roll", range(-180, 180, 60))
+def test_a_staggered_grid_of_an_odd_number_of_rows_is_identified_at_every_roll(roll: float):
+    target = Target(name="asymmetric", layout="staggered", columns=4, rows=11, pitch_mm=40, diameter_mm=8)
+    scene = Scene(columns=4, rows=11, staggered=True, pitch_mm=40, roll_deg=roll, tilt_x_deg=40)
+    candidates, truth = seen(scene, missing=(7,))
+    found = identify(candidates, target)
+    assert tuple(np.flatnonzero(found.candidate < 0) + 1) == (7,)
+    assert wrong(found, candidates, truth) == 0
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(3, 3), (20, 14), (40, 30)])
+def test_targets_of_any_size_are_identified_through_a_wide_lens(columns: int, rows: int):
+    target = Target(name="t", columns=columns, rows=rows, pitch_mm=240 / (columns - 1), diameter_mm=2)
+    pose = Scene(
+        columns=columns, rows=rows, pitch_mm=target.pitch_mm, diameter_mm=2, f_px=2600, distance_mm=330, k1=-0.25
+    )
+    truth = true_centres_px(pose)
+    order = np.random.default_rng(1).permutation(len(truth))
+    candidates = Candidates(truth[order], np.full(len(truth), 100.0))
+    found = identify(candidates, target)
+    assert (found.candidate >= 0).all()
+    assert wrong(found, candidates, truth) == 0
+
+
 def test_too_few_markers_are_refused_with_their_number():
     candidates, _ = seen(Scene(), missing=range(1, 24))
     with pytest.raises(DetectionError, match="found 31 of 54 markers of paper-9x6: 41 are needed"):

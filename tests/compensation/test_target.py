@@ -44,6 +44,8 @@ def test_measured_coordinates_replace_the_nominal_ones():
         (SMALL.replace("columns: 4", "columns: 2"), "t.yaml: columns: "),
         (SMALL.replace("rows: 3", "rows: 5"), "columns is the long side, found 4 columns and 5 rows"),
         (SMALL.replace("diameter_mm: 4", "diameter_mm: 12"), "overlap at a pitch of 10.0 mm"),
+        (SMALL.replace("ter_mm: 4", "ter_mm: 8") + "layout: staggered\n", "overlap at a pitch of 10.0 mm"),
+        (SMALL + "layout: hexagonal\n", "t.yaml: layout: "),
         (SMALL + "pitch_cm: 1\n", "t.yaml: pitch_cm: unknown key"),
         (SMALL + "odd_marker: {number: 13, diameter_mm: 8}\n", "odd_marker.number is 13, but the target has 12"),
         (SMALL + "odd_marker: {number: 1, diameter_mm: 4.5}\n", "differs too little"),
@@ -63,3 +65,18 @@ def test_marker_numbers_outside_the_target_are_a_programming_mistake():
     for number in (0, 13):
         with pytest.raises(ValueError, match=r"numbered 1\.\.12"):
             target.row_column(number)
+
+
+def test_a_staggered_targets_second_row_is_half_a_pitch_further_right_and_half_a_pitch_up():
+    target = parse_document(SMALL + "layout: staggered\n", Target, "t")
+    np.testing.assert_array_equal(target.nominal_mm()[[0, 3, 4, 8]], [[0, 0], [30, 0], [5, 5], [0, 10]])
+    assert target.spacing_mm == pytest.approx(np.hypot(5, 5))
+
+
+@pytest.mark.parametrize("layout", ["square", "staggered"])
+def test_neighbouring_cells_are_the_nearest_markers(layout: str):
+    target = parse_document(f"{SMALL}layout: {layout}\n", Target, "t")
+    cells, places = target.cells(), target.nominal_mm()
+    steps = np.abs(cells[:, None] - cells[None]).sum(axis=2)
+    away = np.linalg.norm(places[:, None] - places[None], axis=2)
+    np.testing.assert_array_equal(steps == 1, np.isclose(away, target.spacing_mm))

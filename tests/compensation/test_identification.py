@@ -1,0 +1,34 @@
+"""A seeded few of the benchmark's frames: every marker identified from the pixels, and in its place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensation.markers.detection import detect
+from compensation.target import load_target
+from stand.config import packaged
+from tests.bench.identification import TARGETS, judged, own, posed
+from tests.compensation.rendered import photograph, render, true_centres_px
+
+PAPER = load_target(packaged("targets", "paper-9x6"))
+
+
+@pytest.mark.parametrize("name", ["uneven light", "one marker missing", "dark disc clutter"])
+def test_the_papers_target_is_identified(name: str):
+    scene = posed(name, 3)
+    assert judged(own(photograph(scene, render(scene), 3), PAPER), scene, own_order=True) == "found"
+
+
+@pytest.mark.parametrize("name", ["light on dark", "staggered 4x11", "20x14", "webcam, 8 px discs"])
+def test_other_targets_are_identified(name: str):
+    target, nominal = TARGETS[name]
+    scene = posed(name, 3, {name: nominal})
+    assert judged(own(photograph(scene, render(scene), 3), target), scene, own_order=True) == "found"
+
+
+def test_detection_keeps_the_corners_that_a_wide_lens_puts_off_the_homography():
+    scene = posed("wide field, distortion", 1)
+    detection = detect(photograph(scene, render(scene), 1), PAPER)
+    assert detection.found == 54
+    assert np.abs(detection.centres_px - true_centres_px(scene)).max() < 0.05
