@@ -16,6 +16,7 @@ from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 from drivers.documents import Document, load_document
 from drivers.interface import ConfigError
 from experiments.parameters import Chamber_degC
+from stand.config_guard import GuardConfig
 
 
 def _tcp_address(address: str) -> str:
@@ -226,85 +227,6 @@ class LimitsConfig(Document):
     chamber_degC: Annotated[tuple[Chamber_degC, Chamber_degC], AfterValidator(_ascending)] = (-10.0, 60.0)
 
 
-class HeatingConfig(Document):
-    """Heater on, but not warming. While the regulator's output is above output_percent, its relay is on and the
-    temperature is more than hysteresis_K below the set-point, it must rise by gain_K every window_s. When it does not,
-    what it lacks is summed up, and more than max_error_K_s is a fault. gain_K in window_s should be about half of your
-    chamber's slowest rate at such an output: the simulated one never takes longer than 170 s for 2 K.
-    """
-
-    output_percent: float = Field(default=50.0, gt=0, le=100)
-    hysteresis_K: float = Field(default=1.0, gt=0, le=10)
-    gain_K: float = Field(default=2.0, gt=0, le=10)
-    window_s: float = Field(default=600.0, gt=0, le=3600)
-    max_error_K_s: float = Field(default=600.0, gt=0, le=36000)
-
-
-class HeaterOffConfig(Document):
-    """Warming with the heater off. settle_s after the heat was switched off the air may rise by rise_K, or end less
-    than above_surroundings_K above laboratory and granite."""
-
-    settle_s: float = Field(default=120.0, ge=0, le=3600)
-    rise_K: float = Field(default=2.0, gt=0, le=20)
-    above_surroundings_K: float = Field(default=5.0, ge=0, le=20)
-
-
-class SensorsConfig(Document):
-    """Regulator and air thermometer, and values that do not change. A difference above warn_K for warn_after_s is told,
-    one above trip_K for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A thermometer
-    that is exactly constant for stuck_after_s is told; the regulator's value constant for pv_stuck_after_s while the
-    air goes air_moves_K is a fault.
-    """
-
-    warn_K: float = Field(default=3.0, gt=0, le=20)
-    warn_after_s: float = Field(default=600.0, ge=0, le=3600)
-    trip_K: float = Field(default=6.0, gt=0, le=20)
-    trip_after_s: float = Field(default=120.0, ge=0, le=3600)
-    stuck_after_s: float = Field(default=900.0, ge=60, le=36000)
-    pv_stuck_after_s: float = Field(default=60.0, ge=10, le=3600)
-    air_moves_K: float = Field(default=1.0, gt=0, le=20)
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.warn_K > self.trip_K:
-            raise ValueError(f"warn_K {self.warn_K} is above trip_K {self.trip_K}")
-        return self
-
-
-class GuardConfig(Document):
-    """When the guard makes the stand safe. The upper bounds are what the chamber survives: no file may lift them.
-
-    keys_s: how long the unit and we may differ about running, permits and the set-point. flap_open_s: how long the flap
-    may be open outside captures, flap_capture_s in all. disk_low_s: how long the recorder may refuse frames. notify:
-    a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may take.
-    """
-
-    period_s: float = Field(default=1.0, gt=0, le=10)
-    max_air_degC: float = Field(default=65.0, le=80)
-    max_granite_degC: float = Field(default=60.0, le=80)
-    max_camera_degC: float = Field(default=85.0, le=100)
-    stale_after_s: float = Field(default=15.0, gt=0, le=120)
-    heater_hold_s: float = Field(default=15.0, ge=2.0, le=60.0)
-    heater_renew_s: float = Field(default=5.0, gt=0)
-    heating: HeatingConfig = HeatingConfig()
-    heater_off: HeaterOffConfig = HeaterOffConfig()
-    sensors: SensorsConfig = SensorsConfig()
-    keys_s: float = Field(default=30.0, ge=1, le=600)
-    flap_open_s: float = Field(default=300.0, gt=0, le=36000)
-    flap_capture_s: float = Field(default=2700.0, gt=0, le=36000)
-    disk_low_s: float = Field(default=900.0, ge=0, le=36000)
-    notify: tuple[Annotated[str, Field(min_length=1)], ...] = Field(default=(), max_length=100)
-    notify_limit_s: float = Field(default=10.0, gt=0, le=60)
-
-    @model_validator(mode="after")
-    def _renewed_in_time(self) -> Self:
-        if self.heater_renew_s * 2 > self.heater_hold_s:
-            raise ValueError("heater_renew_s must be at most half of heater_hold_s, or one lost command cuts the heat")
-        if self.period_s + self.heater_renew_s >= self.heater_hold_s:  # renewals fall on the guard's own looks
-            raise ValueError("period_s + heater_renew_s must be below heater_hold_s, or the heat drops out in between")
-        return self
-
-
 class CompressorConfig(Document):
     """The refrigeration compressor's own protection and when it is wanted (outputs of the regulator, %).
 
@@ -374,6 +296,12 @@ class StandConfig(Document):
             raise ValueError(f"bus and axes need addresses of their own, {twice} is given twice")
         if self.limits.chamber_degC[1] >= self.guard.max_air_degC:
             raise ValueError("guard.max_air_degC must be above the upper limits.chamber_degC, or a normal run trips it")
+        for name in ("granite", "camera"):  # they follow the air
+            limit_degC = getattr(self.guard, f"max_{name}_degC")
+            if limit_degC < self.limits.chamber_degC[1]:
+                raise ValueError(f"guard.max_{name}_degC {limit_degC} is below the upper limits.chamber_degC")
+        if self.flap.poll_s * 2 > self.guard.flap_open_s:
+            raise ValueError(f"guard.flap_open_s must be at least twice flap.poll_s ({self.flap.poll_s} s)")
         slowest_s = max(self.regulator.poll_s, self.thermometers.poll_s, self.camera.poll_s)
         if slowest_s * 2 > self.guard.stale_after_s:
             raise ValueError(f"guard.stale_after_s must be at least twice the slowest safety poll ({slowest_s} s)")

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from drivers.interface import ConfigError
+from drivers.stage import PROFILES
 from experiments.steps import (
     Capture,
     CheckHome,
+    CoolDown,
     MoveTo,
     PlannedStep,
     SetTemperature,
     Soak,
     StartChamber,
     Step,
+    estimate_s,
     frames_of,
     kind_of,
     parameters_of,
@@ -40,7 +44,7 @@ class PricedStep:
 
     work, stated_s: what of the duration follows from the step, the rest being usual for this kind of work.
     in_band_after_s: of a soak, when the chamber is expected at its set-point, s after the soak begins; None when it is
-    there already. warning: of a first capture, why the dwell before it is too short, "" when it is not.
+    there already. warning: why the dwell before a first capture, or a cool-down, is too short, "" when it is not.
     """
 
     planned: PlannedStep
@@ -123,7 +127,12 @@ def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> 
 
 
 def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:
-    """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then."""
+    """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then. Of a
+    cool-down: that it is too short for a camera that was on."""
+    if isinstance(step, CoolDown):
+        needed_s = estimate_s(replace(step, max_s=math.inf), 0.0)
+        too_short = f"ends after {_minutes(step.max_s)}; the camera needs {_minutes(needed_s)} to be within its band"
+        return f"the cool-down {too_short}" if step.max_s < needed_s else ""
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC)
     settled_s = chamber.settled_s(approach.from_degC, approach.to_degC)
     if not isinstance(step, Capture) or approach.captured or approach.age_s >= settled_s:
@@ -166,9 +175,18 @@ def _check(planned: PlannedStep, config: StandConfig) -> None:
             axis = axis_of(config, step.axis)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from error
-        if isinstance(step, MoveTo) and not axis.limits[0] <= step.position <= axis.limits[1]:
+        low, high = axis.limits
+        if isinstance(step, MoveTo) and not low <= step.position <= high:
             raise ConfigError(
                 f"{where}: {step.position} {axis.unit} is outside the limits {axis.limits} of {step.axis}"
+            )
+        # An axis without scale is homed before it moves, which ends at 0; a home check begins at the profile's place.
+        home_from = PROFILES[axis.profile].home_from if isinstance(step, CheckHome) else None
+        outside = [place for place in (0.0, home_from) if place is not None and not low <= place <= high]
+        if outside:
+            raise ConfigError(
+                f"{where}: homing {step.axis} goes to {outside[0]:g} {axis.unit}, which axes.{step.axis}.limits "
+                f"{axis.limits} exclude"
             )
     if isinstance(step, Capture) and step.frames > 1 and step.interval_s < 1 / config.camera.frame_rate_hz - 1e-9:
         rate_hz = config.camera.frame_rate_hz

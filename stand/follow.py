@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from types import MappingProxyType
 
 from drivers.clock import NS_PER_S, seconds_ns
@@ -41,7 +42,11 @@ class Follow:
         self._next_ns = 0
 
     def __call__(self, item: Item) -> None:
-        """Follow one item."""
+        """Follow one item; a terminal that is gone is no reason for a run to end."""
+        with suppress(OSError):
+            self._follow(item)
+
+    def _follow(self, item: Item) -> None:
         if isinstance(item, Event):
             self.eta.event(item)
             if item.level != "info":

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 from collections.abc import Sequence
+from contextlib import suppress
 
 from drivers.clock import Clock
 from drivers.lane import Lane
+
+_KILLED_LIMIT_S = 1.0  # real seconds for what was killed to be gone
 
 
 class Notifier:
@@ -19,6 +23,12 @@ class Notifier:
         self._command = tuple(command)
         self._limit_s = limit_s
         self._clock = clock
+
+    def missing(self) -> str:
+        """Why the command cannot be run, "" when it can."""
+        if not self._command or shutil.which(self._command[0]) is not None:
+            return ""
+        return f"guard.notify: {self._command[0]} is no program that can be run here; nobody will be told of a trip"
 
     async def tell(self, text: str) -> str:
         """Why it failed, "" when it did not; off the loop, but virtual time stands still meanwhile."""
@@ -46,7 +56,16 @@ def run_command(command: Sequence[str], limit_s: float) -> str:
     try:
         status = process.wait(limit_s)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        return f"{command[0]} did not end within {limit_s:g} s"
+        return f"{command[0]} did not end within {limit_s:g} s{_killed(process)}"
     return "" if status == 0 else f"{command[0]} ended with status {status}"
+
+
+def _killed(process: subprocess.Popen[bytes]) -> str:
+    """Kill it and its children; "" when it is gone. One that runs as another user, or hangs in the kernel, stays."""
+    with suppress(OSError):
+        os.killpg(process.pid, signal.SIGKILL)
+    try:
+        process.wait(_KILLED_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        return " and could not be killed"
+    return ""

@@ -68,9 +68,11 @@ async def perform(work: Performance) -> None:
         ended = _ending(stop.fault, error)
         raise
     finally:
-        log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
         stop.taking_down()
-        await assembly.stand.make_safe()
+        try:
+            log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
+        finally:  # also when somebody who listens fails
+            await assembly.stand.make_safe()
         await cancelled(watchers)
         # One more look at every device, so that the recording ends with the safe state as the wire tells it.
         for poller in pollers:
@@ -97,6 +99,9 @@ async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log
     gate = work.assembly.stand.gate
     gate.subscribe(log.held)
     gate.subscribe(lambda reason, held: _forget_cleared(guard, reason, held))
+    if guard.held is not None:  # by the first look, when there was no journal yet
+        log.tripped(guard.held)
+        log.held(INTERLOCK, True)
     work.assembly.hub.subscribe(_hold_while_not_recorded(gate))
     if before is not None and not before.set_up.camera_on:
         work.assembly.stand.camera_is_off(before.cooling)

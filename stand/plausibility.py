@@ -155,6 +155,54 @@ def warming_while_off(limits: OffLimits, air: str, regulator: str, permit: str, 
 
 
 @dataclass(frozen=True, slots=True)
+class VainLimits:
+    """In window_s of cooling without heat the air must fall by fall_K, unless the laboratory or the granite is warmer
+    than margin_K below it."""
+
+    window_s: float
+    fall_K: float
+    margin_K: float
+
+
+@dataclass(frozen=True, slots=True)
+class Cooling:
+    """The compressor has run without heat since `since_ns`, when the air was at `air_degC`."""
+
+    since_ns: int
+    air_degC: float
+
+
+def cooling_in_vain(
+    limits: VainLimits, air: str, regulator: str, compressor: str, surroundings: tuple[str, ...]
+) -> Rule:
+    """The compressor runs, the regulator's heating output is 0, and yet the air, which nothing around it warms, does
+    not fall: a welded relay that heats as much as is cooled, or a compressor that does not cool. The two look alike.
+
+    Below its surroundings the chamber may need all its cold to stay where it is, and nothing can be told.
+    """
+    mv_heat = f"{regulator}.mv_heat"
+
+    def is_alone(readings: Readings, air_degC: float) -> bool:
+        return all(value_of(readings, channel) < air_degC - limits.margin_K for channel in surroundings)
+
+    def step(last: Cooling | None, readings: Readings, now_ns: int) -> tuple[Cooling | None, Fault | None]:
+        air_degC = value_of(readings, air)
+        cools = value_of(readings, compressor) == 1 and value_of(readings, mv_heat) <= 0
+        if not (cools and is_alone(readings, air_degC)):
+            return None, None
+        if last is None or air_degC <= last.air_degC - limits.fall_K:
+            return Cooling(now_ns, air_degC), None
+        if now_ns - last.since_ns < seconds_ns(limits.window_s):
+            return last, None
+        text = (
+            f"{air} stays at {air_degC:.2f} degC though the compressor has run for {limits.window_s:g} s without heat"
+        )
+        return last, Fault("cooling_in_vain", text)
+
+    return remembering(step)
+
+
+@dataclass(frozen=True, slots=True)
 class Constant:
     """A value that has not changed since `since_ns`, and what another sensor read then."""
 

@@ -20,6 +20,8 @@ from stand.interlocks import (
 from stand.plausibility import (
     HeatingLimits,
     OffLimits,
+    VainLimits,
+    cooling_in_vain,
     heater_not_warming,
     stuck,
     stuck_while_other_moves,
@@ -32,7 +34,8 @@ PV, AIR, GRANITE, LABORATORY = (
     "thermometers.granite_inside",
     "thermometers.laboratory",
 )
-RUNNING, PERMIT = "regulator.running", "relays.heater_enable"
+RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
+FLAP = "flap.position"
 
 
 class Announcements:
@@ -74,13 +77,16 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
 
 def _heat(config: StandConfig) -> tuple[Watch, ...]:
     """Heat that does not come, comes unasked, or is held back. The first may be a detached sensor, the second is out
-    of control; a relay that does not close can be put right."""
+    of control; a relay that does not close or answer, or a compressor that does not cool, can be put right."""
     limits = config.guard
     heating, heater_off = HeatingLimits(**limits.heating.model_dump()), OffLimits(**limits.heater_off.model_dump())
+    vain = VainLimits(**limits.cooling.model_dump())
     return (
         Watch(heater_not_warming(heating, "regulator", PERMIT)),
         Watch(warming_while_off(heater_off, AIR, "regulator", PERMIT, (LABORATORY, GRANITE))),
+        Watch(cooling_in_vain(vain, AIR, "regulator", COMPRESSOR, (LABORATORY, GRANITE)), action="hold"),
         Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
+        Watch(trustworthy(PERMIT, limits.keys_s), 2 * limits.keys_s, "hold"),
     )
 
 
@@ -99,7 +105,8 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
 
 
 def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
-    """Hands on the regulator's keys, a stage's alarm, an open flap, a full disk: an operator has to come.
+    """Hands on the regulator's keys, a stage's alarm, a flap that is open or cannot be asked, a full disk: an operator
+    has to come.
 
     A flap that stays open is closed by making safe; when it does not close, that is an error event of its own.
     """
@@ -108,7 +115,8 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
         Watch(reported_fault("regulator.fault"), limits.keys_s, "hold"),
         Watch(stopped_while_permitted(RUNNING, PERMIT), limits.keys_s, "hold"),
         *(Watch(stage_alarm(f"{name}.position"), action="hold") for name in config.axes),
-        Watch(flap_open("flap.position", lambda: announced.is_capturing), limits.flap_open_s, "hold"),
-        Watch(flap_open("flap.position"), limits.flap_capture_s, "hold"),
+        Watch(flap_open(FLAP, lambda: announced.is_capturing), limits.flap_open_s, "hold"),
+        Watch(flap_open(FLAP), limits.flap_capture_s, "hold"),
+        Watch(trustworthy(FLAP, limits.flap_open_s), limits.flap_open_s, "hold"),
         Watch(frames_stopped(lambda: announced.frames_stopped), limits.disk_low_s, "hold"),
     )

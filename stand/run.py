@@ -207,11 +207,12 @@ async def _recording(job: _Job, directory: Path, assembly: Assembly, stop: Stop)
 
 
 async def _open(assembly: Assembly, *, camera_on: bool) -> None:
-    """Connect everything; the flap is closed and the camera switched on before anything else may happen, but for a run
-    that goes on with the camera off."""
+    """Connect everything; heat and cold lose what permission somebody left them, the flap is closed and the camera
+    switched on before anything else may happen, but for a run that goes on with the camera off."""
     devices = assembly.devices
     await assembly.bus.open()
     await devices.relays.open()
+    await assembly.stand.withdraw_permits()
     await devices.regulator.open()
     await devices.regulator.stop()
     await devices.thermometers.open()

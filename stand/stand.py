@@ -96,6 +96,16 @@ class Stand:
         self._check(chamber_degC)
         await self.devices.regulator.set_temperature(chamber_degC)
 
+    async def withdraw_permits(self) -> None:
+        """Before anything else: heater and compressor lose what permission another daemon, or somebody by hand, left
+        them, which is told. A compressor that ran until now begins its rest now."""
+        left_on = {reading.channel for reading in await self.devices.relays.read() if reading.value == 1}
+        await self.devices.relays.make_safe()
+        for channel in sorted(left_on & {"relays.heater_enable", "relays.compressor"}):
+            self._hub.publish(Event(self._clock.now_ns(), "warning", "left_on", f"{channel} was on; switched off"))
+        if "relays.compressor" in left_on:
+            self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
+
     async def stop_chamber(self) -> None:
         """Stop the regulator; heating and cooling lose their permission at once."""
         self._permitted = False
@@ -227,7 +237,13 @@ class Stand:
             devices = self.devices
             actuators = (devices.regulator, devices.relays, devices.flap, *devices.axes.values())
             failures = await asyncio.gather(*(self._safely(actuator) for actuator in actuators))
-            self.unconfirmed = tuple(failure for failure in failures if failure)
+            unconfirmed, told = tuple(failure for failure in failures if failure), self.unconfirmed
+            self.unconfirmed = unconfirmed
+            for text in unconfirmed:
+                if text not in told:
+                    self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text))
+            if told and not unconfirmed:
+                self._hub.publish(Event(self._clock.now_ns(), "info", "confirmed_safe", "the stand is safe"))
             await self._compressor_is_off()
 
     async def _safely(self, actuator: Actuator) -> str:
@@ -239,9 +255,7 @@ class Stand:
                 except (Unreachable, GarbledReply):
                     await actuator.make_safe()
         except Exception as error:  # noqa: BLE001 - whatever one actuator does, the others must still be made safe
-            text = f"{actuator.name} did not confirm its safe state: {str(error) or 'no answer in time'}"
-            self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text))
-            return text
+            return f"{actuator.name} did not confirm its safe state: {str(error) or 'no answer in time'}"
         return ""
 
     async def _open_camera(self, deadline_ns: int, longest_retry_s: float) -> None:

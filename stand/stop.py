@@ -20,7 +20,8 @@ class Interrupted(StandError):
 
 
 class Stop:
-    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM): `stop(fault)`, in any phase.
+    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM, and SIGHUP, when the terminal
+    is closed and nohup does not keep it away): `stop(fault)`, in any phase.
 
     The stand is latched and made safe, the run cancelled where it waits, once, and not while it is being taken down;
     what it then raises becomes Interrupted or StandTripped with the first reason.
@@ -32,6 +33,9 @@ class Stop:
         self._stand: Stand | None = None
         self._aborting: asyncio.Task[None] | None = None
         self._taking_down = False
+        self._signals = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            self._signals.append(signal.SIGHUP)
 
     def watch(self, stand: Stand) -> None:
         """The stand to be made safe; before that a stop only cancels."""
@@ -90,12 +94,12 @@ class Stop:
         if running is None:
             raise ValueError("a run is stopped by its task; there is none")
         self._run = running
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in self._signals:
             asyncio.get_running_loop().add_signal_handler(number, self)
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in self._signals:
             asyncio.get_running_loop().remove_signal_handler(number)
         if self.fault is None or error is None:
             return

@@ -93,6 +93,8 @@ class Night:
             "regulator.mv_cool": mv_cool,
             "regulator.running": float(self._running),
             "relays.heater_enable": float(self.permitted),
+            "relays.compressor": float(plant.compressor_on),
+            "flap.position": self.flap_open,
             "thermometers.air": plant.air_degC,
             "thermometers.granite_inside": plant.granite_inside_degC,
             "thermometers.laboratory": plant.laboratory_degC,

@@ -12,6 +12,7 @@ from experiments.steps import (
     Capture,
     CheckHome,
     CloseFlap,
+    CoolDown,
     MoveTo,
     OpenFlap,
     PlannedStep,
@@ -125,6 +126,52 @@ def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: Sta
     assert warnings == ["", "", "", "", warning, ""]
 
 
+@pytest.mark.parametrize(
+    ("max_s", "warning"),
+    [
+        (7200.0, ""),
+        (4440.0, ""),
+        (4400.0, "the cool-down ends after 73 min; the camera needs 74 min to be within its band"),
+    ],
+)
+def test_a_cool_down_too_short_for_the_camera_is_warned_of(config: StandConfig, max_s: float, warning: str):
+    """20 K of excess down to 1 K takes ln 20 = 3.0 time constants."""
+    (step,) = price(planned(CoolDown(1.0, 1480.0, max_s)), config)
+    assert step.warning == warning
+
+
+@pytest.mark.parametrize(
+    ("axis", "limits", "step", "sentence"),
+    [
+        (
+            "rotary",
+            (-10, 10),
+            CheckHome("rotary"),
+            "homing rotary goes to 16 deg, which axes.rotary.limits (-10.0, 10.0)",
+        ),
+        ("rotary", (10, 20), CheckHome("rotary"), "homing rotary goes to 0 deg"),
+        ("rotary", (17, 40), MoveTo("rotary", 20), "homing rotary goes to 0 deg"),
+        ("linear", (5, 280), MoveTo("linear", 20), "homing linear goes to 0 mm"),
+        ("linear", (5, 280), CheckHome("linear"), "homing linear goes to 0 mm"),
+    ],
+)
+def test_limits_that_exclude_what_homing_needs_are_found_before_the_night(
+    config: StandConfig, axis: str, limits: tuple[float, float], step: Step, sentence: str
+):
+    data = config.model_dump()
+    data["axes"][axis]["limits"] = limits
+    with pytest.raises(ConfigError) as caught:
+        price(planned(step), StandConfig.model_validate(data))
+    assert sentence in str(caught.value)
+    price(planned(step), config)  # with the installed limits nothing is wrong
+
+
+def test_moves_alone_need_no_place_for_a_home_check(config: StandConfig):
+    data = config.model_dump()
+    data["axes"]["rotary"]["limits"] = (-10, 10)
+    price(planned(MoveTo("rotary", 5)), StandConfig.model_validate(data))
+
+
 @pytest.mark.parametrize("step", [MoveTo("vertical", 1.0), CheckHome("vertical")])
 def test_an_axis_that_the_stand_lacks_is_refused(config: StandConfig, step: Step):
     with pytest.raises(ConfigError, match=r"step 0 .*no axis 'vertical', only linear, rotary"):
@@ -206,6 +253,16 @@ def test_following_a_run_reports_the_share_done_the_time_left_and_what_is_wrong(
     assert len(reports) == 6
     follow(Event(BEGIN_NS, "warning", "camera_lost", "no answer"))
     assert lines == ["warning: 18:00:00 UTC no answer"]
+
+
+def test_a_terminal_that_is_gone_does_not_end_what_it_follows(config: StandConfig):
+    def gone(*_: object) -> None:
+        raise BrokenPipeError
+
+    plan = planned(Soak(60.0))
+    follow = Follow(price(plan, config), gone, gone)
+    follow(Event(BEGIN_NS, "error", "guard.rule", "it is so"))
+    follow(marks(plan, [60.0])[0])
 
 
 async def test_runs_teach_what_work_takes_and_the_median_counts(tmp_path: Path, config: StandConfig):

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import Clock, VirtualClock, WallClock, seconds_ns
+from drivers.clock import Clock, VirtualClock, WallClock, block_until, seconds_ns
 from drivers.interface import Unreachable
 from stand.guard import Guard
 from stand.hub import Event, Hub
-from stand.interlocks import Fault, Rule, Watch
+from stand.interlocks import Fault, Readings, Rule, Watch
 from stand.notify import Notifier, run_command
 
 
@@ -22,7 +22,8 @@ class PlainStand:
 
     def __init__(self, log: list[str]) -> None:
         self.log = log
-        self.renews = True
+        self.renews: Exception | None = None
+        self.unconfirmed: tuple[str, ...] = ()
 
     async def make_safe(self) -> None:
         await asyncio.sleep(0)
@@ -30,30 +31,41 @@ class PlainStand:
 
     async def renew_permits(self) -> None:
         self.log.append("renew")
-        if not self.renews:
-            raise Unreachable("relays", "no answer")
+        if isinstance(self.renews, Exception):
+            raise self.renews
 
 
 class Bench:
     """A guard over rules whose objections a test switches."""
 
     def __init__(
-        self, *actions: str, can_hold: bool = True, command: tuple[str, ...] = (), clock: Clock | None = None
+        self,
+        *actions: str,
+        can_hold: bool = True,
+        command: tuple[str, ...] = (),
+        limit_s: float = 5.0,
+        clock: Clock | None = None,
     ) -> None:
         self.log: list[str] = []
         self.events: list[Event] = []
         self.clock = clock or VirtualClock(0)
+        self.broken: Exception | None = None  # what the rules raise
         self.objecting: set[int] = set()
         self.stand = PlainStand(self.log)
         hub = Hub()
         hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
         watches = tuple(Watch(self._rule(index), 0.0, action) for index, action in enumerate(actions))
         stop, hold = (lambda fault, name=name: self.log.append(f"{name} {fault.rule}") for name in ("stop", "hold"))
-        notifier = Notifier(command, 5.0, self.clock)
+        notifier = Notifier(command, limit_s, self.clock)
         self.guard = Guard(self.stand, watches, hub, self.clock, 1.0, 5.0, stop, hold if can_hold else None, notifier)
 
     def _rule(self, index: int) -> Rule:
-        return lambda readings, now_ns: Fault(f"rule{index}", "it is so") if index in self.objecting else None
+        def rule(readings: Readings, now_ns: int) -> Fault | None:
+            if self.broken is not None:
+                raise self.broken
+            return Fault(f"rule{index}", "it is so") if index in self.objecting else None
+
+        return rule
 
     async def run_for(self, duration_s: float) -> bool:
         """Let the guard watch for a while; whether it still does."""
@@ -87,6 +99,62 @@ async def test_a_hold_latches_then_makes_safe_once_and_renews_nothing():
     assert await bench.run_for(20)
     assert bench.log == ["hold rule1", "safe"]
     assert bench.guard.held == Fault("rule1", "it is so", "hold")
+
+
+async def test_what_is_still_wrong_when_it_is_cleared_holds_before_anything_can_move():
+    bench = Bench("hold")
+    bench.objecting = {0}
+    await bench.run_for(2)
+    bench.guard.clear()
+    assert bench.guard.held == Fault("rule0", "it is so", "hold")
+    assert bench.log == ["hold rule0", "safe", "hold rule0"]
+    await bench.run_for(2)
+    assert bench.log[3:] == ["safe"]
+
+
+async def test_a_hold_that_is_not_confirmed_safe_is_made_safe_again_every_minute_until_it_is():
+    bench = Bench("hold")
+    bench.stand.unconfirmed = ("relays did not answer",)
+    bench.objecting = {0}
+    await bench.run_for(130)
+    assert bench.log == ["hold rule0"] + ["safe"] * 3
+    bench.stand.unconfirmed = ()
+    await bench.run_for(130)
+    assert bench.log == ["hold rule0"] + ["safe"] * 3
+
+
+@pytest.mark.parametrize("where", ["a rule", "the permits"])
+async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, script: Callable[[str], str], where: str):
+    told = tmp_path / "told"
+    bench = Bench("hold", command=(script(f'printf "%s" "$1" > {told}'),))
+    if where == "a rule":
+        bench.broken = KeyError("channel")
+    else:
+        bench.stand.renews = KeyError("channel")
+    time = asyncio.create_task(bench.clock.run())
+    with pytest.raises(KeyError):
+        await bench.guard.run()
+    time.cancel()
+    assert [line for line in bench.log if line != "renew"] == ["stop guard_failed", "safe"]
+    text = "the guard failed (KeyError: 'channel')"
+    assert [(event.level, event.kind, event.text) for event in bench.events] == [("error", "guard.guard_failed", text)]
+    assert told.read_text() == text
+
+
+async def test_a_guard_that_was_kept_from_looking_says_so():
+    """Real time goes on while somebody computes in the event loop."""
+    bench = Bench("hold", clock=WallClock())
+    bench.guard.period_s, bench.guard.renew_s = 0.01, 0.05
+    watching = asyncio.create_task(bench.guard.run())
+    while not bench.log:
+        await asyncio.sleep(0)
+    block_until(bench.clock, bench.clock.now_ns() + seconds_ns(0.1))
+    while not bench.events:
+        await asyncio.sleep(0)
+    watching.cancel()
+    await asyncio.wait([watching])
+    assert [(event.level, event.kind) for event in bench.events] == [("warning", "guard_late")]
+    assert bench.events[0].text.startswith("the guard looked 0.")
 
 
 async def test_only_an_operator_clears_a_hold_and_what_is_still_wrong_trips_again():
@@ -148,7 +216,7 @@ async def test_a_warning_is_told_when_it_begins_and_changes_nothing():
 
 async def test_a_permit_that_cannot_be_renewed_is_told():
     bench = Bench("abort")
-    bench.stand.renews = False
+    bench.stand.renews = Unreachable("relays", "no answer")
     assert await bench.run_for(2)
     assert [event.kind for event in bench.events] == ["permit_not_renewed"]
 
@@ -190,6 +258,32 @@ async def test_a_run_that_is_taken_down_waits_until_somebody_was_told(tmp_path: 
     assert watching.cancelled()
     assert told.exists()
     assert [event.kind for event in bench.events] == ["guard.rule0", "notify_failed"]
+
+
+async def test_what_is_not_safe_is_told_with_the_trip(tmp_path: Path, script: Callable[[str], str]):
+    told = tmp_path / "told"
+    bench = Bench("abort", command=(script(f'printf "%s" "$1" > {told}'),))
+    bench.stand.unconfirmed = ("flap: jammed", "relays: no answer")
+    bench.objecting = {0}
+    assert not await bench.guard.check()
+    assert told.read_text() == "it is so; NOT SAFE: flap: jammed; relays: no answer"
+
+
+async def test_a_command_that_hangs_is_killed_and_an_event_while_the_hold_stands(script: Callable[[str], str]):
+    bench = Bench("hold", command=(script("exec sleep 600"),), limit_s=0.2)
+    bench.objecting = {0}
+    assert await bench.run_for(20)
+    assert bench.guard.held is not None
+    assert [event.kind for event in bench.events] == ["guard.rule0", "notify_failed"]
+    assert bench.events[1].text.endswith("notify did not end within 0.2 s")
+
+
+@pytest.mark.parametrize("command", ["/nowhere/tell", "no-such-program-here", "/dev/null"])
+async def test_a_command_that_cannot_be_run_is_told_when_the_watch_begins(command: str):
+    bench = Bench("hold", command=(command,))
+    assert await bench.run_for(20)
+    assert [(event.level, event.kind) for event in bench.events] == [("warning", "notify_failed")]
+    assert bench.events[0].text.startswith(f"guard.notify: {command} is no program")
 
 
 async def test_a_command_that_fails_is_an_event_and_no_more(script: Callable[[str], str]):

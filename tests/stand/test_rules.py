@@ -24,6 +24,7 @@ class Table:
             "regulator.pv": 24.0,
             "regulator.running": 1.0,
             "relays.heater_enable": 1.0,
+            "relays.compressor": 0.0,
             "thermometers.air": 24.0,
             "thermometers.granite_inside": 24.0,
             "flap.position": 0.0,
