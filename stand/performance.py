@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from stand.recording.recorder import Recorder
 from stand.resume import Interruption, begun
 from stand.scheduler import Progress, Scheduler
 from stand.session_setup import Order
+from stand.stand import Stand
 from stand.status import StatusBoard
 from stand.stop import OPERATOR, Stop
 from stand.tasks import cancelled, watched
@@ -72,13 +73,20 @@ async def perform(work: Performance) -> None:
         try:
             log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
         finally:  # also when somebody who listens fails
-            await assembly.stand.make_safe()
+            await _taken_down(assembly.stand, watchers, pollers)
+            stop.ended()
+            await log.end(ended)
+
+
+async def _taken_down(stand: Stand, watchers: Sequence[asyncio.Task[None]], pollers: Iterable[Poller]) -> None:
+    """The actuators safe, and nobody left who could move them; then one more look at every device, so that the
+    recording ends with the safe state as the wire tells it."""
+    try:
+        await stand.make_safe()
+    finally:
         await cancelled(watchers)
-        # One more look at every device, so that the recording ends with the safe state as the wire tells it.
-        for poller in pollers:
-            await poller.poll()
-        stop.ended()
-        await log.end(ended)
+    for poller in pollers:
+        await poller.poll()
 
 
 async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log: Logbook) -> Scheduler:

@@ -81,6 +81,7 @@ class Laboratory:
         self._scene = Scene(SceneSpec(), spec.seed)
         self.axes: dict[str, FakeAxis] = {}
         self.ssr_welded_share = 0.0
+        self.camera_sensor_degC: float | None = None
         self._closers: list[Callable[[], None]] = []
         try:
             self._build()
@@ -157,8 +158,10 @@ class Laboratory:
         self.camera.start()
 
     def _conduct(self, time_ns: int, dt_s: float) -> None:
-        """A welded solid-state relay conducts whatever the regulator says."""
+        """A welded solid-state relay conducts whatever the regulator says; a camera without cooling stays hot."""
         self.plant.heater_on_fraction = max(self.plant.heater_on_fraction, self.ssr_welded_share)
+        if self.camera_sensor_degC is not None:
+            self.plant.sensor_degC = self.camera_sensor_degC
 
     def _listen(self, address: str, make_engine: Callable[[], Engine]) -> LinkFaults:
         faults = LinkFaults(seed=self.spec.seed)
@@ -209,6 +212,14 @@ def _of_thermometers(laboratory: Laboratory, value: object) -> dict[int, float]:
     """`{"air": 30.0}` by the module's channel numbers."""
     named = TypeAdapter(dict[str, float]).validate_python(value or {})
     return {laboratory.spec.thermometer_channels[name]: number for name, number in named.items()}
+
+
+def _silent_thermometers(laboratory: Laboratory, value: object) -> None:
+    laboratory.thermometers.silent = bool(value)
+
+
+def _refuse_fault_bits(laboratory: Laboratory, value: object) -> None:
+    laboratory.thermometers.no_fault_bits = bool(value)
 
 
 def _stuck_pv(laboratory: Laboratory, value: object) -> None:
@@ -263,6 +274,10 @@ def _lose_relay_writes(laboratory: Laboratory, value: object) -> None:
     laboratory.relays.lost_writes = bool(value)
 
 
+def _overheat_camera(laboratory: Laboratory, value: object) -> None:
+    laboratory.camera_sensor_degC = None if value is None else float(str(value))
+
+
 def _flap_jam(laboratory: Laboratory, value: object) -> None:
     laboratory.flap.jam_position = None if value is None else int(str(value))
 
@@ -282,6 +297,8 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "regulator.manual_percent": _press_manual,  # somebody dials in a heating output; None gives control back
     "thermometer.offset_K": _offset_thermometer,  # {channel's name: K}
     "thermometer.stuck_degC": _stuck_thermometer,  # {channel's name: degC}
+    "thermometers.silent": _silent_thermometers,
+    "thermometers.no_fault_bits": _refuse_fault_bits,  # which makes their values STALE
     "heater.cut_out": _cut_out,  # the hard-wired thermal cut-out is open: a dead heater
     "heater.welded_share": _weld_ssr,  # share of the time its solid-state relay conducts at least
     "axis.alarm": _alarm_axis,  # the axis' name
@@ -289,5 +306,6 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "relays.silent_s": _silent_relays,  # its timed-on relays go on and drop
     "relays.lost_writes": _lose_relay_writes,  # acknowledged, not done
     "flap.jam": _flap_jam,  # feedback counts at which it stops
+    "camera.sensor_degC": _overheat_camera,  # its sensor chip stays at this
     "camera.loss": _camera_loss,  # share of stream packets lost
 }

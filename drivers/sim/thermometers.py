@@ -68,7 +68,8 @@ class FakeThermometers:
     The noise of a reading is a pure function of (seed, channel, grid time of the plant), however often it is read.
     type_codes: range of each channel, changed over the bus too. Faults, by channel number: open_channels,
     shorted_channels, stuck_degC (the converter gives this and no noise), noisy_channel (1 K instead of 3 mK), offset_K,
-    drift_K_per_h. late_fault_bit: the fault bits are those of the poll before. name: identity as in FC 0x46. silent.
+    drift_K_per_h. late_fault_bit: the fault bits are those of the poll before. no_fault_bits: they are refused. name:
+    identity as in FC 0x46. silent.
     """
 
     def __init__(self, plant: Places, clock: Now, unit: int, channels: Mapping[str, int], seed: int) -> None:
@@ -94,6 +95,7 @@ class FakeThermometers:
         self.offset_K: dict[int, float] = {}
         self.drift_K_per_h: dict[int, float] = {}
         self.late_fault_bit = False
+        self.no_fault_bits = False
         self._plant = plant
         self._clock = clock
         self._seed = seed
@@ -159,6 +161,8 @@ class FakeThermometers:
     def _read_bits(self, address: int, count: int) -> list[bool]:
         """FC 02: a channel's bit is set when it is over or under its range or its wire is open."""
         _check_span(address, count, FAULT_BITS)
+        if self.no_fault_bits:
+            raise Refusal(ILLEGAL_ADDRESS)
         present = [self._word(channel) in (OVER_RANGE, UNDER_RANGE) for channel in range(CHANNELS)]
         shown = self._fault_bits if self.late_fault_bit else present
         self._fault_bits = present

@@ -5,6 +5,9 @@ chamber can be started again.
 """
 
 import asyncio
+import json
+import socket
+import struct
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -12,9 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
+from drivers.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
 from drivers.interface import Quality
 from stand.assembly import Assembly, assemble
+from stand.compressor import CompressorState, keep
 from stand.config import CompressorConfig, StandConfig, packaged
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
@@ -33,7 +37,7 @@ class Bench:
     """A stand without its camera, polled and guarded in virtual time."""
 
     assembly: Assembly
-    clock: VirtualClock
+    clock: Clock
     control: ControlSocket
     events: list[Event]
     trips: list[Fault] = field(default_factory=list[Fault])
@@ -93,20 +97,29 @@ async def bench_of(order: Order, start: Start) -> AsyncIterator[Bench]:
         yield bench
 
 
+def write_by_another_master(order: Order, unit: int, function: int, address: int, value: int) -> None:
+    """FC 05 or 06 at the bus' gateway, as any other program could send it."""
+    _, host, port = order.config.bus.address.split(":")
+    with socket.create_connection((host, int(port)), 5.0) as line:
+        request = struct.pack(">HHHBBHH", 1, 0, 6, unit, function, address, value)
+        line.sendall(request)
+        assert line.recv(64) == request
+
+
 @asynccontextmanager
-async def bench_from(order: Order, start_ns: int) -> AsyncIterator[Bench]:
-    """A bench, which begins at that instant, against the simulator that runs."""
+async def bench_from(order: Order, start_ns: int | None) -> AsyncIterator[Bench]:
+    """A bench, which begins at that instant, or in real time, against the simulator that runs."""
     simulation = order.config.simulation
     assert simulation is not None
     driver, faults = ControlSocket(simulation.control), ControlSocket(simulation.control)
     await driver.open()
     await faults.open()
-    clock, hub = VirtualClock(start_ns, driver.advance), Hub()
+    clock, hub = WallClock() if start_ns is None else VirtualClock(start_ns, driver.advance), Hub()
     assembly = assemble(order.config, hub, clock)
     events: list[Event] = []
     bench = Bench(assembly, clock, faults, events)  # which the hub must not know: pyusb closes what nobody refers to
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
-    tasks = [asyncio.create_task(clock.run())]
+    tasks = [asyncio.create_task(clock.run() if isinstance(clock, VirtualClock) else asyncio.Event().wait())]
     devices = assembly.devices
     try:
         await assembly.bus.open()
@@ -270,6 +283,84 @@ async def test_a_daemon_that_starts_again_spares_the_compressor_as_one_that_goes
         await bench.start(10, 1000)
         assert await bench.plant("compressor_on") == 0  # a third start within the hour
         await bench.end()
+
+
+async def test_a_relay_board_that_stays_silent_holds_the_stand(order: Callable[..., Order], simulator: Start):
+    """Its timed-on relays have dropped by themselves meanwhile."""
+    ordered = order(bus={"timeout_s": 0.05}, guard={"keys_s": 20.0})
+    async with bench_of(ordered, simulator) as bench:
+        await bench.start(26, 60)
+        await bench.fault("relays.silent_s", 60)
+        trip = await bench.tripped(80)
+        assert (trip.rule, trip.action) == ("sensor_bad", "hold")
+        assert trip.text.startswith("relays.heater_enable is BAD")
+
+
+async def test_what_somebody_left_switched_on_is_switched_off_and_told_before_anything_else(
+    tmp_path: Path, order: Callable[..., Order], simulator: Start
+):
+    """Relays that are on for good, a running regulator and its old set-point; the compressor's rest begins now,
+    whatever its file says."""
+    ordered, state_file = order(), tmp_path / "compressor.json"
+    simulation = ordered.config.simulation
+    assert simulation is not None
+    start_ns = seconds_ns(simulation.start.timestamp())
+    keep(state_file, CompressorState(False, start_ns - seconds_ns(7200)))
+    compressor = CompressorConfig(state_file=state_file)
+    ordered = replace(ordered, config=ordered.config.model_copy(update={"compressor": compressor}))
+    await asyncio.to_thread(simulator, ordered.config, True)
+    for unit, function, address, value in [
+        (1, 6, 0x0000, 0x0001),
+        (1, 6, 0x2103, 550),
+        (1, 6, 0x0000, 0x0100),
+        (2, 5, 0, 0xFF00),
+        (2, 5, 1, 0xFF00),
+    ]:
+        await asyncio.to_thread(write_by_another_master, ordered, unit, function, address, value)
+    async with bench_from(ordered, start_ns) as bench:
+        assert (await bench.plant("heater_enabled"), await bench.plant("compressor_on")) == (1, 1)
+        await bench.assembly.stand.withdraw_permits()
+        assert (await bench.plant("heater_enabled"), await bench.plant("compressor_on")) == (0, 0)
+        left = [event.text for event in bench.events if event.kind == "left_on"]
+        assert left == [f"relays.{name} was on; switched off" for name in ("compressor", "heater_enable")]
+        await bench.start(10, 290)
+        assert await bench.plant("compressor_on") == 0
+        assert await bench.plant("air_degC") < 25  # and not on its way to 55
+        await bench.wait(20)
+        assert await bench.plant("compressor_on") == 1
+
+
+def first_seen_off_s(address: str, clock: Clock, limit_s: float) -> float:
+    """s until the plant's heater is not enabled any more, asked over a connection of its own."""
+    _, host, port = address.split(":")
+    begin_ns = clock.now_ns()
+    with socket.create_connection((host, int(port)), 5.0) as line, line.makefile("rwb") as lines:
+        while (past_s := (clock.now_ns() - begin_ns) / NS_PER_S) < limit_s:
+            lines.write(b'{"do": "state"}\n')
+            lines.flush()
+            if json.loads(lines.readline())["heater_enabled"] == 0:
+                return past_s
+            block_until(clock, clock.now_ns() + NS_PER_S // 50)
+    return limit_s
+
+
+async def test_a_daemon_whose_event_loop_is_held_up_does_not_heat(order: Callable[..., Order], simulator: Start):
+    """In real time, with the shortest permit there is: 2 s."""
+    ordered = order(guard={"heater_hold_s": 2.0, "heater_renew_s": 0.5, "period_s": 0.2})
+    simulation = ordered.config.simulation
+    assert simulation is not None
+    await asyncio.to_thread(simulator, ordered.config, False)
+    async with bench_from(ordered, None) as bench:
+        await bench.start(26, 0.5)
+        asking = asyncio.ensure_future(asyncio.to_thread(first_seen_off_s, simulation.control, bench.clock, 4.0))
+        await asyncio.sleep(0)
+        block_until(bench.clock, bench.clock.now_ns() + seconds_ns(3.0))
+        assert await asking < 3.0
+        await bench.wait(0.5)
+        assert "guard_late" in {event.kind for event in bench.events}
+        assert bench.trips == []
+        await bench.end()
+        await bench.assembly.stand.make_safe()
 
 
 @pytest.fixture

@@ -1,0 +1,259 @@
+"""The guard in whole runs, over every wire in virtual time: a trip is latched, made safe, recorded, noted and told, and
+only an operator clears it."""
+
+import asyncio
+import os
+import signal
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import seconds_ns
+from drivers.interface import SessionError, StandTripped
+from stand.control_client import ask, ask_status
+from stand.hub import Batch, Event, Hub, Item
+from stand.journal import JOURNAL_NAME, Cleared, Tripped, read_lines
+from stand.recording.session import Session
+from stand.resume import interruption
+from stand.run import Interrupted, run_virtual
+from stand.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_guard_wire import write_by_another_master
+from tests.system.test_run import at_step, fault
+
+LONG_SOAK = """
+name: soak
+experiments:
+  - thermal_cycle:
+      table_position: {linear: 2, rotary: 1}
+      reference_degC: 40
+      equilibrium_s: 400000
+      set_points_degC: [41]
+      reference_frames: 1
+      frames_per_point: 1
+"""
+TELL = 'printf "%s\\n" "$1" >> "$0"'
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+@dataclass
+class Watcher:
+    """What a run says, and waiting for it on the stand's time."""
+
+    events: list[Event] = field(default_factory=list[Event])
+    now_ns: int = 0
+    _changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def __call__(self, item: Item) -> None:
+        if isinstance(item, Event):
+            self.events.append(item)
+        self.now_ns = max(self.now_ns, item.time_ns if isinstance(item, Event | Batch) else 0)
+        self._changed.set()
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        while not condition():
+            self._changed.clear()
+            await self._changed.wait()
+
+    async def event(self, kind: str, within_s: float) -> Event:
+        """The next event of that kind, forgotten with those before it."""
+        limit_ns = self.now_ns + seconds_ns(within_s)
+        await self.until(lambda: kind in {event.kind for event in self.events} or self.now_ns > limit_ns)
+        kinds = [event.kind for event in self.events]
+        assert kind in kinds, f"{kind} did not come within {within_s} s: {kinds}"
+        found = self.events[kinds.index(kind)]
+        del self.events[: kinds.index(kind) + 1]
+        return found
+
+    async def wait(self, duration_s: float) -> None:
+        end_ns = self.now_ns + seconds_ns(duration_s)
+        await self.until(lambda: self.now_ns >= end_ns)
+
+
+def telling(order: Order, path: Path) -> Order:
+    """The same, and every trip is written to `path`."""
+    guard = order.config.guard.model_copy(update={"notify": ("/bin/sh", "-c", TELL, str(path))})
+    return replace(order, config=order.config.model_copy(update={"guard": guard}))
+
+
+def trips_of(directory: Path) -> list[str]:
+    entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
+    return [
+        entry.rule if isinstance(entry, Tripped) else "cleared"
+        for entry in entries
+        if isinstance(entry, Tripped | Cleared)
+    ]
+
+
+def check_safe(session: Session) -> None:
+    """The last word of every device is that of a stand at rest."""
+    for channel in ("regulator.running", "relays.heater_enable", "relays.compressor", "linear.moving"):
+        assert session.readings(channel)[1][-1] == 0, channel
+    assert session.readings("flap.position")[1][-1] == pytest.approx(0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "rule", "text"),
+    [
+        (
+            "camera.sensor_degC",
+            95,
+            "over_temperature",
+            "camera.temperature is 9",
+        ),
+        ("thermometers.no_fault_bits", True, "sensor_stale", "was last good 20.0 s ago, limit 15.0 s"),
+        ("thermometers.silent", True, "sensor_bad", "thermometers.air is BAD"),
+        ("heater.cut_out", True, "heater_not_warming", "has not risen by 2.0 K in 600 s of heating towards 40.0 degC"),
+        ("heater.welded_share", 0.9, "warming_while_off", "degC with the heater off"),
+    ],
+)
+async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_operator_may_resume_it(
+    tmp_path: Path, order: Callable[..., Order], name: str, value: object, rule: str, text: str
+):
+    told, tasks = tmp_path / "told", list[asyncio.Task[None]]()
+    ordered = telling(order(LONG_SOAK, bus={"timeout_s": 0.3}), told)
+    watch = at_step("Soak", lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))
+    with pytest.raises(StandTripped) as caught:
+        await run_virtual(ordered, tmp_path / "out", None, watch)
+    await asyncio.gather(*tasks)
+    (directory,) = (tmp_path / "out").iterdir()
+    session = Session.open(directory)
+    (trip,) = [event for event in session.events() if event.kind.startswith("guard.")]
+    assert (trip.level, trip.kind) == ("error", f"guard.{rule}")
+    assert text in trip.text
+    assert str(caught.value) == f"{trip.text}; the stand is safe"
+    assert told.read_text() == f"{trip.text}\n"
+    assert trips_of(directory) == [rule]
+    if name != "thermometers.silent":
+        check_safe(session)
+    with pytest.raises(SessionError, match=r"tripped: .*resume with --clear"):
+        interruption(directory)
+
+
+async def run_operated(order: Order, out: Path, watcher: Watcher, operate: Coroutine[None, None, None]) -> None:
+    """A run that `operate` stops; what that raises ends it, too."""
+    run = asyncio.create_task(run_virtual(order, out, None, lambda hub: hub.subscribe(watcher)))
+    operating = asyncio.create_task(operate)
+    await asyncio.wait([run, operating], return_when=asyncio.FIRST_COMPLETED)
+    if not run.done() and operating.exception() is not None:
+        run.cancel()
+    elif run.done() and not operating.done():
+        operating.cancel()
+    await asyncio.wait([run, operating])
+    if not operating.cancelled():
+        operating.result()
+    with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
+        run.result()
+
+
+async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    """One fault after the other: each holds, stays held when its cause is gone, and is cleared over the socket."""
+    told, out, watcher = tmp_path / "told", tmp_path / "out", Watcher()
+    ordered = telling(order(LONG_SOAK), told)
+
+    async def by_hand(unit: int, address: int, value: int) -> None:
+        await asyncio.to_thread(write_by_another_master, ordered, unit, 6, address, value)
+
+    def broken(name: str, value: object) -> Callable[[], Coroutine[None, None, None]]:
+        return lambda: fault(ordered, name, value)
+
+    cases = [
+        ("device_fault", lambda: by_hand(1, 0x2103, 450), None),
+        ("device_fault", broken("regulator.manual_percent", 30), broken("regulator.manual_percent", None)),
+        ("regulator_stopped", lambda: by_hand(1, 0x0000, 0x0101), None),
+        ("permit_missing", broken("relays.lost_writes", True), broken("relays.lost_writes", False)),
+        ("stage_alarm", broken("axis.alarm", "rotary"), broken("axis.alarm", None)),
+        ("cooling_in_vain", broken("heater.welded_share", 0.3), broken("heater.welded_share", None)),
+    ]
+
+    async def operate() -> None:
+        await watcher.event("run.start", 60)
+        (directory,) = out.iterdir()
+        for rule, break_it, mend in cases:
+            await watcher.wait(1800)
+            await break_it()
+            trip = await watcher.event(f"guard.{rule}", 3000)
+            assert trip.level == "error"
+            if rule == "stage_alarm":  # cleared without a look at the cause
+                assert (await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"] == ["interlock"]
+                await watcher.event("guard.stage_alarm", 60)
+            if mend is not None:
+                await mend()
+            await watcher.wait(300)
+            status = await asyncio.to_thread(ask_status, directory)
+            assert (status.state, status.reasons) == ("held", ("interlock",))
+            assert (await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"] == []
+            await watcher.event("restored", 60)
+        await asyncio.to_thread(ask, directory, {"do": "stop"})
+
+    await run_operated(ordered, out, watcher, operate())
+    (directory,) = out.iterdir()
+    session = Session.open(directory)
+    check_safe(session)
+    rules = [rule for rule, _, _ in cases]
+    rules.insert(rules.index("stage_alarm"), "stage_alarm")
+    trips = [event for event in session.events() if event.kind.startswith("guard.") and event.level == "error"]
+    assert [trip.kind for trip in trips] == [f"guard.{rule}" for rule in rules]
+    assert told.read_text().splitlines() == [trip.text for trip in trips]
+    assert [entry for entry in trips_of(directory) if entry != "cleared"] == rules
+    assert trips_of(directory).count("cleared") == len(rules)
+
+
+async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_room(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    ordered, watcher, out = telling(order(LONG_SOAK), tmp_path / "told"), Watcher(), tmp_path / "out"
+    recording = ordered.config.recording.model_copy(update={"stop_frames_below_GB": 1e9})
+    ordered = replace(ordered, config=ordered.config.model_copy(update={"recording": recording}))
+
+    async def operate() -> None:
+        await watcher.event("run.start", 60)
+        await watcher.event("guard.disk_low", 1200)
+        (directory,) = out.iterdir()
+        assert (await asyncio.to_thread(ask_status, directory)).reasons == ("disk_low", "interlock")
+        assert (await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"] == ["disk_low"]
+        await watcher.event("guard.disk_low", 1200)
+        await asyncio.to_thread(ask, directory, {"do": "stop"})
+
+    await run_operated(ordered, out, watcher, operate())
+    assert len((tmp_path / "told").read_text().splitlines()) == 2
+
+
+async def test_a_terminal_that_is_closed_leaves_the_stand_safe(tmp_path: Path, order: Callable[..., Order]):
+    hang_up = at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGHUP))
+    with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
+        await run_virtual(order(LONG_SOAK), tmp_path / "out", None, hang_up)
+    (directory,) = (tmp_path / "out").iterdir()
+    check_safe(Session.open(directory))
+
+
+@pytest.mark.parametrize("who", ["thermometers", "regulator"])
+async def test_a_poller_or_listener_that_fails_unexpectedly_leaves_the_stand_safe(
+    tmp_path: Path, order: Callable[..., Order], who: str
+):
+    """Whoever listens fails at a reading, in the poller's task, and at the end of the run."""
+    failing = list[bool]()
+
+    def listen(item: Item) -> None:
+        if isinstance(item, Batch) and item.device == who and failing:
+            failing.clear()
+            raise RuntimeError("nobody expected this")
+        if isinstance(item, Event) and item.kind == "run.end":
+            raise RuntimeError("nor that")
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(listen)
+        at_step("Soak", lambda: failing.append(True))(hub)
+
+    with pytest.raises(RuntimeError, match="nor that"):
+        await run_virtual(order(LONG_SOAK), tmp_path / "out", None, watch)
+    (directory,) = (tmp_path / "out").iterdir()
+    check_safe(Session.open(directory))
