@@ -1,11 +1,12 @@
 """The guard's table with the installed limits: what is said on the hub, who is excused, what costs how much time."""
 
+import math
 from pathlib import Path
 
 import pytest
 
 from drivers.clock import seconds_ns
-from drivers.interface import Reading
+from drivers.interface import Reading, bad_reading
 from stand.config import load_config, packaged
 from stand.hub import Batch, Event, Hub, StepMark, StepState
 from stand.interlocks import Fault
@@ -36,7 +37,9 @@ class Table:
         values = self.values | {name.replace("_", ".", 1): value for name, value in changed.items()}
         noise = {"thermometers.air", "thermometers.granite_inside"}
         for channel, value in values.items():
-            reading = Reading(channel, value + (time_s % 7) * 1e-3 * (channel in noise), "1", time_ns)
+            noisy = value + (time_s % 7) * 1e-3 * (channel in noise)
+            lost = math.isnan(value)
+            reading = bad_reading(channel, "1", time_ns, "lost") if lost else Reading(channel, noisy, "1", time_ns)
             self.hub.publish(Batch("device", time_ns, (reading,)))
         return [fault for watch in self.watches if (fault := watch.check(self.hub, time_ns)) is not None]
 
@@ -82,6 +85,13 @@ def test_an_open_flap_holds_after_five_minutes_unless_a_capture_is_under_way():
     found = capturing.first_s(4000, flap_position=1.0)
     assert found is not None
     assert (found[0], found[1].rule) == (2700, "flap_open")
+
+
+@pytest.mark.parametrize(("channel", "after_s"), [("flap_position", 300), ("relays_heater_enable", 60)])
+def test_a_flap_or_relay_board_that_cannot_be_asked_holds_after_its_time(channel: str, after_s: int):
+    found = Table().first_s(4000, **{channel: math.nan})
+    assert found is not None
+    assert (found[0], found[1].rule, found[1].action) == (after_s, "sensor_bad", "hold")
 
 
 @pytest.mark.parametrize("end", [StepState.DONE, StepState.FAILED])
