@@ -38,24 +38,6 @@ _ENDING = {signal.SIGINT, signal.SIGTERM}
 
 
 @app.command()
-def simulate(
-    config: Annotated[str, typer.Argument(help="A configuration with a `simulation` section.")] = "simulated",
-) -> None:
-    """The simulated laboratory in real time, until interrupted: every device answers at its configured address.
-
-    Example: stand simulate & stand run demo
-    """
-    with one_line_errors():
-        stand_config = load_config(packaged("", config))
-        simulator = Simulator(laboratory_of(stand_config, virtual=False, seed=None))
-        # Blocked only now, or the simulator would inherit it; unblocked, SIGTERM would end us and leave it behind.
-        signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
-        typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
-        signal.sigwait(_ENDING)
-        simulator.stop()
-
-
-@app.command()
 def plan(
     recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
     config: Annotated[
@@ -90,6 +72,24 @@ def plan(
             f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
         )
         typer.echo(str(learned))
+
+
+@app.command()
+def simulate(
+    config: Annotated[str, typer.Argument(help="A configuration with a `simulation` section.")] = "simulated",
+) -> None:
+    """The simulated laboratory in real time, until interrupted: every device answers at its configured address.
+
+    Example: stand simulate & stand run demo
+    """
+    with one_line_errors():
+        stand_config = load_config(packaged("", config))
+        simulator = Simulator(laboratory_of(stand_config, virtual=False, seed=None))
+        # Blocked only now, or the simulator would inherit it; unblocked, SIGTERM would end us and leave it behind.
+        signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+        typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
+        signal.sigwait(_ENDING)
+        simulator.stop()
 
 
 def _line(step: PricedStep) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import shutil
 import tempfile
-from collections.abc import Callable, Collection, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -83,7 +84,10 @@ def run(
             check_reportable(order.recipe.plan())
         directory = out or order.config.recording.directory
         _check_writable(directory)
-        with _run_progress(price(order.recipe.plan(), order.config, load_learned(directory))) as watch:
+        steps = price(order.recipe.plan(), order.config, load_learned(directory))
+        if lack := small_disk(shutil.disk_usage(_existing(directory)).free, steps, order.config):
+            typer.echo(one_line(f"warning: {directory}: {lack}"), err=True)
+        with _run_progress(steps) as watch:
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
             session = asyncio.run(work)
         _finished(session, order.config, report=report)
@@ -145,12 +149,23 @@ def _unused(out: Path) -> Path:
     return out if not out.exists() else next(path for path in candidates if not path.exists())
 
 
+def _existing(directory: Path) -> Path:
+    """`directory`, or the nearest folder above it that is there."""
+    return next(path for path in (directory, *directory.absolute().parents) if path.exists() or path.is_symlink())
+
+
+def small_disk(free_bytes: int, steps: Iterable[PricedStep], config: StandConfig) -> str:
+    """What is wrong with so much room for a run that would stop in the middle of the night; "" when it will do."""
+    plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
+    if free_bytes / 1e9 >= plan_GB + least_GB:
+        return ""
+    return f"{free_bytes / 1e9:.1f} GB are free; the plan records {plan_GB:.1f} GB and waits below {least_GB:.1f} GB"
+
+
 def _check_writable(directory: Path) -> None:
     """ConfigError when no session could be made below `directory`: to be told before anything is opened."""
     try:
-        places = (directory, *directory.absolute().parents)
-        existing = next(path for path in places if path.exists() or path.is_symlink())
-        Path(tempfile.mkdtemp(prefix=".writable-", dir=existing)).rmdir()
+        Path(tempfile.mkdtemp(prefix=".writable-", dir=_existing(directory))).rmdir()
     except OSError as error:
         raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from compensation.drift.validation import table
-from compensation.report.report import analyse
 from drivers.interface import ConfigError, StandError
 from experiments.steps import Capture, PlannedStep, Role
 from stand.progress import progress
@@ -31,6 +29,10 @@ def report_session(session: Path, folder: Path) -> list[str]:
     The session's own folder will do: whatever reads a session looks only at what a run has left there. NotReported when
     the frames do not allow it or a file cannot be written; what was recorded is as it was.
     """
+    # Figures and fit take half a second to import, which `stand status` need not wait for.
+    from compensation.drift.validation import table
+    from compensation.report.report import analyse
+
     model, report = folder / MODEL_NAME, folder / REPORT_NAME
     try:
         evaluation = analyse([session], model, report, progress)

@@ -1,5 +1,6 @@
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,9 @@ from typer.testing import CliRunner
 
 from stand.commands import app
 from stand.config import packaged
+from stand.estimate import price
+from stand.order_files import load_order
+from stand.run_cli import small_disk
 
 runner = CliRunner()
 
@@ -82,6 +86,7 @@ def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(
         (["plan", "demo", "--config", "nowhere.yaml"], "nowhere.yaml: no such file"),
         (["run", "demo", "--seed", "3"], "--seed belongs to --virtual-time"),
         (["run", "demo", "--virtual-time", "--seed", "-1"], "--seed is 0 or more, not -1"),
+        (["run", "warm-up", "--report"], "--report needs a recipe with a thermal_cycle"),
         (["run", "demo", "--out", "/proc/x"], "/proc/x: no session can be written there"),
         (["run", "demo", "--out", __file__], "no session can be written there (Not a directory)"),
         (["demo", "--out", "/proc/x"], "/proc/x: no session can be written there"),
@@ -135,3 +140,30 @@ def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_
     assert "unplugged" in result.stderr
     assert "Traceback" not in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_disk_that_is_too_small_for_the_plan_is_told_of():
+    order = load_order("overnight", "simulated")
+    steps = price(order.recipe.plan(), order.config)
+    assert small_disk(11_000_000_000, steps, order.config) == (
+        "11.0 GB are free; the plan records 9.1 GB and waits below 2.0 GB"
+    )
+    assert small_disk(11_200_000_000, steps, order.config) == ""
+
+
+def test_ctrl_c_while_the_commands_are_imported_ends_with_a_line(tmp_path: Path):
+    # An import that tells when it is under way, and then waits for the interrupt.
+    (tmp_path / "typer.py").write_text(
+        "import signal\nprint('importing', flush=True)\nwhile True:\n    signal.pause()\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    command = [sys.executable, "-m", "stand.cli", "plan", "demo"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "importing\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+        assert process.stderr.read() == "interrupted; nothing was begun\n"

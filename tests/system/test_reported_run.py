@@ -1,0 +1,132 @@
+"""`stand run --report`: one command to a complete report, for a small recipe of every sequence and for the night."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from compensation.drift.model import CompensationModel
+from stand.config import packaged
+from stand.estimate import price
+from stand.exit_codes import NOT_REPORTED
+from stand.order_files import load_order
+from stand.recording.session import Session
+from stand.recording.verify import verify
+from stand.session_report import MODEL_NAME, REPORT_NAME
+from tests.system.conftest import require_aravis
+
+EVERY_SEQUENCE = """
+name: every-sequence
+experiments:
+  - warm_up: {table_position: {linear: 0, rotary: 0}, frames: 3, interval_s: 60}
+  - calibration:
+      equilibrium_s: 120
+      linear_mm: [0, 30]
+      rotary_deg: [-5, 5]
+      frames_per_position: 1
+  - thermal_cycle:
+      table_position: {linear: 0, rotary: 0}
+      equilibrium_s: 300
+      set_points_degC: [30, 20, 26, 18, 22]
+      held_out_degC: [22]
+      dwell_s: 600
+      reference_frames: 2
+  - validation:
+      temperatures_degC: [24, 30]
+      positions: [{linear_mm: 20, rotary_deg: 0}, {linear_mm: 25, rotary_deg: 4}]
+      equilibrium_s: 120
+      dwell_s: 600
+      reference_frames: 1
+      frames_per_position: 1
+"""
+TOO_FEW_TEMPERATURES = """
+name: too-few
+experiments:
+  - thermal_cycle:
+      table_position: {linear: 0, rotary: 0}
+      equilibrium_s: 60
+      set_points_degC: [25]
+      dwell_s: 60
+      reference_frames: 1
+"""
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Iterator[Path]:
+    """A folder for sessions that is not kept: a night is large."""
+    yield tmp_path / "sessions"
+    shutil.rmtree(tmp_path / "sessions", ignore_errors=True)
+
+
+def run_reported(recipe: str, config_text: str, out: Path, timeout_s: float) -> subprocess.CompletedProcess[str]:
+    config = out.parent / "stand.yaml"
+    config.write_text(config_text)
+    command = [sys.executable, "-m", "stand.cli", "run", recipe, "--config", str(config), "--out", str(out)]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    options = ["--virtual-time", "--report"]
+    return subprocess.run(
+        [*command, *options], capture_output=True, text=True, env=environment, check=False, timeout=timeout_s
+    )
+
+
+def check_reported(ended: subprocess.CompletedProcess[str]) -> Path:
+    """The session: sound, with a model and a report in its folder."""
+    assert ended.returncode == 0, ended.stderr
+    session, *lines = ended.stdout.splitlines()
+    directory = Path(session)
+    assert verify(directory).is_sound
+    assert lines[-2:] == [f"model    {directory / MODEL_NAME}", f"report   {directory / REPORT_NAME}"]
+    assert CompensationModel.load(directory / MODEL_NAME).session_ids == (directory.name,)
+    assert directory.name in (directory / REPORT_NAME).read_text(encoding="utf-8")
+    return directory
+
+
+@pytest.mark.usefixtures("_aravis")
+def test_one_command_runs_every_sequence_to_a_report(out: Path, config_text: Callable[..., str]):
+    recipe = out.parent / "recipe.yaml"
+    recipe.write_text(EVERY_SEQUENCE)
+    directory = check_reported(run_reported(str(recipe), config_text(), out, 120))
+    assert Session.open(directory).frame_count == 3 + 4 + 2 + 5 + 2 * 3
+
+
+@pytest.mark.usefixtures("_aravis")
+def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, config_text: Callable[..., str]):
+    recipe = out.parent / "recipe.yaml"
+    recipe.write_text(TOO_FEW_TEMPERATURES)
+    ended = run_reported(str(recipe), config_text(), out, 60)
+    assert ended.returncode == NOT_REPORTED
+    directory = Path(ended.stdout.strip())
+    assert verify(directory).is_sound
+    assert not (directory / REPORT_NAME).exists()
+    last = ended.stderr.splitlines()[-1]
+    assert last.startswith(f"error: {directory} is recorded, but not reported: a fit needs frames at 3 chamber")
+
+
+@pytest.mark.nightly
+@pytest.mark.usefixtures("_aravis")
+def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_text: Callable[..., str]):
+    text = config_text(recording={"frame_encoding": "roi"})
+    directory = check_reported(run_reported("overnight", text, out, 3600))
+    session = Session.open(directory)
+    assert session.frame_count == 3600 + 34 * 5 + 20 + 14 * 5
+    assert not [event.text for event in session.events() if event.level != "info"]
+
+    order = load_order("overnight", str(out.parent / "stand.yaml"))
+    expected_s = {step.planned.step_id: step.duration_s for step in price(order.recipe.plan(), order.config)}
+    marks = [mark for mark in session.steps() if mark.kind != "CoolDown"]  # the simulated camera is cold already
+    took_s = sum((end.time_ns - begin.time_ns) / 1e9 for begin, end in zip(marks[::2], marks[1::2], strict=True))
+    assert took_s == pytest.approx(sum(expected_s[mark.step_id] for mark in marks[::2]), rel=0.02)
+    assert sum(expected_s.values()) < 14 * 3600  # 18:00 to 08:00
+    report = (directory / REPORT_NAME).read_text(encoding="utf-8")
+    for title in ("Result", "Drift", "Before and after compensation", "Model", "Recorded data"):
+        assert f">{title}<" in report
+    assert packaged("recipes", "overnight").read_text() == session.attachments["recipe.yaml"]
