@@ -9,6 +9,7 @@ it was never acknowledged, and is cut off before anything is appended.
     Dwell     what a soak has earned so far
     Held      a reason to wait appeared or went
     Gap       nothing ran between two instants
+    Again     steps that were done are to be done again
     Tripped   the guard has made the stand safe, and why
     Cleared   an operator has seen to what had tripped
     Ended     complete, tripped, interrupted by the operator, or failed
@@ -87,6 +88,14 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
+class Again:
+    """These steps count as neither begun nor done from now on, and no frame of theirs before counts."""
+
+    time_ns: int
+    step_ids: list[str]
+
+
+@dataclass(frozen=True, slots=True)
 class Tripped:
     """The guard has made the stand safe; nothing goes on before an operator has cleared it."""
 
@@ -111,9 +120,9 @@ class Ended:
     text: str
 
 
-Entry = Begun | Step | Dwell | Held | Gap | Tripped | Cleared | Ended
+Entry = Begun | Step | Dwell | Held | Gap | Again | Tripped | Cleared | Ended
 _ENTRIES: dict[str, type[Entry]] = {
-    kind.__name__: kind for kind in (Begun, Step, Dwell, Held, Gap, Tripped, Cleared, Ended)
+    kind.__name__: kind for kind in (Begun, Step, Dwell, Held, Gap, Again, Tripped, Cleared, Ended)
 }
 
 

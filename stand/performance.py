@@ -17,11 +17,12 @@ from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.guard import Guard
 from stand.hub import Event, Item
 from stand.interlocks import Fault
-from stand.journal import Cleared, Ended, Entry, Gap, Journal
+from stand.journal import Again, Cleared, Ended, Entry, Gap, Journal
 from stand.logbook import Logbook
 from stand.poller import Poller
 from stand.recording.instants import utc_text
 from stand.recording.recorder import Recorder
+from stand.recording.superseded import restarted
 from stand.resume import Interruption, begun
 from stand.scheduler import Progress, Scheduler
 from stand.session_setup import Order
@@ -54,6 +55,7 @@ async def perform(work: Performance) -> None:
     """The whole plan, or what is not done of it; the actuators are safe before anything else is taken down."""
     assembly, stop = work.assembly, work.stop
     log = Logbook(assembly.hub, assembly.clock)
+    assembly.stand.attended = work.order.attended
     pollers, guard = assembly.pollers(), _guard(assembly, stop, log)
     watchers: list[asyncio.Task[None]] = []
     ended = Ended(0, "failed", "")
@@ -97,6 +99,9 @@ async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log
         log.tell("info", "run.start", f"recipe {work.order.recipe.name}")
     else:
         _tell_interruption(work.before, work.assembly.clock.now_ns(), log)
+        if work.before.again:
+            event = restarted(work.assembly.clock.now_ns(), work.before.again[-1], work.before.superseded)
+            work.assembly.hub.publish(event)
     if not await guard.check():
         raise StandTripped("the rules do not hold")
     await work.recorder.flushed()  # a session with a journal can be opened and resumed
@@ -140,7 +145,8 @@ def _first_entries(work: Performance) -> tuple[Entry, ...]:
     if work.before is None:
         return (begun(work.order, work.recorder.directory.name, now_ns, work.seed),)
     cleared = (Cleared(now_ns),) if work.before.tripped else ()
-    return (*cleared, Gap(work.before.last_ns, now_ns))
+    again = (Again(now_ns, list(work.before.again)),) if work.before.again else ()
+    return (*cleared, Gap(work.before.last_ns, now_ns), *again)
 
 
 def _tell_interruption(before: Interruption, now_ns: int, log: Logbook) -> None:

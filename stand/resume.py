@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -17,8 +17,9 @@ from typing import Literal, cast
 from drivers.interface import SessionError
 from experiments.steps import Capture, PlannedStep
 from stand.camera_cooling import Cooling
+from stand.cold_start import cold_start
 from stand.hub import StepState
-from stand.journal import Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
+from stand.journal import Again, Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
 from stand.order_files import parse_order
 from stand.recipe import Recipe
 from stand.recording.overview import glance
@@ -50,7 +51,8 @@ class Interruption:
 
     last_ns: the last instant on the disk. seed: of the simulated laboratory. ended: how it ended, "" when it was
     killed. tripped: what an operator has cleared. salvaged: what had to be finished first. cooling: the last word of
-    a camera that was off.
+    a camera that was off. again: ids of the steps of an interrupted warm-up that are done again, its capture last,
+    which had `superseded` frames.
     """
 
     directory: Path
@@ -65,6 +67,8 @@ class Interruption:
     tripped: str
     salvaged: tuple[Salvaged, ...]
     cooling: Cooling | None
+    again: tuple[str, ...] = ()
+    superseded: int = 0
 
     def release(self) -> None:
         """Give the session free for another daemon; may be called twice."""
@@ -98,7 +102,8 @@ def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear
     salvaged = tuple(salvage_unfinished(directory.resolve().parent))
     session = Session.open(directory)
     order = _order(session, first)
-    progress = _progress(session, entries, order.recipe)
+    found = _found(session, entries, order.recipe)
+    progress = found.progress
     set_up = SetUp()
     for planned in order.recipe.plan():
         set_up = set_up.after(planned) if planned.step_id in progress.done else set_up
@@ -115,6 +120,8 @@ def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear
         tripped,
         salvaged,
         None if set_up.camera_on else _cooling(session),
+        found.again,
+        found.superseded,
     )
 
 
@@ -162,27 +169,58 @@ def journaled(entries: Iterable[Entry]) -> tuple[frozenset[str], dict[str, float
     done: set[str] = set()
     earned_s: dict[str, float] = {}
     for entry in entries:
-        if isinstance(entry, Dwell):
-            earned_s[entry.step_id] = entry.earned_s
-        if isinstance(entry, Step) and entry.state == "done":
-            done.add(entry.step_id)
-            earned_s.pop(entry.step_id, None)
+        match entry:
+            case Dwell():
+                earned_s[entry.step_id] = entry.earned_s
+            case Step(state="done"):
+                done.add(entry.step_id)
+                earned_s.pop(entry.step_id, None)
+            case Again():
+                done.difference_update(entry.step_ids)
+            case _:
+                pass
     return frozenset(done), earned_s
 
 
-def _progress(session: Session, entries: Iterable[Entry], recipe: Recipe) -> Progress:
+def _begun_steps(entries: Iterable[Entry]) -> set[str]:
+    """The ids of the steps that were begun, done or not."""
+    begun: set[str] = set()
+    for entry in entries:
+        if isinstance(entry, Step):
+            begun.add(entry.step_id)
+        if isinstance(entry, Again):
+            begun.difference_update(entry.step_ids)
+    return begun
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """again: ids of steps to be done again, the capture last. superseded: how many frames that capture had."""
+
+    progress: Progress
+    again: tuple[str, ...]
+    superseded: int
+
+
+def _found(session: Session, entries: Sequence[Entry], recipe: Recipe) -> _Found:
+    """What counts as done; of a warm-up that was interrupted nothing does from its cold start on."""
+    since_ns = {step_id: entry.time_ns for entry in entries if isinstance(entry, Again) for step_id in entry.step_ids}
     done, earned_s = journaled(entries)
-    done |= {mark.step_id for mark in session.steps() if mark.state is StepState.DONE}
+    recorded = (mark for mark in session.steps() if mark.time_ns >= since_ns.get(mark.step_id, 0))
+    done |= {mark.step_id for mark in recorded if mark.state is StepState.DONE}
+    again = tuple(planned.step_id for planned in cold_start(recipe.plan(), done, _begun_steps(entries)))
     begun = {planned.step_id for planned in recipe.plan() if isinstance(planned.step, Capture)} - done
-    return Progress(done, earned_s, _frames(session, begun))
+    frames = _frames(session, begun, since_ns)
+    superseded = frames.pop(again[-1], 0) if again else 0
+    return _Found(Progress(done - frozenset(again), earned_s, frames), again, superseded)
 
 
-def _frames(session: Session, step_ids: set[str]) -> dict[str, int]:
-    """How many frames of these steps are on the disk with their descriptions."""
+def _frames(session: Session, step_ids: set[str], since_ns: Mapping[str, int]) -> dict[str, int]:
+    """How many frames of these steps are on the disk with their descriptions, each counted from its instant on."""
     times_ns = set(session.frame_times_ns.tolist())
     counts: dict[str, int] = {}
     for time_ns, meta in session.frame_metas:
-        if meta.step_id in step_ids and time_ns in times_ns:
+        if meta.step_id in step_ids and time_ns in times_ns and time_ns >= since_ns.get(meta.step_id, 0):
             counts[meta.step_id] = counts.get(meta.step_id, 0) + 1
     return counts
 

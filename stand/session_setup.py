@@ -25,13 +25,15 @@ from stand.recording.settings import VIRTUAL_COMMIT_S
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What to run: the checked files and their texts (they are attached to the recording)."""
+    """What to run: the checked files and their texts (they are attached to the recording). attended: somebody is there
+    to do what the plan prompts for."""
 
     config: StandConfig
     recipe: Recipe
     config_text: str
     recipe_text: str
     target_text: str
+    attended: bool = False
 
     def attachments(self) -> dict[str, str]:
         """The texts by the names under which a session has them."""

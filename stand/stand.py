@@ -17,7 +17,7 @@ from drivers.stage import Axis
 from drivers.thermometers import Thermometers
 from stand.camera_cooling import Cooling, cool_down, last_word
 from stand.compressor import CompressorLimits, CompressorState, decide, keep, restored
-from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
+from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
 from stand.hub import Event, Hub
 from stand.interlocks import Fault
 from stand.stage_care import check_home, ready
@@ -64,6 +64,7 @@ class Stand:
         self.devices = devices
         self.fault: Fault | None = None
         self.gate = Gate()
+        self.attended = False  # whether an operator does what is prompted for
         self._limits = limits
         self._hub = hub
         self._clock = clock
@@ -202,9 +203,14 @@ class Stand:
             await stage.move_to(self._commanded[axis])
 
     async def prompt(self, text: str) -> None:
-        """Tell the operator what to do; nobody attends, so the run goes on and says so."""
+        """Tell the operator what to do, and wait until it is done (a pause that the operator ends); when nobody attends
+        the run goes on and says so."""
         self._check()
-        self._hub.publish(Event(self._clock.now_ns(), "info", "prompt", text))
+        self._hub.publish(Event(self._clock.now_ns(), "warning" if self.attended else "info", "prompt", text))
+        if self.attended:
+            self.gate.hold(OPERATOR)
+            await self.gate.passed()
+            return
         self._hub.publish(Event(self._clock.now_ns(), "warning", "prompt_skipped", f"nobody attends; not done: {text}"))
 
     async def cool_down(self, band_K: float, time_constant_s: float, max_s: float) -> None:

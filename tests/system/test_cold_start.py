@@ -1,0 +1,128 @@
+"""Warm-ups that are interrupted begin anew from a cold camera; prompts that somebody attends to are waited for."""
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments.steps import Capture, PowerCamera, Prompt
+from stand.cold_start import cold_start
+from stand.control_client import ask
+from stand.hub import Event, Hub, Item, StepMark, StepState
+from stand.recording.session import Session
+from stand.recording.superseded import begins_of, is_superseded
+from stand.resume import interruption
+from stand.run import run_virtual
+from stand.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.resume_process import Daemon
+from tests.system.test_resume import end_laboratory
+
+WARM_UP = """
+name: warm
+experiments:
+  - warm_up: {table_position: {linear: 10, rotary: 0}, frames: 8, interval_s: 30, band_K: 2}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+def test_a_warm_up_that_was_killed_begins_anew_from_a_cold_camera(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order(WARM_UP)
+    daemon = Daemon(ordered, tmp_path / "out")
+    assert daemon.lives_for(5, "Frame")
+    daemon.kill()
+    (directory,) = (tmp_path / "out").iterdir()
+    daemon = Daemon(None, directory)
+    assert daemon.lives_for(2, "Frame")  # once more, in the warm-up that was begun anew
+    daemon.kill()
+    assert Daemon(None, directory).wait() == 0
+
+    session = Session.open(directory)
+    (capture,) = (planned for planned in ordered.recipe.plan() if isinstance(planned.step, Capture))
+    restarts = [event for event in session.events() if event.kind == "capture_restarted"]
+    assert len(restarts) == 2
+    begins_ns = begins_of(session)
+    assert begins_ns == {capture.step_id: restarts[-1].time_ns}
+    frames = [frame for frame in session.frames() if frame.step_id and not is_superseded(frame, begins_ns)]
+    assert len(frames) == 8
+    assert session.frame_count > 8
+    assert frames[0].camera_degC < 27.0
+    assert frames[-1].camera_degC > frames[0].camera_degC + 1.0
+    marks = [mark for mark in session.steps() if mark.kind == "CoolDown" and mark.state is StepState.DONE]
+    assert len(marks) == 3
+    assert marks[-1].time_ns > begins_ns[capture.step_id]
+
+
+def test_only_what_follows_from_a_warm_camera_is_done_again(order: Callable[..., Order]):
+    plan = tuple(order(WARM_UP).recipe.plan())
+    ids = [planned.step_id for planned in plan]
+    off = next(planned.index for planned in plan if planned.step == PowerCamera(False))
+    on = next(planned.index for planned in plan if planned.step == PowerCamera(True))
+    assert cold_start(plan, ids[:on], ids[:on]) == ()  # killed while the camera cooled: it is off
+    again = cold_start(plan, ids[:on], ids[: on + 1])  # killed while it was switched on
+    assert [planned.index for planned in again] == list(range(off, on + 2))
+    assert cold_start(plan, ids[: on + 1], ids[: on + 2]) == again
+    assert cold_start(plan, ids[: on + 2], ids[: on + 2]) == ()
+
+
+def test_what_the_operator_did_is_not_asked_for_again(order: Callable[..., Order]):
+    plan = tuple(order(WARM_UP.replace("band_K: 2", "band_K: 2, rolls_deg: [20]")).recipe.plan())
+    ids = [planned.step_id for planned in plan]
+    assert any(isinstance(planned.step, Prompt) for planned in plan)
+    again = cold_start(plan, ids[:-3], ids[:-3])
+    assert isinstance(again[-1].step, Capture)
+    assert not any(isinstance(planned.step, Prompt) for planned in again)
+
+
+@pytest.mark.parametrize("attended", [True, False])
+async def test_a_prompt_that_somebody_attends_to_holds_the_run(
+    tmp_path: Path, order: Callable[..., Order], attended: bool
+):
+    recipe = WARM_UP.replace("frames: 8", "frames: 2, cool_down_max_s: 10, rolls_deg: [20]")
+    ordered, out = replace(order(recipe), attended=attended), tmp_path / "out"
+    kinds, tasks = list[str](), list[asyncio.Task[None]]()
+
+    async def done() -> None:
+        (directory,) = out.iterdir()
+        assert (await asyncio.to_thread(ask, directory, {"do": "continue"}))["reasons"] == []
+        kinds.append("continued")
+
+    def watch(hub: Hub) -> None:
+        def follow(item: Item) -> None:
+            if isinstance(item, Event):
+                kinds.append(item.kind)
+            if isinstance(item, StepMark):
+                kinds.append(f"{item.kind} {item.state}")
+            if isinstance(item, Event) and item.kind == "held":
+                tasks.append(asyncio.create_task(done()))
+
+        hub.subscribe(follow)
+
+    session = Session.open(await run_virtual(ordered, out, None, watch))
+    await asyncio.gather(*tasks)
+    counted = Counter(kinds)
+    assert (counted["prompt"], counted["prompt_skipped"]) == (1, 0 if attended else 1)
+    assert counted["held"] == counted["released"] == counted["continued"] == int(attended)
+    if attended:
+        assert kinds.index("prompt") < kinds.index("held") < kinds.index("released") < kinds.index("Prompt done")
+    assert len(session.frame_metas) == 2
+
+
+def test_nothing_is_superseded_in_a_run_that_was_not_interrupted(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order(WARM_UP.replace("frames: 8", "frames: 2, cool_down_max_s: 10"))
+    daemon = Daemon(ordered, tmp_path / "out")
+    assert daemon.lives_for(1, "StepMark")
+    daemon.kill()
+    (directory,) = (tmp_path / "out").iterdir()
+    before = interruption(directory)
+    assert (before.again, before.superseded) == ((), 0)
+    before.release()
+    assert begins_of(Session.open(directory)) == {}
+    asyncio.run(end_laboratory(ordered))
