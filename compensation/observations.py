@@ -36,9 +36,9 @@ _PREVIEW_WIDTH_PX = 816
 
 
 class Role(StrEnum):
-    """What a frame was taken for, as its capture step says. OTHER: no such step, or one without a set-point.
+    """What a frame was taken for, as its step says. OTHER: no such step, or one without a set-point.
 
-    The first four are experiments.steps.Role, written out again because this package knows recorded sessions only and
+    All but the last are experiments.steps.Role, written out again because this package knows recorded sessions only and
     may not import what plans them: the words in the recording are what the two share.
     """
 
@@ -46,6 +46,7 @@ class Role(StrEnum):
     FIT = "fit"
     VALIDATION = "validation"
     WARM_UP = "warm_up"
+    SETTLING = "settling"
     OTHER = "other"
 
 
@@ -120,7 +121,7 @@ def observe(session: Session, target: Target, report: Report | None = None) -> O
     A frame without the target, of another size or without a camera temperature stays, with its reason. SessionError
     when no frame can be used at all.
     """
-    captures = {mark.step_id: mark.parameters for mark in session.steps() if mark.kind == "Capture"}
+    captures = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
     found: list[_Seen] = []
     previous: Detection | None = None
     first: Frame | None = None
@@ -236,7 +237,7 @@ def _covariance(detection: Detection | None, count: int) -> Float:
 
 
 def _purpose(parameters: dict[str, object]) -> tuple[Role, float]:
-    """Role and set-point of a capture step's parameters."""
+    """Role and set-point of a step that takes frames, from its parameters."""
     role, chamber_degC = parameters.get("role"), parameters.get("chamber_degC")
     if not isinstance(chamber_degC, int | float) or not isinstance(role, str) or role not in set(Role):
         return Role.OTHER, math.nan

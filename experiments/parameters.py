@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Chamber_degC = Annotated[float, Field(ge=-10, le=70)]  # the paper's chamber, section 2
 Wait_s = Annotated[float, Field(ge=0, le=7 * 86400)]  # longer is a slip of the keyboard
@@ -32,6 +32,50 @@ class StillTable(CaptureParameters):
     """An experiment with the target in one place: axis -> mm or deg."""
 
     table_position: dict[str, float] = Field(default_factory=dict)
+
+
+class Settled(BaseModel):
+    """When a camera counts as settled; see steps.SoakUntilSettled.
+
+    The drift decides: it is seen to some 0.1 mpx/min, while cameras tell their temperature in digits of 0.1 to 0.5 K.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    min_s: Wait_s = 600.0
+    window_s: float = Field(default=600.0, ge=60, le=3600)
+    look_every_s: float = Field(default=120.0, ge=20, le=900)  # the flap alone takes 6 s there and back
+    camera_K_per_min: float = Field(default=0.2, gt=0, le=10)
+    drift_px_per_min: float = Field(default=0.003, gt=0, le=10)
+
+    @model_validator(mode="after")
+    def _enough_looks(self) -> Self:
+        if self.window_s < 4 * self.look_every_s:
+            raise ValueError(f"window_s {self.window_s} holds less than four looks every {self.look_every_s} s")
+        return self
+
+
+def _settled(value: object) -> object:
+    """`settled` alone takes the defaults, `{settled: {...}}` has some of its own."""
+    if value == "settled":
+        return Settled()
+    if isinstance(value, dict) and set(cast("dict[object, object]", value)) == {"settled"}:
+        return cast("dict[str, object]", value)["settled"]
+    if value is None or isinstance(value, Settled):
+        return value
+    raise ValueError(f"until takes `settled`, or `settled:` with thresholds, not {value!r}")
+
+
+Until = Annotated[Settled | None, BeforeValidator(_settled)]
+
+
+def check_until(until: Settled | None, dwell_s: float) -> None:
+    """ValueError when a dwell of at most `dwell_s` leaves no time to see that the camera has settled."""
+    if until is not None and dwell_s < max(until.min_s, until.window_s):
+        raise ValueError(
+            f"dwell_s {dwell_s} is the longest dwell; it must be at least until's min_s {until.min_s} "
+            f"and window_s {until.window_s}"
+        )
 
 
 class TablePosition(BaseModel):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from experiments.parameters import CaptureParameters, MovingTable, TablePosition
-from experiments.steps import Capture, CheckHome, CloseFlap, MoveTo, OpenFlap, Role, Soak, Step
+from experiments.parameters import CaptureParameters, MovingTable, Settled, TablePosition
+from experiments.steps import Capture, CheckHome, CloseFlap, MoveTo, OpenFlap, Role, Soak, SoakUntilSettled, Step
 
 _AXES = ("linear", "rotary")
 
@@ -15,6 +15,22 @@ def frames_through_flap(parameters: CaptureParameters, frames: int, role: Role, 
     yield OpenFlap()
     yield Capture(frames, parameters.interval_s, parameters.exposure_s, role, chamber_degC)
     yield CloseFlap()
+
+
+def dwell(dwell_s: float, until: Settled | None, exposure_s: float, chamber_degC: float) -> Step:
+    """The soak at a set-point: `dwell_s`, or at most that."""
+    if until is None:
+        return Soak(dwell_s)
+    return SoakUntilSettled(
+        max_s=dwell_s,
+        min_s=until.min_s,
+        window_s=until.window_s,
+        look_every_s=until.look_every_s,
+        camera_K_per_min=until.camera_K_per_min,
+        drift_px_per_min=until.drift_px_per_min,
+        exposure_s=exposure_s,
+        chamber_degC=chamber_degC,
+    )
 
 
 def placed(table_position: Mapping[str, float]) -> Iterator[Step]:

@@ -18,7 +18,8 @@ class Role(StrEnum):
     """What a capture is for; the fitter never sees VALIDATION frames, the validation never scores FIT frames.
 
     CALIBRATION, POSE and REPEATABILITY frames show the target elsewhere than the drift's: no drift is fitted to them.
-    POSE: the target at a validation position; REPEATABILITY: back at the first of them.
+    POSE: the target at a validation position; REPEATABILITY: back at the first of them. SETTLING: a look during a soak,
+    when the camera is not at rest yet.
     """
 
     REFERENCE = "reference"
@@ -28,6 +29,7 @@ class Role(StrEnum):
     CALIBRATION = "calibration"
     POSE = "pose"
     REPEATABILITY = "repeatability"
+    SETTLING = "settling"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,27 @@ class Soak:
     """Let the camera come to equilibrium for `duration_s` from now."""
 
     duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SoakUntilSettled:
+    """Let the camera come to equilibrium at the set-point `chamber_degC`; done when it has settled, after `min_s` at
+    the earliest and `max_s` at the latest.
+
+    Settled: throughout `window_s` the chamber was in its band, the camera's temperature changed by less than
+    `camera_K_per_min` and its image by less than `drift_px_per_min`, their uncertainties included. The image is looked
+    at every `look_every_s` by a frame exposed for `exposure_s`, the flap being open for it only.
+    """
+
+    max_s: float
+    min_s: float
+    window_s: float
+    look_every_s: float
+    camera_K_per_min: float
+    drift_px_per_min: float
+    exposure_s: float
+    chamber_degC: float
+    role: Role = Role.SETTLING
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +147,7 @@ Step = (
     | SetTemperature
     | StopChamber
     | Soak
+    | SoakUntilSettled
     | OpenFlap
     | CloseFlap
     | Capture
@@ -135,9 +159,17 @@ Step = (
 )
 
 
+AnySoak = Soak | SoakUntilSettled
+
+
 def is_setup(step: Step) -> bool:
     """Whether the step brings about a state, to be restored after an interruption; the others are work, done once."""
-    return not isinstance(step, Soak | CoolDown | Capture | CheckHome | Prompt)
+    return not isinstance(step, AnySoak | CoolDown | Capture | CheckHome | Prompt)
+
+
+def longest_s(soak: AnySoak) -> float:
+    """What the soak takes when it is not cut short, s."""
+    return soak.duration_s if isinstance(soak, Soak) else soak.max_s
 
 
 # What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves, homing and back.
@@ -150,8 +182,8 @@ _CAMERA_EXCESS_K = 20.0  # of a camera that has been on for an hour, over the ai
 def estimate_s(step: Step, camera_boot_s: float) -> float:
     """How long the step is expected to take on the stand's clock, s, with a camera that boots in `camera_boot_s`."""
     match step:
-        case Soak():
-            return step.duration_s
+        case Soak() | SoakUntilSettled():
+            return longest_s(step)
         case Capture():
             return (step.frames - 1) * step.interval_s + step.exposure_s
         case OpenFlap() | CloseFlap():

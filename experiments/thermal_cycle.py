@@ -2,6 +2,9 @@
 
 The camera is powered throughout and first comes to equilibrium at the reference temperature. The flap is closed but
 for the captures. Set-points listed as held out are recorded for validation and never shown to the fitter.
+
+With `until: settled` a dwell ends when the camera has settled, at the latest after `dwell_s`; the flap then opens for
+short looks at the target too.
 """
 
 from __future__ import annotations
@@ -11,8 +14,8 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import Chamber_degC, FrameCount, StillTable, Wait_s
-from experiments.pieces import frames_through_flap, placed
+from experiments.parameters import Chamber_degC, FrameCount, StillTable, Until, Wait_s, check_until
+from experiments.pieces import dwell, frames_through_flap, placed
 from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
 
 
@@ -24,17 +27,19 @@ class ThermalCycle(StillTable):
     set_points_degC: tuple[Chamber_degC, ...] = Field(min_length=1, max_length=1000)
     held_out_degC: tuple[Chamber_degC, ...] = Field(default=(), max_length=1000)
     dwell_s: Wait_s = 2700.0
+    until: Until = None
     cycles: int = Field(default=1, ge=1, le=100)
     reference_frames: FrameCount = 20
     frames_per_point: FrameCount = 1
 
     @model_validator(mode="after")
-    def _held_out_visits(self) -> Self:
+    def _possible(self) -> Self:
         unvisited = sorted(set(self.held_out_degC) - set(self.set_points_degC))
         if unvisited:
             raise ValueError(f"held_out_degC has {unvisited}, which set_points_degC never visits")
         if self.reference_degC in self.held_out_degC:
             raise ValueError(f"the reference {self.reference_degC} degC cannot be held out")
+        check_until(self.until, self.dwell_s)
         return self
 
     @property
@@ -53,7 +58,7 @@ def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     for _ in range(parameters.cycles):
         for chamber_degC in parameters.set_points_degC:
             yield SetTemperature(chamber_degC)
-            yield Soak(parameters.dwell_s)
+            yield dwell(parameters.dwell_s, parameters.until, parameters.exposure_s, chamber_degC)
             role = Role.VALIDATION if chamber_degC in parameters.held_out_degC else Role.FIT
             yield from frames_through_flap(parameters, parameters.frames_per_point, role, chamber_degC)
     yield StopChamber()

@@ -2,7 +2,8 @@
 
 The first temperature is the reference: what the table does to the target is known from there. The paper counts 12
 temperatures in its text and shows 11 deviations from the reference. At each temperature the target goes back to V0
-at the end; how far it is then from where it was is the table's own share of the deviations.
+at the end; how far it is then from where it was is the table's own share of the deviations. With `until: settled` a
+dwell ends when the camera, which sees the target at V0 meanwhile, has settled, at the latest after `dwell_s`.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import Chamber_degC, FrameCount, MovingTable, TablePosition, Wait_s
-from experiments.pieces import frames_at, homes_checked, moved
+from experiments.parameters import Chamber_degC, FrameCount, MovingTable, TablePosition, Until, Wait_s, check_until
+from experiments.pieces import dwell, frames_at, homes_checked, moved
 from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
 
 
@@ -27,15 +28,17 @@ class Validation(MovingTable):
     positions: tuple[TablePosition, ...] = Field(min_length=2, max_length=100)
     equilibrium_s: Wait_s = 2700.0
     dwell_s: Wait_s = 2700.0
+    until: Until = None
     reference_frames: FrameCount = 20
     check_home_every: int = Field(default=3, ge=1, le=100)
 
     @model_validator(mode="after")
-    def _each_once(self) -> Self:
+    def _possible(self) -> Self:
         if len(set(self.temperatures_degC)) < len(self.temperatures_degC):
             raise ValueError("temperatures_degC has the same temperature twice")
         if len(set(self.positions)) < len(self.positions):
             raise ValueError("positions has the same position twice; going back to the first is in the plan already")
+        check_until(self.until, self.dwell_s)
         return self
 
     @property
@@ -57,7 +60,7 @@ def validation(parameters: Validation) -> Iterator[Step]:
         if number % parameters.check_home_every == 0:
             yield from homes_checked()
         yield SetTemperature(chamber_degC)
-        yield Soak(parameters.dwell_s)
+        yield dwell(parameters.dwell_s, parameters.until, parameters.exposure_s, chamber_degC)
         yield from _poses(parameters, chamber_degC, parameters.frames_per_position)
     yield from homes_checked()
     yield StopChamber()

@@ -13,14 +13,29 @@ from types import MappingProxyType
 
 from drivers.interface import ConfigError
 from drivers.stage import PROFILES
-from experiments.steps import CheckHome, CloseFlap, MoveTo, OpenFlap, Step, estimate_s, kind_of
+from experiments.steps import (
+    CheckHome,
+    CloseFlap,
+    MoveTo,
+    OpenFlap,
+    SetTemperature,
+    SoakUntilSettled,
+    StartChamber,
+    Step,
+    estimate_s,
+    kind_of,
+)
 from stand.config import AxisConfig, StandConfig
+from stand.thermal_model import ChamberModel
 
 # Until recorded nights have shown better, s: a flap's travel with its confirmation, homing from near the switch.
 _FLAP_TRAVEL_S = 3.0
 _FLAP_AT_REST_S = 0.2
 _HOMING_S = 15.0
 _MOVE_CONFIRMED_S = 0.1
+
+
+LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +61,13 @@ _PACES = {"8MT160-300": Pace(1000.0, 2000.0, 4000.0, 500.0), "8MR151": Pace(2000
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a step finds: the flap, and where each axis stands (mm or deg; one that is missing is not homed)."""
+    """What a step finds: the flap, where each axis stands (mm or deg; one that is missing is not homed), and the last
+    two set-points: a soak is taken to begin when the chamber sets off from the one to the other."""
 
     flap_open: bool = False
     positions: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    from_degC: float = LABORATORY_degC
+    to_degC: float = LABORATORY_degC
 
     def after(self, step: Step) -> Situation:
         """What the step leaves behind."""
@@ -58,6 +76,8 @@ class Situation:
                 return replace(self, flap_open=True)
             case CloseFlap():
                 return replace(self, flap_open=False)
+            case StartChamber(chamber_degC) | SetTemperature(chamber_degC):
+                return replace(self, from_degC=self.to_degC, to_degC=chamber_degC)
             case MoveTo(axis, position):
                 return replace(self, positions=MappingProxyType({**self.positions, axis: position}))
             case _:
@@ -79,10 +99,14 @@ class Expectation:
 
 
 def expect(
-    step: Step, found: Situation, config: StandConfig, overheads_s: Mapping[str, float] = MappingProxyType({})
+    step: Step,
+    found: Situation,
+    config: StandConfig,
+    overheads_s: Mapping[str, float] = MappingProxyType({}),
+    chamber: ChamberModel | None = None,
 ) -> Expectation:
-    """What the step takes in the situation it finds; `overheads_s` was learned, by kind of work."""
-    usual = _usual(step, found, config)
+    """What the step takes in the situation it finds; `overheads_s` was learned, by kind of work, with `chamber`."""
+    usual = _usual(step, found, config, chamber or ChamberModel())
     return replace(usual, overhead_s=overheads_s.get(usual.work, usual.overhead_s))
 
 
@@ -94,7 +118,17 @@ def axis_of(config: StandConfig, name: str) -> AxisConfig:
     return axis
 
 
-def _usual(step: Step, found: Situation, config: StandConfig) -> Expectation:
+def settling_s(soak: SoakUntilSettled, found: Situation, chamber: ChamberModel) -> float:
+    """How long the soak is expected to take, s: the chamber arrives, the camera follows with its time constant until it
+    is slow enough, and then it has to stay so. What the image does meanwhile nobody knows before it was seen once."""
+    gap_K = abs(found.to_degC - found.from_degC)
+    first_K_per_min = 60.0 * gap_K / chamber.camera_time_constant_s
+    slowing_s = chamber.camera_time_constant_s * math.log(max(1.0, first_K_per_min / soak.camera_K_per_min))
+    expected_s = chamber.arrival_s(found.from_degC, found.to_degC) + slowing_s + soak.window_s
+    return min(soak.max_s, max(soak.min_s, expected_s))
+
+
+def _usual(step: Step, found: Situation, config: StandConfig, chamber: ChamberModel) -> Expectation:
     match step:
         case OpenFlap() | CloseFlap():
             travels = found.flap_open is not isinstance(step, OpenFlap)
@@ -110,6 +144,8 @@ def _usual(step: Step, found: Situation, config: StandConfig) -> Expectation:
             return Expectation(
                 f"check home {axis}", _to_home_s(stage, position) + _move_s(stage, 0.0, position), _HOMING_S
             )
+        case SoakUntilSettled():
+            return Expectation(kind_of(step), settling_s(step, found, chamber), 0.0)
         case _:
             return Expectation(kind_of(step), estimate_s(step, config.camera.boot_s), 0.0)
 

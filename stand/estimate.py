@@ -9,22 +9,24 @@ from dataclasses import dataclass, replace
 from drivers.interface import ConfigError
 from drivers.stage import PROFILES
 from experiments.steps import (
+    AnySoak,
     Capture,
     CheckHome,
     CoolDown,
     MoveTo,
     PlannedStep,
     SetTemperature,
-    Soak,
+    SoakUntilSettled,
     StartChamber,
     Step,
     estimate_s,
     frames_of,
     kind_of,
+    longest_s,
     parameters_of,
 )
 from stand.config import StandConfig
-from stand.durations import Situation, axis_of, expect
+from stand.durations import LABORATORY_degC, Situation, axis_of, expect
 from stand.learned import Learned
 from stand.thermal_model import ChamberModel
 
@@ -34,7 +36,6 @@ _BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0, "roi": 0.074}
 _TELEMETRY_BYTES_PER_MESSAGE = 116.0
 _SENSOR_PX = (2448, 2048)
 
-_LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
 _LONGEST_S = 366 * 86400.0  # a longer plan is a slip of the keyboard, and its end soon beyond any calendar
 
 
@@ -84,7 +85,9 @@ class _Approach:
         """When the step is done; a new set-point is taken to find the air at the old one."""
         if isinstance(step, StartChamber | SetTemperature):
             return _Approach(self.to_degC, step.chamber_degC)
-        return replace(self, age_s=self.age_s + duration_s, captured=self.captured or isinstance(step, Capture))
+        # A soak that waits for the camera has time enough when its longest is enough.
+        lasts_s = longest_s(step) if isinstance(step, SoakUntilSettled) else duration_s
+        return replace(self, age_s=self.age_s + lasts_s, captured=self.captured or isinstance(step, Capture))
 
 
 def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | None = None) -> tuple[PricedStep, ...]:
@@ -93,23 +96,25 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
     learned = learned or Learned()
     frame_px = (config.camera.width_px or _SENSOR_PX[0]) * (config.camera.height_px or _SENSOR_PX[1])
     telemetry_bytes_per_s = _messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
-    found, approach = Situation(), _Approach(_LABORATORY_degC, _LABORATORY_degC)
+    found, approach = Situation(), _Approach(LABORATORY_degC, LABORATORY_degC)
     priced: list[PricedStep] = []
     for planned in plan:
         _check(planned, config)
         step = planned.step
-        expected = expect(step, found, config, learned.overheads_s)
+        expected = expect(step, found, config, learned.overheads_s, learned.chamber)
         duration_s = expected.duration_s
-        size_bytes = frame_px * _image_bytes_per_px(step, config) + duration_s * telemetry_bytes_per_s
+        in_band_after_s = _in_band_after_s(step, approach, learned.chamber)
+        frames = _frames(step, duration_s, in_band_after_s)
+        size_bytes = frame_px * _image_bytes_per_px(step, frames, config) + duration_s * telemetry_bytes_per_s
         priced.append(
             PricedStep(
                 planned,
                 duration_s,
-                frames_of(step),
+                frames,
                 size_bytes,
                 expected.work,
                 expected.stated_s,
-                _in_band_after_s(step, approach, learned.chamber),
+                in_band_after_s,
                 _warning(step, approach, learned.chamber),
             )
         )
@@ -123,7 +128,14 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
 def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:
     """Of a soak: s until the chamber is in its band; None when it is, and of other steps."""
     after_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s
-    return after_s if isinstance(step, Soak) and after_s > 0.0 else None
+    return after_s if isinstance(step, AnySoak) and after_s > 0.0 else None
+
+
+def _frames(step: Step, duration_s: float, in_band_after_s: float | None) -> int:
+    """Of a soak: its looks, from when the chamber is in its band."""
+    if not isinstance(step, SoakUntilSettled):
+        return frames_of(step)
+    return max(0, math.ceil((duration_s - (in_band_after_s or 0.0)) / step.look_every_s))
 
 
 def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:
@@ -154,12 +166,12 @@ def _messages_per_s(config: StandConfig) -> float:
     return sum(1.0 / device.poll_s for device in polled)
 
 
-def _image_bytes_per_px(step: Step, config: StandConfig) -> float:
+def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
     """What all frames of a step take, per pixel of one; with `roi` a step's first frame is whole, then one at times."""
-    frames, recording = frames_of(step), config.recording
-    whole = 0
-    if isinstance(step, Capture) and recording.frame_encoding == "roi":
-        whole = min(frames, 1 + int((frames - 1) * step.interval_s / recording.whole_every_s))
+    recording, whole = config.recording, 0
+    if isinstance(step, Capture | SoakUntilSettled) and recording.frame_encoding == "roi" and frames:
+        interval_s = step.interval_s if isinstance(step, Capture) else step.look_every_s
+        whole = min(frames, 1 + int((frames - 1) * interval_s / recording.whole_every_s))
     return whole * _BYTES_PER_PIXEL["png"] + (frames - whole) * _BYTES_PER_PIXEL[recording.frame_encoding]
 
 

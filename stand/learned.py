@@ -65,7 +65,7 @@ class _Night:
     """What a session teaches."""
 
     name: str
-    overheads: list[tuple[str, float]]
+    marks: list[StepMark]
     ramps: list[Ramp]
 
 
@@ -79,11 +79,12 @@ def learn(directory: Path, config: StandConfig) -> Learned:
     if not nights:
         return load_learned(directory)
     seen_s: defaultdict[str, list[float]] = defaultdict(list)
+    chamber = fit([ramp for night in nights for ramp in night.ramps])
     for night in nights:
-        for work, overhead_s in night.overheads:
+        for work, overhead_s in overheads_of(night.marks, config, chamber):
             seen_s[work].append(overhead_s)
     learned = Learned(
-        chamber=fit([ramp for night in nights for ramp in night.ramps]),
+        chamber=chamber,
         overheads_s={work: round(median(values_s), 3) for work, values_s in sorted(seen_s.items())},
         nights=tuple(sorted(night.name for night in nights)),
     )
@@ -91,16 +92,18 @@ def learn(directory: Path, config: StandConfig) -> Learned:
     return learned
 
 
-def overheads_of(session: Session, config: StandConfig) -> list[tuple[str, float]]:
-    """(kind of work, s beyond what is stated) of every step that was done in one go, in order; `config` is the stand's
-    as it is now. Steps that are not known any more are left out."""
+def overheads_of(
+    marks: Iterable[StepMark], config: StandConfig, chamber: ChamberModel | None = None
+) -> list[tuple[str, float]]:
+    """(kind of work, s beyond what is stated) of every step of a session that was done in one go, in order; `config` is
+    the stand's as it is now, `chamber` its model. Steps that are not known any more are left out."""
     found, overheads = Situation(), list[tuple[str, float]]()
-    for mark, duration_s in _done(session.steps()):
+    for mark, duration_s in _done(marks):
         step = _step_of(mark)
         if step is None:
             continue
         if duration_s is not None:
-            expected = expect(step, found, config)
+            expected = expect(step, found, config, chamber=chamber)
             overheads.append((expected.work, duration_s - expected.stated_s))
         found = found.after(step)
     return overheads
@@ -122,7 +125,7 @@ def _nights(directory: Path, config: StandConfig) -> Iterator[_Night]:
             session = Session.open(path)
             recorded = yaml.safe_load(session.attachment("config.yaml") or "{}")
             if isinstance(recorded, dict) and recorded.get("name") == config.name:
-                yield _Night(path.name, overheads_of(session, config), ramps_of(session))
+                yield _Night(path.name, session.steps(), ramps_of(session))
 
 
 def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float | None]]:

@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from compensation.target import Target
 from drivers.clock import NS_PER_S
+from drivers.documents import parse_document
 from drivers.interface import SessionError, StandTripped
 from stand.assembly import Assembly
 from stand.control import SOCKET_NAME, handlers, serve
@@ -26,6 +28,7 @@ from stand.recording.superseded import restarted
 from stand.resume import Interruption, begun
 from stand.scheduler import Progress, Scheduler
 from stand.session_setup import Order
+from stand.settling_watch import SettlingWatch
 from stand.stand import Stand
 from stand.status import StatusBoard
 from stand.stop import OPERATOR, Stop
@@ -57,10 +60,12 @@ async def perform(work: Performance) -> None:
     log = Logbook(assembly.hub, assembly.clock)
     assembly.stand.attended = work.order.attended
     pollers, guard = assembly.pollers(), _guard(assembly, stop, log)
+    target = parse_document(work.order.target_text, Target, "target.yaml")
+    settling = SettlingWatch(assembly.stand, assembly.hub, assembly.clock, target)
     watchers: list[asyncio.Task[None]] = []
     ended = Ended(0, "failed", "")
     try:
-        scheduler = await watched(_begun(work, pollers, guard, log), work.background)
+        scheduler = await watched(_begun(work, pollers, guard, log, settling), work.background)
         watchers.append(asyncio.create_task(_answer(work, log)))
         watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
         watchers.append(asyncio.create_task(guard.run()))
@@ -76,6 +81,7 @@ async def perform(work: Performance) -> None:
             log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
         finally:  # also when somebody who listens fails
             await _taken_down(assembly.stand, watchers, pollers)
+            settling.close()
             stop.ended()
             await log.end(ended)
 
@@ -91,7 +97,9 @@ async def _taken_down(stand: Stand, watchers: Sequence[asyncio.Task[None]], poll
         await poller.poll()
 
 
-async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log: Logbook) -> Scheduler:
+async def _begun(
+    work: Performance, pollers: Iterable[Poller], guard: Guard, log: Logbook, settling: SettlingWatch
+) -> Scheduler:
     """Everything read and judged once, and the journal begun or continued: nothing moves before that."""
     for poller in pollers:
         await poller.first()
@@ -119,9 +127,8 @@ async def _begun(work: Performance, pollers: Iterable[Poller], guard: Guard, log
     if before is not None and not before.set_up.camera_on:
         work.assembly.stand.camera_is_off(before.cooling)
     progress = None if before is None else before.progress
-    return Scheduler(
-        work.assembly.stand, work.assembly.hub, work.assembly.clock, journal, work.recorder.flushed, progress
-    )
+    assembly = work.assembly
+    return Scheduler(assembly.stand, assembly.hub, assembly.clock, journal, work.recorder.flushed, settling, progress)
 
 
 async def _answer(work: Performance, log: Logbook) -> None:

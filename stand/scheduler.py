@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from drivers.clock import NS_PER_S, Clock, seconds_ns
 from drivers.interface import DeviceError
 from experiments.steps import (
+    AnySoak,
     Capture,
     CheckHome,
     CloseFlap,
@@ -26,15 +27,18 @@ from experiments.steps import (
     Prompt,
     SetTemperature,
     Soak,
+    SoakUntilSettled,
     StartChamber,
     StopChamber,
     kind_of,
+    longest_s,
     parameters_of,
 )
 from stand.gate import INTERLOCK
 from stand.hub import Event, Hub, StepMark, StepState
 from stand.journal import Dwell, Journal, Step
 from stand.set_up import SetUp
+from stand.settling_watch import SettlingWatch
 from stand.stand import Interlocked, Stand
 
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
@@ -57,6 +61,7 @@ class Scheduler:
     """Performs a plan; what a step raises ends the run, after the step is marked as failed.
 
     `flushed` returns when all that was published is on the disk. `progress`: go on where an earlier daemon was.
+    `settling` tells when a soak may end early.
     """
 
     def __init__(
@@ -66,6 +71,7 @@ class Scheduler:
         clock: Clock,
         journal: Journal,
         flushed: Callable[[], Awaitable[None]],
+        settling: SettlingWatch,
         progress: Progress | None = None,
     ) -> None:
         self._stand = stand
@@ -73,6 +79,7 @@ class Scheduler:
         self._clock = clock
         self._journal = journal
         self._flushed = flushed
+        self._settling = settling
         self._disturbed = progress is not None  # the set-up has to be brought about before anything else
         progress = progress or Progress()
         self._done = set(progress.done)
@@ -86,7 +93,7 @@ class Scheduler:
         for planned in plan:
             if planned.step_id not in self._done:
                 # A soak depends on what it has earned itself as on those before it.
-                needed = set_up.after(planned) if isinstance(planned.step, Soak) else set_up
+                needed = set_up.after(planned) if isinstance(planned.step, AnySoak) else set_up
                 await self._ready(planned, needed)
                 await self._run_step(planned, needed)
             set_up = set_up.after(planned)
@@ -130,7 +137,7 @@ class Scheduler:
                 await stand.set_temperature(chamber_degC)
             case StopChamber():
                 await stand.stop_chamber()
-            case Soak():
+            case Soak() | SoakUntilSettled():
                 await self._soak(planned, set_up)
             case OpenFlap():
                 await stand.open_flap()
@@ -176,14 +183,25 @@ class Scheduler:
 
     async def _dwell(self, planned: PlannedStep) -> None:
         """Earn what a soak still owes, while the gate is open; returns early when the set-up was disturbed."""
+        self._settling.restart()
         while (owed_ns := self._owed_ns(planned)) and not self._disturbed:
             begin_ns = self._clock.now_ns()
             await self._sleep_while_open(begin_ns + min(owed_ns, _JOURNAL_NS))
+            duration_ns = self._duration_ns(planned)
+            is_settled = await self._is_settled(planned, duration_ns - owed_ns + self._clock.now_ns() - begin_ns)
             end_ns = self._clock.now_ns()
-            earned_ns = self._duration_ns(planned) - owed_ns + min(end_ns - begin_ns, owed_ns)
+            # Who has settled owes nothing more.
+            earned_ns = duration_ns if is_settled else duration_ns - owed_ns + min(end_ns - begin_ns, owed_ns)
             self._earned_ns[planned.step_id] = earned_ns
             await self._journal.write(Dwell(end_ns, planned.step_id, earned_ns / NS_PER_S))
-            await self._stand.gate.passed()
+            if self._stand.gate.reasons:
+                await self._stand.gate.passed()
+                self._settling.restart()
+
+    async def _is_settled(self, planned: PlannedStep, soaked_ns: int) -> bool:
+        if not isinstance(planned.step, SoakUntilSettled) or self._stand.gate.reasons or self._disturbed:
+            return False
+        return await self._settling.is_settled(planned.step, planned.step_id, soaked_ns / NS_PER_S)
 
     async def _sleep_while_open(self, until_ns: int) -> None:
         """Until then, or until the gate closes."""
@@ -264,7 +282,7 @@ class Scheduler:
         return max(0, duration_ns - earned_ns)
 
     def _duration_ns(self, soak: PlannedStep) -> int:
-        return seconds_ns(soak.step.duration_s) if isinstance(soak.step, Soak) else 0
+        return seconds_ns(longest_s(soak.step)) if isinstance(soak.step, AnySoak) else 0
 
     def _on_hold(self, reason: str, held: bool) -> None:
         """An interlock makes the stand safe: nothing is as it was."""

@@ -14,6 +14,7 @@ from experiments.steps import (
     PowerCamera,
     SetTemperature,
     Soak,
+    SoakUntilSettled,
     StartChamber,
     StopChamber,
 )
@@ -38,7 +39,7 @@ class SetUp:
                 return replace(self, chamber_degC=chamber_degC, soaks=())
             case StopChamber():
                 return replace(self, chamber_degC=None, soaks=())
-            case Soak():
+            case Soak() | SoakUntilSettled():
                 return replace(self, soaks=(*self.soaks, planned))
             case PowerCamera(on):
                 return replace(self, camera_on=on)

@@ -172,6 +172,24 @@ class Stand:
             self.gate.clear(CAMERA_LOST)
         self._hub.publish(replace(frame, step_id=step_id))
 
+    async def look(self, exposure_s: float, step_id: str) -> Frame | None:
+        """One frame of the step through the flap, which is open for it only; published. None when the camera was lost:
+        it answers again then, or Unreachable after 30 min."""
+        await self.open_flap()
+        try:
+            frame = replace(await self.devices.camera.grab(exposure_s), step_id=step_id)
+            self._hub.publish(frame)
+            return frame
+        except Unreachable as error:
+            lost = error
+        finally:
+            await self.close_flap()
+        try:
+            await self._regain(lost, self._clock.now_ns() + seconds_ns(_CAMERA_LOST_LIMIT_S))
+        finally:
+            self.gate.clear(CAMERA_LOST)
+        return None
+
     async def _grab(self, exposure_s: float, due_ns: int, deadline_ns: int) -> Frame:
         while True:
             try:
@@ -179,10 +197,15 @@ class Stand:
             except Unreachable as error:
                 if self._clock.now_ns() >= deadline_ns:
                     raise
-                self._hub.publish(Event(self._clock.now_ns(), "warning", "camera_lost", str(error)))
-                self.gate.hold(CAMERA_LOST)
-            await self._open_camera(deadline_ns, _CAMERA_LONGEST_RETRY_S)
-            self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
+                lost = error
+            await self._regain(lost, deadline_ns)
+
+    async def _regain(self, lost: Unreachable, deadline_ns: int) -> None:
+        """Hold the gate until the camera, lost for that reason, is open again."""
+        self._hub.publish(Event(self._clock.now_ns(), "warning", "camera_lost", str(lost)))
+        self.gate.hold(CAMERA_LOST)
+        await self._open_camera(deadline_ns, _CAMERA_LONGEST_RETRY_S)
+        self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
 
     async def move_to(self, axis: str, position: float) -> None:
         """Move a stage (mm or deg), homing it first when it lost its scale."""

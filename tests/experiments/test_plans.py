@@ -11,12 +11,16 @@ from experiments.steps import (
     Role,
     SetTemperature,
     Soak,
+    SoakUntilSettled,
     StartChamber,
     StopChamber,
     estimate_s,
+    is_setup,
+    longest_s,
     number_steps,
 )
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
 from stand.recipe import Recipe
 
@@ -54,6 +58,42 @@ def test_each_dwell_follows_its_set_point():
     for before, after in itertools.pairwise(steps):
         if isinstance(before, SetTemperature):
             assert after == Soak(CYCLE.dwell_s)
+
+
+UNTIL_SETTLED = SoakUntilSettled(2700.0, 600.0, 600.0, 120.0, 0.2, 0.003, 0.1, 34.0)
+
+
+def test_a_dwell_until_settled_takes_the_place_of_the_fixed_one_at_its_set_point():
+    """The equilibrium, which everything is measured against, stays as it is."""
+    cycle = {"set_points_degC": [34], "equilibrium_s": 3000, "dwell_s": 2700}
+    fixed = list(thermal_cycle(ThermalCycle.model_validate(cycle)))
+    adaptive = list(thermal_cycle(ThermalCycle.model_validate({**cycle, "until": "settled"})))
+    assert adaptive == [UNTIL_SETTLED if step == Soak(2700.0) else step for step in fixed]
+    assert adaptive.count(UNTIL_SETTLED) == 1
+    assert not is_setup(UNTIL_SETTLED)
+    assert longest_s(UNTIL_SETTLED) == 2700.0
+
+
+def test_a_validation_waits_for_the_camera_too():
+    places = [{"linear_mm": 0, "rotary_deg": 0}, {"linear_mm": 9, "rotary_deg": 0}]
+    parameters = {"temperatures_degC": [24, 34], "positions": places, "until": {"settled": {"min_s": 900}}}
+    soaks = [step for step in validation(Validation.model_validate(parameters)) if isinstance(step, SoakUntilSettled)]
+    assert soaks == [SoakUntilSettled(2700.0, 900.0, 600.0, 120.0, 0.2, 0.003, 0.1, 34.0)]
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"until": "soon"}, "until takes `settled`, or `settled:` with thresholds, not 'soon'"),
+        ({"until": {"min_s": 900}}, "until takes `settled`"),
+        ({"until": {"settled": {"drift": 1}}}, "Extra inputs"),
+        ({"until": {"settled": {"window_s": 300}}}, "window_s 300.0 holds less than four looks every 120.0 s"),
+        ({"until": "settled", "dwell_s": 500}, "dwell_s 500.0 is the longest dwell; it must be at least"),
+    ],
+)
+def test_thresholds_that_cannot_be_are_refused(entries: dict[str, object], message: str):
+    with pytest.raises(ValidationError, match=message):
+        ThermalCycle.model_validate({"set_points_degC": [34], **entries})
 
 
 def test_a_warm_up_powers_the_camera_right_before_the_first_frame():

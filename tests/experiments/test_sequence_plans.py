@@ -25,6 +25,7 @@ from experiments.steps import (
     Role,
     SetTemperature,
     Soak,
+    SoakUntilSettled,
     StartChamber,
     Step,
     StopChamber,
@@ -38,7 +39,15 @@ from stand.config import load_config, packaged
 from stand.estimate import price
 from stand.recipe import Experiment, Recipe, load_recipe
 
-RECIPES = ["calibration", "demo", "overnight", "thermal-cycle", "validation", "warm-up"]
+RECIPES = [
+    "calibration",
+    "demo",
+    "overnight",
+    "thermal-cycle",
+    "thermal-cycle-settled",
+    "validation",
+    "warm-up",
+]
 GRID = {"linear_mm": (0.0, 100.0), "rotary_deg": (-10.0, 0.0, 10.0)}
 POSITIONS = ({"linear_mm": 70.0, "rotary_deg": 0.0}, {"linear_mm": 95.0, "rotary_deg": 8.0})
 PLACES = {"temperatures_degC": (24.0, 30.0, 12.0), "positions": POSITIONS}
@@ -93,7 +102,8 @@ def check_order(steps: list[Step]) -> None:
                 assert chamber_degC is not None
                 assert not flap_open
                 settled = True
-            case Soak():
+            case Soak() | SoakUntilSettled():
+                assert isinstance(step, Soak) or step.chamber_degC == chamber_degC
                 assert camera_on
                 assert not flap_open
                 settled = True

@@ -5,6 +5,7 @@ import asyncio
 from collections import Counter
 from pathlib import Path
 
+from compensation.target import Target
 from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
 from drivers.interface import Frame, Reading, StandTripped, Unreachable
 from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
@@ -12,9 +13,11 @@ from stand.hub import Batch, Hub, StepMark, StepState
 from stand.journal import JOURNAL_NAME, Journal
 from stand.resume import journaled
 from stand.scheduler import Progress, Scheduler
+from stand.settling_watch import SettlingWatch
 from stand.stand import Interlocked
 from stand.stop import Stop
 
+TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
 COMMIT_S = 0.2  # what the disk takes to have all that was published
 COMMIT_EVERY_S = 1.0  # and what was published before that, it has in any case
 
@@ -29,6 +32,7 @@ class SmallStand:
         self.unconfirmed = ()
         self.safe = self.heating = self.flap_open = self.broken = False
         self.camera_back_ns = 0
+        self.image = None  # what a look shows
         self.started_at_degC = None  # what the chamber was at when it was last set going, None after a new set-point
         self.set_ns = 0  # when that was
         self._clock, self._hub, self._wrong = clock, hub, wrong
@@ -91,6 +95,14 @@ class SmallStand:
             self._wrong.append("a frame of a stand that is not set up")
         self._hub.publish(Frame("camera.image", None, self._clock.now_ns(), exposure_s, 0.0, 40.0, 1, 1, 0, step_id))
 
+    async def look(self, exposure_s, step_id):
+        await self.open_flap()
+        await self._act("look")
+        await self.close_flap()
+        frame = Frame("camera.image", self.image, self._clock.now_ns(), exposure_s, 0.0, 40.0, 1, 1, 0, step_id)
+        self._hub.publish(frame)
+        return frame
+
     async def make_safe(self):
         async with self._making_safe:
             self.heating = self.flap_open = False
@@ -131,7 +143,8 @@ class Life:
         else:
             self._journal = Journal.create(folder)
         self._journal.start(self.clock, self.wrong.append)
-        scheduler = Scheduler(self.stand, self.hub, self.clock, self._journal, self._flushed, progress)
+        settling = SettlingWatch(self.stand, self.hub, self.clock, TARGET)
+        scheduler = Scheduler(self.stand, self.hub, self.clock, self._journal, self._flushed, settling, progress)
         self._time = asyncio.create_task(self.clock.run())
         self.run = asyncio.create_task(self._run(scheduler))
 

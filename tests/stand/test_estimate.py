@@ -1,6 +1,7 @@
 """What a plan is expected to take, and how that follows what steps really take."""
 
 import json
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from experiments.steps import (
     Role,
     SetTemperature,
     Soak,
+    SoakUntilSettled,
     StartChamber,
     Step,
     kind_of,
@@ -172,6 +174,25 @@ def test_moves_alone_need_no_place_for_a_home_check(config: StandConfig):
     price(planned(MoveTo("rotary", 5)), StandConfig.model_validate(data))
 
 
+def test_a_soak_until_settled_is_priced_by_the_chamber_and_the_camera(config: StandConfig):
+    def soak(max_s: float) -> SoakUntilSettled:
+        return SoakUntilSettled(max_s, 600.0, 600.0, 120.0, 0.2, 0.003, 0.1, 52.0)
+
+    plan = planned(StartChamber(24.0), SetTemperature(52.0), soak(9000.0), CAPTURE, SetTemperature(52.0), soak(9000.0))
+    steps = price(plan, config, Learned(chamber=CHAMBER))
+    arrives_s = CHAMBER.arrival_s(24.0, 52.0)
+    follows_s = 900.0 * math.log(28.0 / 15.0 / 0.2)  # from 28 K in 15 min to 0.2 K/min
+    assert steps[2].in_band_after_s == pytest.approx(arrives_s)
+    assert steps[2].duration_s == pytest.approx(arrives_s + follows_s + 600.0)
+    assert steps[2].frames == math.ceil((follows_s + 600.0) / 120.0)
+    assert steps[2].size_bytes > steps[2].frames * 0.4 * 2448 * 2048
+    assert steps[3].warning == ""
+    assert steps[5].duration_s == 600.0  # nothing has to move: the shortest
+    short = price(planned(StartChamber(24.0), SetTemperature(52.0), soak(1200.0), CAPTURE), config)
+    assert short[2].duration_s == 1200.0
+    assert short[3].warning.startswith("the dwell at 52 degC ends")
+
+
 @pytest.mark.parametrize("step", [MoveTo("vertical", 1.0), CheckHome("vertical")])
 def test_an_axis_that_the_stand_lacks_is_refused(config: StandConfig, step: Step):
     with pytest.raises(ConfigError, match=r"step 0 .*no axis 'vertical', only linear, rotary"):
@@ -286,7 +307,7 @@ async def test_a_step_that_was_begun_again_teaches_nothing(tmp_path: Path, confi
     plan = planned(OpenFlap(), CloseFlap())
     killed, *rest = marks([plan[0], *plan], [2.0, 0.4, 1.1])
     session = await recorded_marks(tmp_path / "night", config.name, [killed, *rest[1:]])
-    assert overheads_of(session, config) == [("flap travel", pytest.approx(1.1, abs=1e-3))]
+    assert overheads_of(session.steps(), config) == [("flap travel", pytest.approx(1.1, abs=1e-3))]
 
 
 async def recorded(directory: Path, stand: str, plan: list[PlannedStep], durations_s: list[float]) -> Session:

@@ -1,0 +1,81 @@
+"""Dwells that end when the camera has settled, over every wire in virtual time."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from compensation.observations import Observations, Role, observe_sessions
+from drivers.clock import NS_PER_S
+from stand.hub import StepState
+from stand.journal import Dwell, read_lines
+from stand.progress import progress
+from stand.recording.session import Session
+from stand.run import run_virtual
+from stand.session_setup import Order
+from tests.system.conftest import require_aravis
+
+RECIPE = """
+name: settled
+experiments:
+  - thermal_cycle:
+      table_position: {linear: 0, rotary: 0}
+      equilibrium_s: 600
+      set_points_degC: [28, 24]
+      dwell_s: 3600
+      until: {settled: {drift_px_per_min: 0.004}}
+      reference_frames: 2
+      frames_per_point: 1
+"""
+# A chamber that is never at its set-point, as far as these thresholds can tell, and a target that is not there.
+NEVER = RECIPE.replace("drift_px_per_min: 0.004", "drift_px_per_min: 0.0001").replace("[28, 24]", "[26]")
+NEVER = NEVER.replace("dwell_s: 3600", "dwell_s: 900")
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+pytestmark = pytest.mark.usefixtures("_aravis")
+
+
+async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: Path, order: Callable[..., Order]):
+    session = Session.open(await run_virtual(order(RECIPE), tmp_path, 3, lambda _: None))
+    told = [event.text for event in session.events() if event.kind == "settled"]
+    assert len(told) == 2
+    assert all("K/min" in text and "mpx/min" in text for text in told)
+    soaks = [mark for mark in session.steps() if mark.kind == "SoakUntilSettled"]
+    assert [mark.state for mark in soaks] == [StepState.STARTED, StepState.DONE] * 2
+    lasted_s = [(end.time_ns - begin.time_ns) / NS_PER_S for begin, end in zip(soaks[::2], soaks[1::2], strict=True)]
+    assert all(900.0 < soak_s < 2700.0 for soak_s in lasted_s)
+    entries, _ = read_lines((session.path / "journal.jsonl").read_bytes())
+    for begin, soak_s in zip(soaks[::2], lasted_s, strict=True):
+        earned_s = [entry.earned_s for entry in entries if isinstance(entry, Dwell) and entry.step_id == begin.step_id]
+        assert len(earned_s) >= soak_s / 70.0  # each 60 s, a look included
+        assert earned_s == sorted(earned_s)
+        assert earned_s[-1] == 3600.0  # nothing is owed
+    check_the_flap_opens_for_looks_only(session)
+    check_looks_are_not_fitted(observe_sessions([session.path], progress))
+
+
+def check_the_flap_opens_for_looks_only(session: Session) -> None:
+    _, position = session.readings("flap.position")
+    assert 0.0 < (position > 0.5).mean() < 0.15
+    assert not [event for event in session.events() if event.level == "error"]
+
+
+def check_looks_are_not_fitted(observed: Observations) -> None:
+    assert observed.of(Role.SETTLING).sum() > 10
+    assert observed.of(Role.REFERENCE).sum() == 2
+    assert observed.of(Role.FIT).sum() == 2
+    assert set(observed.chamber_degC[observed.of(Role.SETTLING)]) == {28.0, 24.0}
+
+
+async def test_a_dwell_that_never_settles_ends_at_its_longest_and_says_so(tmp_path: Path, order: Callable[..., Order]):
+    session = Session.open(await run_virtual(order(NEVER), tmp_path, 3, lambda _: None))
+    told = [event for event in session.events() if event.kind in ("settled", "not_settled")]
+    assert [(event.kind, event.level) for event in told] == [("not_settled", "warning")]
+    assert told[0].text.startswith("not settled after 15 min: ")
+    begin, end = (mark for mark in session.steps() if mark.kind == "SoakUntilSettled")
+    assert 900.0 <= (end.time_ns - begin.time_ns) / NS_PER_S < 915.0
