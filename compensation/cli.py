@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import sys
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from compensation.budget_cli import budget_of_session
+from compensation.command_line import TargetOption, installed_target, named_target, one_line_errors
 from compensation.drift.fitting import check_degree
 from compensation.drift.fitting import fit as fit_model
 from compensation.drift.model import MAX_DEGREE, CompensationModel
@@ -20,11 +20,11 @@ from compensation.markers.detection import Detection, DetectionError, Image, det
 from compensation.markers.table import DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
 from compensation.report.report import write_report
-from compensation.target import Target, load_target
-from drivers.interface import ConfigError, StandError
+from compensation.target import Target
+from drivers.interface import ConfigError
 from stand.progress import progress
 from stand.recording.session import Session
-from stand.usage import OneLineUsage, one_line, tell
+from stand.usage import OneLineUsage, one_line
 
 app = typer.Typer(
     cls=OneLineUsage,
@@ -35,14 +35,13 @@ app = typer.Typer(
 )
 
 Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of recorded sessions.")]
-TargetOption = Annotated[
-    str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
-]
 DegreeOption = Annotated[
     int | None, typer.Option(help=f"Degree of the polynomial, 1 to {MAX_DEGREE}; else chosen by cross-validation.")
 ]
 
 _DEFAULT_TARGET = "paper-9x6"
+
+app.command("budget")(budget_of_session)
 
 
 @app.command("detect")
@@ -55,7 +54,7 @@ def detect_images(
 
     Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
     """
-    with _one_line_errors():
+    with one_line_errors():
         check_writable(out)
         opened = [_open(path) for path in sources]
         chosen = _detection_target(opened, target)
@@ -83,10 +82,10 @@ def fit(
 
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
-    with _one_line_errors():
+    with one_line_errors():
         check_degree(degree)
         check_writable(out)
-        observations = observe_sessions(sessions, progress, _named_target(target))
+        observations = observe_sessions(sessions, progress, named_target(target))
         model = fit_model(observations, degree)
         evaluation = evaluate(model, observations)
         model.save(out)
@@ -105,29 +104,14 @@ def report(
 
     Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
     """
-    with _one_line_errors():
+    with one_line_errors():
         check_writable(out)
         given = None if model is None else CompensationModel.load(model)
-        observations = observe_sessions(sessions, progress, _named_target(target))
+        observations = observe_sessions(sessions, progress, named_target(target))
         used = given or fit_model(observations)
         evaluation = evaluate(used, observations)
         write_report(out, observations, used, evaluation)
         typer.echo(table(evaluation))
-
-
-def installed_target(name: str) -> Target:
-    """The target of a file, or of an installed name; ConfigError that lists what there is."""
-    if Path(name).is_file():
-        return load_target(Path(name))
-    folder = Path(str(importlib.resources.files("configs"))) / "targets"
-    known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-    if name.removesuffix(".yaml") not in known:
-        raise ConfigError(f"{name}: no such file, and not one of the installed targets: {', '.join(known)}")
-    return load_target(known[name.removesuffix(".yaml")])
-
-
-def _named_target(name: str | None) -> Target | None:
-    return None if name is None else installed_target(name)
 
 
 def _open(path: Path) -> Session | Path:
@@ -184,22 +168,6 @@ def _images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | 
     prefix = f"{one_line(source.path.name)}/" if several else ""
     for index, frame in enumerate(read_frames(source)):
         yield f"{prefix}{index}", frame.time_ns, frame.image
-
-
-@contextmanager
-def _one_line_errors() -> Generator[None]:
-    """Bad input ends with status 2, a machine that fails with 1, an interrupted run with 130; each with a sentence."""
-    try:
-        yield
-    except StandError as error:
-        tell(error)
-        raise typer.Exit(2) from error
-    except OSError as error:
-        tell(error)
-        raise typer.Exit(1) from error
-    except KeyboardInterrupt as error:
-        typer.echo("interrupted; nothing was written", err=True)
-        raise typer.Exit(130) from error
 
 
 if __name__ == "__main__":

@@ -1,0 +1,29 @@
+"""`compensate budget`: what the stand itself did to the images of a session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.budget.budget import budget, table
+from compensation.budget.geometry import load_geometry
+from compensation.command_line import TargetOption, named_target, one_line_errors
+from compensation.observations import session_target
+from stand.recording.session import Session
+
+
+def budget_of_session(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded session.")],
+    geometry: Annotated[str, typer.Option(help="The stand's geometry: a file, or the installed `paper`.")] = "paper",
+    target: TargetOption = None,
+) -> None:
+    """The stand's error budget: refraction, granite, target and table, in um and px, with uncertainty.
+
+    Example: compensate budget sessions/20260101T180000Z-validation --geometry my-stand.yaml
+    """
+    with one_line_errors():
+        stand = load_geometry(geometry)
+        recorded = Session.open(session)
+        typer.echo(table(budget(recorded, named_target(target) or session_target(recorded), stand)))

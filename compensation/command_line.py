@@ -1,0 +1,51 @@
+"""What the commands of `compensate` share: errors in one line, and the target they are told to use."""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.target import Target, load_target
+from drivers.interface import ConfigError, StandError
+from stand.usage import tell
+
+TargetOption = Annotated[
+    str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
+]
+
+
+def installed_target(name: str) -> Target:
+    """The target of a file, or of an installed name; ConfigError that lists what there is."""
+    if Path(name).is_file():
+        return load_target(Path(name))
+    folder = Path(str(importlib.resources.files("configs"))) / "targets"
+    known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    if name.removesuffix(".yaml") not in known:
+        raise ConfigError(f"{name}: no such file, and not one of the installed targets: {', '.join(known)}")
+    return load_target(known[name.removesuffix(".yaml")])
+
+
+def named_target(name: str | None) -> Target | None:
+    """The target of an option, None when it was not given."""
+    return None if name is None else installed_target(name)
+
+
+@contextmanager
+def one_line_errors() -> Generator[None]:
+    """Bad input ends with status 2, a machine that fails with 1, an interrupted run with 130; each with a sentence."""
+    try:
+        yield
+    except StandError as error:
+        tell(error)
+        raise typer.Exit(2) from error
+    except OSError as error:
+        tell(error)
+        raise typer.Exit(1) from error
+    except KeyboardInterrupt as error:
+        typer.echo("interrupted; nothing was written", err=True)
+        raise typer.Exit(130) from error

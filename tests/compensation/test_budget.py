@@ -1,0 +1,245 @@
+"""The stand's part in an image: sizes known by hand, the simulated laboratory's own optics, and a recorded session."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from compensation import cli
+from compensation.budget.budget import Budget, budget
+from compensation.budget.correction import displacement_px, granite_mm, post_mm, stand_correction
+from compensation.budget.geometry import Geometry, StandState, load_geometry
+from compensation.budget.states import mean_state
+from compensation.budget.table import home_residuals
+from compensation.target import load_target
+from drivers.clock import NS_PER_S, VirtualClock
+from drivers.interface import ConfigError, Frame, Reading
+from drivers.sim import optics
+from stand.config import packaged
+from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
+from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.recording.session import Session
+
+from .rendered import Scene, photograph, render
+
+PAPER = load_geometry("paper")
+TARGET = load_target(packaged("targets", "paper-9x6"))
+COOL = StandState(24.0, 24.0, 24.0, 24.0, 24.0)
+CENTRE_px = np.array([1223.5, 1023.5])
+CORNER_px = np.array([2447.0, 2047.0])
+
+
+def moved_px(xy_px: np.ndarray, geometry: Geometry = PAPER, **degC: float) -> np.ndarray:
+    return displacement_px(replace(COOL, **degC), COOL, geometry, xy_px)
+
+
+def test_granite_inside_warmer_by_30_K_scales_the_image_by_75_ppm_and_the_post_lowers_it():
+    warm = replace(COOL, granite_inside_degC=54.0)
+    assert 1e3 * granite_mm(warm, COOL, PAPER) == pytest.approx(62, abs=0.05)
+    assert 1e3 * post_mm(warm, COOL, PAPER) == pytest.approx(15)
+    at_centre, at_corner = moved_px(np.array([CENTRE_px, CORNER_px]), granite_inside_degC=54.0)
+    assert at_centre == pytest.approx([0, 0.1316], abs=1e-3)
+    assert np.linalg.norm(at_corner - at_centre) == pytest.approx(0.12, abs=0.001)
+    assert (at_corner - at_centre < 0).all()
+
+
+def test_a_rolled_camera_sees_the_post_rise_sideways():
+    rolled = PAPER.model_copy(update={"camera_roll_deg": 90.0})
+    assert moved_px(CENTRE_px, rolled, granite_inside_degC=54.0) == pytest.approx([0.1316, 0], abs=1e-3)
+
+
+def test_glass_warmer_by_1_K_grows_by_10_mpx_at_135_mm():
+    radius_px = 135 / 826 * PAPER.focal_px
+    grown = moved_px(CENTRE_px + np.array([radius_px, 0.0]), artifact_degC=25.0)
+    assert grown == pytest.approx([0.0101, 0], abs=1e-4)
+
+
+@pytest.mark.parametrize(("part", "mpx"), [(0.1, 37), (0.5, 21)])
+def test_warm_air_at_the_camera_moves_the_corner_outwards(part: float, mpx: float):
+    interface = PAPER.interface_mm.model_copy(update={"value": part * 826})
+    dry = PAPER.relative_humidity.model_copy(update={"value": 0.0})
+    geometry = PAPER.model_copy(update={"interface_mm": interface, "relative_humidity": dry})
+    moved = moved_px(CORNER_px, geometry, air_degC=54.0)
+    assert 1e3 * np.linalg.norm(moved) == pytest.approx(mpx, abs=0.6)
+    assert (moved > 0).all()
+
+
+def test_the_correction_takes_out_what_the_simulated_stand_does():
+    """The simulator's granite, post and glass; its camera is held still, and it has no refraction."""
+    geometry = PAPER.model_copy(update={"target_per_K": PAPER.target_per_K.model_copy(update={"value": 9.0e-6})})
+    cool_nodes = optics.Nodes(24.0, 24.0, 24.0, 24.0, 24.0, 24.0)
+    warm_nodes = replace(cool_nodes, granite_inside_degC=50.0, granite_outside_degC=27.0, artifact_degC=25.5)
+    cool = optics.optics_at("modified", cool_nodes, optics.Placement())
+    warm = optics.optics_at("modified", warm_nodes, optics.Placement())
+    stand_only = replace(
+        cool,
+        camera_shift_mm=warm.camera_shift_mm,
+        target_centre_mm=warm.target_centre_mm,
+        target_scale=warm.target_scale,
+    )
+    before, after = optics.true_centres_px(cool), optics.true_centres_px(stand_only)
+    state = replace(COOL, granite_inside_degC=50.0, granite_outside_degC=27.0, artifact_degC=25.5)
+    correction = stand_correction(state, COOL, geometry)
+    assert np.abs(after - before).max() > 0.15
+    assert np.abs(correction(after) - before).max() < 0.010  # the simulated granite expands 5 % more in the warm
+    assert (np.abs(correction(after) - before) < 2 * correction.sigma_px(after) + 1e-4).all()
+
+
+def test_the_uncertainty_is_that_of_its_inputs():
+    warm = replace(COOL, granite_inside_degC=54.0)
+    sure = {name: getattr(PAPER, name).model_copy(update={"u": 0.0}) for name in QUANTITIES}
+    exact = PAPER.model_copy(update={**sure, "thermometer_K": 0.0, "granite_gradient_K": 0.0})
+    assert stand_correction(warm, COOL, exact).sigma_px(CORNER_px) == pytest.approx([0, 0])
+    loose = exact.model_copy(update={"granite_per_K": PAPER.granite_per_K})
+    tenth = 0.1 * np.abs(stand_correction(warm, COOL, exact).displacement_px(CORNER_px))
+    assert stand_correction(warm, COOL, loose).sigma_px(CORNER_px) == pytest.approx(tenth, rel=1e-6)
+
+
+QUANTITIES = [name for name in Geometry.model_fields if hasattr(getattr(PAPER, name), "u")]
+
+
+def test_a_state_without_one_of_the_thermometers_is_refused():
+    with pytest.raises(ValueError, match="artifact_degC of the state is unknown"):
+        stand_correction(replace(COOL, artifact_degC=math.nan), COOL, PAPER)
+
+
+def test_means_leave_out_what_is_unknown():
+    mean = mean_state([COOL, replace(COOL, air_degC=30.0), replace(COOL, air_degC=math.nan, artifact_degC=math.nan)])
+    assert (mean.air_degC, mean.artifact_degC) == (27.0, 24.0)
+    assert math.isnan(mean_state([replace(COOL, air_degC=math.nan)]).air_degC)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("distance_mm: {value: 50, u: 1}", "interface_mm is between the lens and the target, 0 to 50 mm, not 83"),
+        ("relative_humidity: {value: 45, u: 5}", "relative_humidity is a part of 1, not 45"),
+        ("pressure_Pa: {value: 1013, u: 5}", "pressure_Pa is in pascal"),
+        ("post_mm: 100", "post_mm"),
+        ("granite_per_K: {value: 5.0e-6, u: -1}", "granite_per_K.u"),
+    ],
+)
+def test_a_wrong_geometry_gets_a_sentence(line: str, message: str, tmp_path: Path):
+    key = line.partition(":")[0]
+    kept = [old for old in packaged("geometry", "paper").read_text().splitlines() if not old.startswith(f"{key}:")]
+    path = tmp_path / "stand.yaml"
+    path.write_text("\n".join([*kept, line]))
+    with pytest.raises(ConfigError, match=message):
+        load_geometry(str(path))
+
+
+def test_home_checks_are_read_from_the_recorded_events():
+    texts = [
+        ("home_residual", "linear: home was at 0.00300 mm (0.24 steps)"),
+        ("home_residual_large", "linear: home was at -0.00400 mm (-3.20 steps)"),
+        ("home_residual", "rotary: home was at 0.00500 deg (0.50 steps)"),
+        ("homed", "linear: homed"),
+    ]
+    events = [Event(0, "info", kind, text) for kind, text in texts]
+    linear, rotary = home_residuals(events, "mm"), home_residuals(events, "deg")
+    assert (linear.count, rotary.count) == (2, 1)
+    assert linear.rms == pytest.approx(math.sqrt((9 + 16) / 2) * 1e-3)
+    assert rotary.rms == pytest.approx(0.005)
+
+
+WARM = StandState(50.0, 27.0, 25.0, 52.0, 24.5)
+CAPTURES = (
+    ("reference", COOL),
+    ("pose", COOL),
+    ("repeatability", COOL),
+    ("pose", WARM),
+    ("pose", WARM),
+    ("repeatability", WARM),
+)
+REPEAT_px = 0.4
+
+
+def published(index: int, time_ns: int, started: bool) -> Iterator[Item]:
+    role, state = CAPTURES[index]
+    names = ("granite_inside", "granite_outside", "artifact", "air", "laboratory")
+    readings = tuple(Reading(f"thermometers.{n}", getattr(state, f"{n}_degC"), "degC", time_ns) for n in names)
+    yield Batch("thermometers", time_ns, readings)
+    mark = StepState.STARTED if started else StepState.DONE
+    yield StepMark(time_ns, f"step-{index}", index, "Capture", mark, {"role": role, "chamber_degC": state.air_degC})
+    if started:
+        shift_mm = REPEAT_px / 2 if role == "repeatability" else 0.0  # 2 px per mm
+        scene = Scene(size=(640, 480), f_px=2000, diameter_mm=10, shift_mm=(shift_mm, 0.0))
+        image = photograph(scene, render(scene), index)
+        yield Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, index, 0, 0, f"step-{index}")
+        yield Event(time_ns, "info", "home_residual", "linear: home was at 0.00300 mm (0.24 steps)")
+
+
+async def record(directory: Path) -> None:
+    start_ns = 1_767_290_400 * NS_PER_S
+    clock, hub = VirtualClock(start_ns), Hub()
+    info = SessionInfo("night", "validation", "TS-0001", "operator", "0.1.0", "virtual")
+    attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text()}
+    devices = {"thermometers": "thermometers", "camera": "camera"}
+    recorder = Recorder(directory, info, attachments, devices, hub, clock, RecordingSettings(telemetry_commit_s=60.0))
+    recorder.start()
+    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
+    for index in range(len(CAPTURES)):
+        for started in (True, False):
+            await clock.sleep_until(start_ns + (index * 60 + 30 * (not started)) * NS_PER_S)
+            for item in published(index, clock.now_ns(), started):
+                hub.publish(item)
+    await clock.sleep_until(clock.now_ns() + NS_PER_S)
+    for task in tasks:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+    await recorder.finish()
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sessions") / "night"
+    asyncio.run(record(path))
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(session: Path) -> Budget:
+    return budget(Session.open(session), TARGET, PAPER)
+
+
+def test_a_sessions_budget_has_each_part_at_its_largest(found: Budget):
+    assert found.reference == COOL
+    assert found.air_degC == (24.0, 52.0)
+    lines = {line.name: line for line in found.contributions}
+    granite = lines["granite along the axis"]
+    assert granite.um == pytest.approx(1e3 * 5e-6 * 413 * (26 + 3))
+    assert granite.px == pytest.approx(-granite.um / 826e3 * math.hypot(*CENTRE_px))
+    assert 0.1 * granite.um < granite.u_um < 0.13 * granite.um
+    assert lines["granite post under the camera"].um == pytest.approx(13)
+    assert lines["expansion of the target"].um == pytest.approx(8.5e-6 * math.hypot(120, 75) * 1e3)
+    refraction, edlen = lines["refraction, Ciddor 1996"], lines["the same by Edlen 1966, as in the paper"]
+    assert 3 < refraction.um < 4.2
+    assert 0.1 * refraction.um < refraction.u_um < 0.2 * refraction.um
+    assert edlen.um == pytest.approx(refraction.um, rel=0.02)
+    assert refraction.um == pytest.approx(114 * refraction.px, rel=1e-3)
+    assert lines["rotary table, resolution"].um == pytest.approx(24, abs=1)
+
+
+def test_what_the_table_repeats_comes_from_the_recording(found: Budget):
+    lines = {line.name: line for line in found.contributions}
+    assert lines["linear table, 6 home checks"].um == pytest.approx(3)
+    assert lines["V0 seen again, 2 times, with the camera"].px == pytest.approx(REPEAT_px / math.sqrt(2), abs=0.005)
+
+
+def test_the_command_prints_the_table_and_refuses_in_a_sentence(session: Path, tmp_path: Path):
+    done = CliRunner().invoke(cli.app, ["budget", str(session)])
+    assert done.exit_code == 0, done.output
+    assert "refraction, Ciddor 1996" in done.stdout
+    assert "captures at 24.0 to 52.0 degC" in done.stdout
+    refused = CliRunner().invoke(cli.app, ["budget", str(session), "--geometry", str(tmp_path / "none.yaml")])
+    assert refused.exit_code == 2
+    assert "none.yaml: cannot be read" in refused.stderr
