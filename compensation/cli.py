@@ -16,6 +16,7 @@ from compensation.drift.fitting import fit as fit_model
 from compensation.drift.model import MAX_DEGREE, CompensationModel
 from compensation.drift.validation import evaluate, table
 from compensation.files import check_writable
+from compensation.finding.found import finder
 from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found, read_image
 from compensation.markers.table import DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
@@ -38,6 +39,12 @@ Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Fold
 DegreeOption = Annotated[
     int | None, typer.Option(help=f"Degree of the polynomial, 1 to {MAX_DEGREE}; else chosen by cross-validation.")
 ]
+
+Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
+Cluster = Annotated[
+    str | None, typer.Option("--cluster", help="A Dask scheduler, host:port, whose workers see the same files.")
+]
+Cache = Annotated[bool, typer.Option("--cache/--no-cache", help="Keep what was found, and take what is kept.")]
 
 _DEFAULT_TARGET = "paper-9x6"
 
@@ -77,6 +84,9 @@ def fit(
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
     degree: DegreeOption = None,
     target: TargetOption = None,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    cache: Cache = True,
 ) -> None:
     """Fit the drift model to the reference and fit frames of sessions of one camera.
 
@@ -85,7 +95,8 @@ def fit(
     with one_line_errors():
         check_degree(degree)
         check_writable(out)
-        observations = observe_sessions(sessions, progress, named_target(target))
+        found_by = finder(workers, cluster, use_cache=cache)
+        observations = observe_sessions(sessions, progress, named_target(target), found_by)
         model = fit_model(observations, degree)
         evaluation = evaluate(model, observations)
         model.save(out)
@@ -99,6 +110,9 @@ def report(
     out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write.")],
     model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
     target: TargetOption = None,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    cache: Cache = True,
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
@@ -106,8 +120,9 @@ def report(
     """
     with one_line_errors():
         check_writable(out)
+        found_by = finder(workers, cluster, use_cache=cache)
         given = None if model is None else CompensationModel.load(model)
-        observations = observe_sessions(sessions, progress, named_target(target))
+        observations = observe_sessions(sessions, progress, named_target(target), found_by)
         used = given or fit_model(observations)
         evaluation = evaluate(used, observations)
         write_report(out, observations, used, evaluation)

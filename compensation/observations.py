@@ -16,12 +16,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.markers.detection import Detection, DetectionError, detect
+from compensation.finding.found import Finder
+from compensation.finding.piece import FoundMarkers, joined, pieces_of
 from compensation.target import Target
 from drivers.documents import parse_document
 from drivers.interface import Frame, SessionError
 from stand.progress import Report
 from stand.recording.session import Session
+from stand.recording.superseded import begins_of, is_superseded
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -115,27 +117,28 @@ def session_target(session: Session) -> Target:
     return parse_document(text, Target, f"{session.path}: target.yaml")
 
 
-def observe(session: Session, target: Target, report: Report | None = None) -> Observations:
-    """Find the target in every frame; `report` counts frames.
+def observe(
+    session: Session, target: Target, finder: Finder | None = None, report: Report | None = None
+) -> Observations:
+    """Find the target in every frame; `report` counts frames. finder: how, else one frame after the other.
 
     A frame without the target, of another size or without a camera temperature stays, with its reason. SessionError
     when no frame can be used at all.
     """
-    captures = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
-    found: list[_Seen] = []
-    previous: Detection | None = None
-    first: Frame | None = None
-    for frame in read_frames(session):
-        seen = _see(frame, target, previous, None if first is None else first.image.shape)
-        if seen.detection is not None:
-            previous, first = seen.detection, first or frame
-        found.append(seen)
+    pieces = pieces_of(session, target)
+    total = sum(piece.frames for piece in pieces)
+
+    def counted(done: int) -> None:
         if report is not None:
-            report(len(found), f"frame {len(found)} of {session.frame_count}")
-    if first is None:
-        why = found[0].reason if found else "it has no frames"
-        raise SessionError(f"{session.path}: no frame can be used; {why}")
-    return _arrays(session, target, found, captures, first)
+            report(done, f"frame {done} of {total}")
+
+    if not pieces:
+        raise SessionError(f"{session.path}: no frame can be used; it has no frames")
+    found = joined((finder or Finder())(pieces, counted))
+    seen = np.flatnonzero(found.reason == "")
+    if not len(seen):
+        raise SessionError(f"{session.path}: no frame can be used; {found.reason[0]}")
+    return _arrays(session, target, found, int(seen[0]))
 
 
 def read_frames(session: Session) -> Iterator[Frame]:
@@ -149,7 +152,9 @@ def read_frames(session: Session) -> Iterator[Frame]:
         raise SessionError(f"{error}; this was frame {done}, counted from 0") from error
 
 
-def observe_sessions(paths: Sequence[Path], progress: Progress, target: Target | None = None) -> Observations:
+def observe_sessions(
+    paths: Sequence[Path], progress: Progress, target: Target | None = None, finder: Finder | None = None
+) -> Observations:
     """All frames of all sessions, found once, with progress. target: instead of the ones attached to the sessions."""
     sessions = [Session.open(path) for path in paths]
     targets = [target or session_target(session) for session in sessions]
@@ -157,7 +162,7 @@ def observe_sessions(paths: Sequence[Path], progress: Progress, target: Target |
     done = 0
     with progress("find markers", sum(session.frame_count for session in sessions)) as report:
         for session, its_target in zip(sessions, targets, strict=True):
-            parts.append(observe(session, its_target, _continued(report, done)))
+            parts.append(observe(session, its_target, finder, _continued(report, done)))
             done += session.frame_count
     return concatenate(parts)
 
@@ -169,71 +174,58 @@ def _continued(report: Report, done_before: float) -> Report:
     return continued
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """A frame without its image. `detection` is None, with a reason, when the target was not found."""
-
-    time_ns: int
-    step_id: str
-    camera_degC: float
-    detection: Detection | None
-    reason: str
-
-
-def _see(frame: Frame, target: Target, previous: Detection | None, shape: tuple[int, ...] | None) -> _Seen:
-    detection, reason = None, ""
-    if shape is not None and frame.image.shape != shape:
-        reason = f"the image has the shape {frame.image.shape}, the session's {shape}"
-    else:
-        try:
-            detection = detect(frame.image, target, previous)
-        except DetectionError as error:
-            reason = str(error)
-    if not reason and math.isnan(frame.camera_degC):
-        reason = "the camera's temperature is unknown"
-    return _Seen(frame.time_ns, frame.step_id, frame.camera_degC, detection, reason)
-
-
-def _arrays(
-    session: Session, target: Target, found: list[_Seen], captures: dict[str, dict[str, object]], first: Frame
-) -> Observations:
-    purposes = [_purpose(captures.get(seen.step_id, {})) for seen in found]
-    time_ns = np.array([seen.time_ns for seen in found], np.int64)
-    flags = np.array([_flags(seen.detection, target.count) for seen in found], np.uint8)
-    centres = np.array([_centres(seen.detection, target.count) for seen in found])
-    covariance = np.array([_covariance(seen.detection, target.count) for seen in found])
-    centres[flags != 0] = np.nan
-    covariance[flags != 0] = np.nan
+def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -> Observations:
+    """first: the first frame with the target, whose size the others must have."""
+    captures = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
+    metas = {(time_ns, meta.block_id & 0xFFFFFFFF): meta for time_ns, meta in session.frame_metas}
+    described = [metas.get(name) for name in zip(found.time_ns.tolist(), found.block.tolist(), strict=True)]
+    step_id = tuple("" if meta is None else meta.step_id for meta in described)
+    camera_degC = np.array([math.nan if meta is None else meta.camera_degC for meta in described])
+    reasons = _reasons(found, first, camera_degC, _superseded(session, found.time_ns, step_id))
+    purposes = [_purpose(captures.get(name, {})) for name in step_id]
+    unusable = (found.flags != 0) | np.array([bool(reason) for reason in reasons])[:, None]
+    image = session.frame(first).image
     return Observations(
         target=target,
         sessions=(_facts(session),),
-        image_size=(first.image.shape[1], first.image.shape[0]),
-        preview=_preview(first.image),
-        session=np.zeros(len(found), np.int64),
-        frame=np.arange(len(found)),
-        time_ns=time_ns,
+        image_size=(image.shape[1], image.shape[0]),
+        preview=_preview(image),
+        session=np.zeros(len(reasons), np.int64),
+        frame=np.arange(len(reasons)),
+        time_ns=found.time_ns,
         role=np.array([str(role) for role, _ in purposes]),
-        step_id=tuple(seen.step_id for seen in found),
+        step_id=step_id,
         chamber_degC=np.array([chamber_degC for _, chamber_degC in purposes]),
-        camera_degC=np.array([seen.camera_degC for seen in found]),
-        air_degC=_air_degC(session, time_ns),
-        centres_px=centres,
-        covariance_px2=covariance,
-        flags=flags,
-        reasons=tuple(seen.reason for seen in found),
+        camera_degC=camera_degC,
+        air_degC=_air_degC(session, found.time_ns),
+        centres_px=np.where(unusable[:, :, None], np.nan, found.centres_px),
+        covariance_px2=np.where(unusable[:, :, None, None], np.nan, found.covariance_px2),
+        flags=np.where((found.reason == "")[:, None], found.flags, 0).astype(np.uint8),
+        reasons=reasons,
     )
 
 
-def _flags(detection: Detection | None, count: int) -> NDArray[np.uint8]:
-    return np.zeros(count, np.uint8) if detection is None else detection.flags
+def _superseded(session: Session, time_ns: NDArray[np.int64], step_id: Sequence[str]) -> Mask:
+    """(K,): frames of a capture that was begun anew after them."""
+    begins_ns = begins_of(session)
+    named = zip(time_ns.tolist(), step_id, strict=True)
+    return np.array([is_superseded(time_ns, name, begins_ns) for time_ns, name in named])
 
 
-def _centres(detection: Detection | None, count: int) -> Float:
-    return np.full((count, 2), np.nan) if detection is None else detection.centres_px
-
-
-def _covariance(detection: Detection | None, count: int) -> Float:
-    return np.full((count, 2, 2), np.nan) if detection is None else detection.covariance_px2
+def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: Mask) -> tuple[str, ...]:
+    """Why each frame cannot be used, "" when it can."""
+    width, height = found.size_px[first].tolist()
+    columns = (found.size_px.tolist(), found.reason.tolist(), camera_degC.tolist(), superseded.tolist())
+    reasons: list[str] = []
+    for size_px, reason, degC, begun_anew in zip(*columns, strict=True):
+        if begun_anew:
+            reason = "its capture was begun anew"
+        elif size_px != [width, height]:
+            reason = f"the image has {size_px[0]} x {size_px[1]} pixels, the session's {width} x {height}"
+        elif not reason and math.isnan(degC):
+            reason = "the camera's temperature is unknown"
+        reasons.append(reason)
+    return tuple(reasons)
 
 
 def _purpose(parameters: dict[str, object]) -> tuple[Role, float]:

@@ -6,8 +6,8 @@ A warm-up is one: it shows a camera that was cold when it was switched on. The e
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
-from drivers.interface import Frame
 from stand.hub import Event
 from stand.recording.session import Session
 
@@ -27,6 +27,6 @@ def begins_of(session: Session) -> dict[str, int]:
     return {match[1]: time_ns for match, time_ns in found if match is not None}
 
 
-def is_superseded(frame: Frame, begins_ns: dict[str, int]) -> bool:
-    """Whether a frame does not count, by what `begins_of` its session says."""
-    return frame.time_ns < begins_ns.get(frame.step_id, frame.time_ns)
+def is_superseded(time_ns: int, step_id: str, begins_ns: Mapping[str, int]) -> bool:
+    """Whether a frame of that instant and step does not count, by what `begins_of` its session says."""
+    return time_ns < begins_ns.get(step_id, time_ns)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.interface import Frame, Reading
-from stand.hub import Batch, Hub, Item, StepMark, StepState
+from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
 from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
@@ -69,8 +70,10 @@ def published(index: int, time_ns: int) -> Iterator[Item]:
     yield Frame("camera.image", image, time_ns, 0.1, 0.0, chamber_degC + 20, index, 0, 0, f"step-{index}")
 
 
-async def record(directory: Path, attachments: dict[str, str], frames: int = len(SEQUENCE)) -> None:
-    """The first frames of the sequence, one a minute."""
+async def record(
+    directory: Path, attachments: dict[str, str], frames: int = len(SEQUENCE), events: Mapping[int, Event] | None = None
+) -> None:
+    """The first frames of the sequence, one a minute; events come right after the frame of that index."""
     clock, hub = VirtualClock(START_NS), Hub()
     info = SessionInfo(directory.name, "thermal-cycle", "TS-0001", "operator", "0.1.0", "virtual")
     devices = {"thermometers": "thermometers", "camera": "camera"}
@@ -81,6 +84,8 @@ async def record(directory: Path, attachments: dict[str, str], frames: int = len
         await clock.sleep_until(START_NS + index * 60 * NS_PER_S)
         for item in published(index, clock.now_ns()):
             hub.publish(item)
+        if events and index in events:
+            hub.publish(events[index])
     await clock.sleep_until(clock.now_ns() + NS_PER_S)
     for task in tasks:
         task.cancel()
@@ -95,3 +100,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     path = tmp_path_factory.mktemp("sessions") / "night"
     asyncio.run(record(path, {"target.yaml": TARGET_YAML}))
     return Recorded(path, np.array([true_centres_px(scene_at(index)) for index in range(len(SEQUENCE))]))
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Markers that an earlier test, or the developer, has found are not those of this test."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / f"cache-{next(_numbers)}"))
+
+
+_numbers = itertools.count()

@@ -207,7 +207,7 @@ def test_an_interrupted_command_leaves_older_files_as_they_were(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("compensation.observations.detect", interrupted)
+    monkeypatch.setattr("compensation.finding.piece.detect", interrupted)
     monkeypatch.setattr("compensation.cli.detect", interrupted)
     for command in ("detect", "fit", "report"):
         out = tmp_path / command

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
-from collections.abc import Iterator
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +13,14 @@ import pytest
 from compensation.drift.displacements import displacements, reference_centres
 from compensation.markers.detection import Flag
 from compensation.observations import Observations, Role, concatenate, observe, session_target
-from drivers.interface import ConfigError, Frame, SessionError
+from drivers.clock import NS_PER_S
+from drivers.interface import ConfigError, SessionError
+from stand.recording.instants import utc_text
+from stand.recording.records import frame_places
 from stand.recording.session import Session
+from stand.recording.superseded import restarted
 
-from .conftest import DARK, GLARE, SEQUENCE, TARGET_YAML, Recorded, record
+from .conftest import DARK, GLARE, SEQUENCE, START_NS, TARGET_YAML, Recorded, record
 from .synthetic import facts, observations, quadratic
 
 
@@ -76,9 +79,9 @@ def test_air_is_interpolated_between_readings_and_unknown_after_the_last(observe
 
 def test_progress_counts_frames(recorded: Recorded):
     session, told = Session.open(recorded.path), list[tuple[float, str]]()
-    observe(session, session_target(session), lambda done, text: told.append((done, text)))
-    assert [done for done, _ in told] == list(range(1, len(SEQUENCE) + 1))
-    assert told[0][1] == f"frame 1 of {len(SEQUENCE)}"
+    observe(session, session_target(session), report=lambda done, text: told.append((done, text)))
+    count = len(SEQUENCE)
+    assert told == [(done, f"frame {done} of {count}") for done in (0, 10, count)]  # the segments' ends
 
 
 @pytest.mark.parametrize(("word", "simulated"), [("true", True), ("false", False), (None, None), ("maybe", None)])
@@ -91,16 +94,28 @@ def test_a_session_says_whether_it_is_simulated_or_nothing(recorded_frame: Path,
     assert seen.simulated is bool(simulated)
 
 
-def test_a_damaged_frame_is_named(recorded: Recorded, monkeypatch: pytest.MonkeyPatch):
-    session = Session.open(recorded.path)
-
-    def frames() -> Iterator[Frame]:
-        yield from itertools.islice(Session.open(recorded.path).frames(), 2)
-        raise SessionError("000000.mcap: damaged")
-
-    monkeypatch.setattr(session, "frames", frames)
-    with pytest.raises(SessionError, match=r"^000000\.mcap: damaged; this was frame 2, counted from 0$"):
+def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(recorded.path, damaged)
+    session = Session.open(damaged)
+    segment = session.frame_segments[0]
+    place = frame_places(segment)[2]
+    data = bytearray(segment.read_bytes())
+    data[place.chunk.offset + place.chunk.length // 2] ^= 0xFF
+    segment.write_bytes(data)
+    when = utc_text(place.time_ns)
+    with pytest.raises(SessionError, match=rf"{segment.name}: .*; this was the frame of {when}$"):
         observe(session, session_target(session))
+
+
+def test_frames_of_a_capture_that_was_begun_anew_do_not_count(tmp_path: Path):
+    after_ns = START_NS + 2 * 60 * NS_PER_S + 1
+    again = restarted(after_ns, "step-1", 1)
+    asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))
+    session = Session.open(tmp_path / "night")
+    seen = observe(session, session_target(session))
+    assert seen.reasons == ("", "its capture was begun anew", "", "")
+    assert np.isnan(seen.centres_px[1]).all()
 
 
 def test_a_session_without_or_with_a_wrong_target_is_refused(tmp_path: Path):

@@ -50,7 +50,11 @@ def test_a_warm_up_that_was_killed_begins_anew_from_a_cold_camera(tmp_path: Path
     assert len(restarts) == 2
     begins_ns = begins_of(session)
     assert begins_ns == {capture.step_id: restarts[-1].time_ns}
-    frames = [frame for frame in session.frames() if frame.step_id and not is_superseded(frame, begins_ns)]
+    frames = [
+        frame
+        for frame in session.frames()
+        if frame.step_id and not is_superseded(frame.time_ns, frame.step_id, begins_ns)
+    ]
     assert len(frames) == 8
     assert session.frame_count > 8
     assert frames[0].camera_degC < 27.0

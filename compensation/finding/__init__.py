@@ -1,0 +1,1 @@
+"""Markers found in all frames of sessions: piece by piece, side by side, and never twice."""

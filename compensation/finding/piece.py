@@ -1,0 +1,125 @@
+"""The unit of work: the markers in the frames of one segment within a range of time.
+
+A piece names its frames and never holds one. It begins with a search and then tracks from frame to frame, so its
+result depends on the file, the range, the target and the noise alone: whoever works on it, wherever, and whatever was
+worked on before, finds the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.markers.detection import Detection, DetectionError, Noise, detect, nothing_found
+from compensation.target import Target
+from drivers.interface import Frame, SessionError
+from stand.recording.instants import utc_text
+from stand.recording.items import RecordedImage, frame_of
+from stand.recording.records import FramePlace, frame_places, read_frame
+from stand.recording.session import Session
+
+Float = NDArray[np.float64]
+
+FRAMES_PER_PIECE = 64
+"""A search costs as much as five tracked frames, and several workers should have something to do in a short night."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """The `frames` frames of `segment` whose middles of exposure lie in [begin_ns, end_ns]."""
+
+    segment: Path
+    begin_ns: int
+    end_ns: int
+    frames: int
+    target: Target
+    noise: Noise | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundMarkers:
+    """K frames with N markers. time_ns (K,) int64 and block (K,) int64 (low 32 bits of the block id) name the frames;
+    size_px (K, 2): width and height. centres_px (K, N, 2), covariance_px2 (K, N, 2, 2), chi (K, N): NaN for a marker
+    without a centre. flags (K, N) uint8: of markers.Flag. homography (K, 3, 3): target mm -> px, NaN when the target
+    was not found. reason (K) str: why it was not, else ""."""
+
+    time_ns: NDArray[np.int64]
+    block: NDArray[np.int64]
+    size_px: NDArray[np.int64]
+    centres_px: Float
+    covariance_px2: Float
+    chi: Float
+    flags: NDArray[np.uint8]
+    homography: Float
+    reason: NDArray[np.str_]
+
+
+def pieces_of(
+    session: Session, target: Target, noise: Noise | None = None, frames_per_piece: int = FRAMES_PER_PIECE
+) -> list[Piece]:
+    """All the frames of a session: its segments in order, each in order of time."""
+    pieces: list[Piece] = []
+    for segment in session.frame_segments:
+        places = _in_order(segment)
+        for first in range(0, len(places), frames_per_piece):
+            part = places[first : first + frames_per_piece]
+            pieces.append(Piece(segment.resolve(), part[0].time_ns, part[-1].time_ns, len(part), target, noise))
+    return pieces
+
+
+def find_markers(piece: Piece) -> FoundMarkers:
+    """Find the target in every frame of the piece; SessionError, with the frame's time, for one that cannot be read."""
+    nothing = nothing_found(piece.target)
+    rows: list[tuple[int, int, tuple[int, int], Detection, str]] = []
+    previous: Detection | None = None
+    size_px = (0, 0)
+    for frame in _frames(piece):
+        height, width = frame.image.shape[:2]
+        if (width, height) != size_px:
+            previous, size_px = None, (width, height)
+        detection, reason = None, ""
+        try:
+            detection = previous = detect(frame.image, piece.target, previous, piece.noise)
+        except DetectionError as error:
+            reason = str(error)
+        rows.append((frame.time_ns, frame.block_id & 0xFFFFFFFF, size_px, detection or nothing, reason))
+    found = [row[3] for row in rows]
+    return FoundMarkers(
+        time_ns=np.array([row[0] for row in rows], np.int64),
+        block=np.array([row[1] for row in rows], np.int64),
+        size_px=np.array([row[2] for row in rows], np.int64),
+        centres_px=np.array([detection.centres_px for detection in found]),
+        covariance_px2=np.array([detection.covariance_px2 for detection in found]),
+        chi=np.array([detection.chi for detection in found]),
+        flags=np.array([detection.flags for detection in found], np.uint8),
+        homography=np.array([detection.homography for detection in found]),
+        reason=np.array([row[4] for row in rows], np.str_),
+    )
+
+
+def joined(parts: list[FoundMarkers]) -> FoundMarkers:
+    """The frames of several pieces of one session, in order of time."""
+    order = np.argsort(np.concatenate([part.time_ns for part in parts]), kind="stable")
+    names = [field.name for field in fields(FoundMarkers)]
+    return FoundMarkers(**{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names})
+
+
+def _frames(piece: Piece) -> Iterator[Frame]:
+    for place in _in_order(piece.segment):
+        if piece.begin_ns <= place.time_ns <= piece.end_ns:
+            try:
+                message = read_frame(place)
+                yield frame_of(
+                    RecordedImage(place.schema, message.data, message.sequence, message.time_ns, None, place.path)
+                )
+            except SessionError as error:
+                raise SessionError(f"{error}; this was the frame of {utc_text(place.time_ns)}") from error
+
+
+def _in_order(segment: Path) -> list[FramePlace]:
+    return sorted(frame_places(segment), key=attrgetter("time_ns"))

@@ -1,0 +1,117 @@
+"""Pieces worked on here, in processes of this machine, or on a Dask cluster; the results are the same to the bit."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+
+from compensation.finding.piece import FoundMarkers, Piece, find_markers
+from drivers.interface import ConfigError, SessionError
+
+Work = Callable[[Sequence[Piece]], Iterator[tuple[int, FoundMarkers]]]
+"""Pieces -> (index, its markers), each piece once, in any order."""
+
+_TRIES = 3
+"""A piece whose worker died so often has killed it: the machine is out of memory, or the file is poison."""
+
+
+def in_turn(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
+    """One piece after the other, in this process."""
+    for index, piece in enumerate(pieces):
+        yield index, find_markers(piece)
+
+
+def in_processes(workers: int) -> Work:
+    """So many processes, each with one thread. What a process that was killed had not finished is done again by
+    another; SessionError when that does not help."""
+
+    def work(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
+        left, tries = set(range(len(pieces))), 0
+        while left:
+            before = len(left)
+            with _pool(workers) as pool:
+                try:
+                    for index, found in _finished(pool, pieces, sorted(left)):
+                        left.discard(index)
+                        yield index, found
+                except BrokenProcessPool as error:
+                    tries = 1 if len(left) < before else tries + 1
+                    if tries >= _TRIES:
+                        raise SessionError(
+                            f"{pieces[min(left)].segment}: the processes that look for its markers are killed each "
+                            "time; is there enough memory? Try fewer --workers"
+                        ) from error
+
+    return work
+
+
+def _finished(
+    pool: ProcessPoolExecutor, pieces: Sequence[Piece], indices: Iterable[int]
+) -> Iterator[tuple[int, FoundMarkers]]:
+    """As they are finished, also those that were when the pool broke."""
+    waiting: dict[Future[FoundMarkers], int] = {pool.submit(find_markers, pieces[index]): index for index in indices}
+    broken: BrokenProcessPool | None = None
+    while waiting:
+        done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+        for future in done:
+            index = waiting.pop(future)
+            try:
+                found = future.result()
+            except BrokenProcessPool as error:
+                broken = error
+            else:
+                yield index, found
+    if broken is not None:
+        raise broken
+
+
+@contextmanager
+def _pool(workers: int) -> Generator[ProcessPoolExecutor]:
+    """Started afresh (a fork would copy our threads' locks); what is not begun is dropped on any early way out."""
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _one_thread() -> None:
+    cv2.setNumThreads(1)
+
+
+def on_cluster(address: str, wait_s: float = 10.0) -> Work:
+    """The Dask cluster whose scheduler is at `address` (host:port); its workers must see the sessions' files under the
+    same paths. ConfigError when Dask is missing or nobody answers there."""
+
+    def work(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
+        with _client(address, wait_s) as client:
+            futures = [client.submit(find_markers, piece, pure=False, retries=_TRIES) for piece in pieces]
+            index_of = {future.key: index for index, future in enumerate(futures)}
+            for future, found in _as_completed(futures, client.loop):
+                yield index_of[future.key], found
+
+    return work
+
+
+def _client(address: str, wait_s: float) -> Any:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigError("--cluster needs Dask: pip install 'thermostand[cluster]'") from error
+    try:
+        return Client(address, timeout=wait_s, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--cluster {address}: no Dask scheduler answers there ({error})") from error
+
+
+def _as_completed(futures: Any, loop: Any) -> Any:
+    from distributed import as_completed
+
+    return as_completed(futures, loop=loop, with_results=True)

@@ -1,0 +1,181 @@
+"""Markers found piece by piece: by whoever, wherever, the same bits; a killed worker loses nothing; nothing is found
+twice."""
+
+import multiprocessing
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from compensation.finding.cache import keep, kept
+from compensation.finding.found import Finder, finder
+from compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
+from compensation.finding.workers import in_processes, in_turn, on_cluster
+from compensation.markers.noise import Noise
+from compensation.observations import session_target
+from drivers.interface import ConfigError, SessionError
+from stand.recording.session import Session
+
+from .conftest import Recorded
+
+
+@pytest.fixture
+def pieces(recorded: Recorded) -> list[Piece]:
+    session = Session.open(recorded.path)
+    return pieces_of(session, session_target(session), frames_per_piece=5)
+
+
+@pytest.fixture
+def serial(pieces: list[Piece]) -> list[FoundMarkers]:
+    return [found for _, found in in_turn(pieces)]
+
+
+def assert_same(one: FoundMarkers, other: FoundMarkers) -> None:
+    for field in fields(FoundMarkers):
+        here, there = getattr(one, field.name), getattr(other, field.name)
+        assert (here.dtype, here.shape, here.tobytes()) == (there.dtype, there.shape, there.tobytes()), field.name
+
+
+def assert_all_same(found: dict[int, FoundMarkers], serial: list[FoundMarkers]) -> None:
+    assert sorted(found) == list(range(len(serial)))
+    for index, expected in enumerate(serial):
+        assert_same(found[index], expected)
+
+
+def test_the_pieces_of_a_session_are_all_its_frames_once_and_in_order(recorded: Recorded, pieces: list[Piece]):
+    session = Session.open(recorded.path)
+    assert [piece.frames for piece in pieces] == [5, 5, 5, session.frame_count - 15]
+    found = joined([find_markers(piece) for piece in reversed(pieces)])
+    assert np.array_equal(found.time_ns, session.frame_times_ns)
+    assert np.array_equal(found.block, [frame.block_id & 0xFFFFFFFF for frame in session.frames()])
+
+
+def test_what_is_found_is_near_the_truth_and_a_dark_frame_has_its_reason(recorded: Recorded, pieces: list[Piece]):
+    found = joined([find_markers(piece) for piece in pieces])
+    (dark,) = np.flatnonzero(found.reason != "")
+    assert "found 0 of 54" in found.reason[dark]
+    seen = found.flags == 0
+    assert not seen[dark].any()
+    assert seen.mean() > 0.9
+    assert np.abs((found.centres_px - recorded.true_px)[seen]).max() < 0.1
+
+
+def test_processes_find_the_same_bits(pieces: list[Piece], serial: list[FoundMarkers]):
+    assert_all_same(dict(in_processes(2)(pieces)), serial)
+
+
+def test_a_killed_process_loses_nothing(pieces: list[Piece], serial: list[FoundMarkers]):
+    found: dict[int, FoundMarkers] = {}
+    for index, markers in in_processes(2)(pieces):
+        if not found:
+            for child in multiprocessing.active_children():
+                child.kill()
+        assert index not in found
+        found[index] = markers
+    assert_all_same(found, serial)
+
+
+class Poison(Piece):
+    """Kills whoever receives it."""
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+def test_a_piece_that_kills_its_workers_ends_with_a_sentence(pieces: list[Piece]):
+    poison = Poison(*(getattr(pieces[0], field.name) for field in fields(Piece)))
+    with pytest.raises(SessionError, match=r"0000\.mcap: the processes .* are killed each time; .* fewer --workers"):
+        list(in_processes(1)([poison]))
+
+
+def test_a_segment_that_cannot_be_read_ends_the_work_with_its_sentence(pieces: list[Piece], tmp_path: Path):
+    lost = replace(pieces[0], segment=tmp_path / "lost.mcap")
+    with pytest.raises(SessionError, match=r"lost\.mcap"):
+        list(in_processes(2)([lost, *pieces]))
+
+
+def test_a_cluster_finds_the_same_bits_also_when_a_worker_is_killed(pieces: list[Piece], serial: list[FoundMarkers]):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as here:
+        assert_all_same(dict(on_cluster(here.scheduler_address)(pieces)), serial)
+        found: dict[int, FoundMarkers] = {}
+        for index, markers in on_cluster(here.scheduler_address)(pieces):
+            if not found:
+                psutil.Process(here.workers[0].pid).kill()
+            found[index] = markers
+        assert_all_same(found, serial)
+
+
+def test_a_cluster_that_does_not_answer_is_named(pieces: list[Piece]):
+    with pytest.raises(ConfigError, match=r"--cluster 127\.0\.0\.1:9: no Dask scheduler answers there"):
+        list(on_cluster("127.0.0.1:9", wait_s=0.2)(pieces))
+
+
+def nobody(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
+    if pieces:
+        raise AssertionError(f"{len(pieces)} pieces are not kept")
+    yield from ()
+
+
+def test_what_was_found_is_kept_also_for_a_copy_elsewhere(
+    recorded: Recorded, pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
+):
+    told: list[int] = []
+    first = Finder(in_turn, tmp_path / "kept")(pieces, told.append)
+    assert told == [0, 5, 10, 15, sum(piece.frames for piece in pieces)]
+    shutil.copytree(recorded.path, tmp_path / "copy")
+    session = Session.open(tmp_path / "copy")
+    copies = pieces_of(session, session_target(session), frames_per_piece=5)
+    again = Finder(nobody, tmp_path / "kept")(copies, told.append)
+    for one, other, expected in zip(first, again, serial, strict=True):
+        assert_same(one, expected)
+        assert_same(other, expected)
+
+
+def test_another_content_target_noise_or_range_is_found_anew(pieces: list[Piece], tmp_path: Path):
+    Finder(in_turn, tmp_path / "kept")(pieces[:1], lambda done: None)
+    changed = tmp_path / "changed.mcap"
+    changed.write_bytes(pieces[0].segment.read_bytes() + b" ")
+    others = [
+        replace(pieces[0], segment=changed),
+        replace(pieces[0], target=pieces[0].target.model_copy(update={"pitch_mm": 31.0})),
+        replace(pieces[0], noise=Noise()),
+        pieces[1],
+    ]
+    for other in others:
+        with pytest.raises(AssertionError, match="1 pieces are not kept"):
+            Finder(nobody, tmp_path / "kept")([other], lambda done: None)
+    Finder(nobody, tmp_path / "kept")(pieces[:1], lambda done: None)
+
+
+def test_what_is_kept_but_damaged_is_found_anew(pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path):
+    Finder(in_turn, tmp_path)(pieces[:1], lambda done: None)
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"no archive", whole.replace(b"flags", b"flogs")):
+        file.write_bytes(damaged)
+        (found,) = Finder(in_turn, tmp_path)(pieces[:1], lambda done: None)
+        assert_same(found, serial[0])
+        assert file.read_bytes() == whole
+
+
+def test_a_place_that_cannot_be_written_keeps_nothing_and_stops_nobody(
+    pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
+):
+    (tmp_path / "file").write_text("")
+    keep(tmp_path / "file", "key", serial[0])
+    assert kept(tmp_path / "file", "key") is None
+    (found,) = Finder(in_turn, tmp_path / "file" / "below")(pieces[:1], lambda done: None)
+    assert_same(found, serial[0])
+
+
+def test_workers_that_cannot_be_are_refused():
+    with pytest.raises(ConfigError, match="--workers is 1 or more, not 0"):
+        finder(workers=0)
+    with pytest.raises(ConfigError, match="exclude each other"):
+        finder(workers=2, cluster="127.0.0.1:8786")
