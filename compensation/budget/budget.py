@@ -12,7 +12,7 @@ from compensation.budget.air import Index, ciddor_1996, edlen_1966
 from compensation.budget.correction import granite_mm, indices, post_mm, refraction_px, target_strain, varied
 from compensation.budget.geometry import Geometry, StandState
 from compensation.budget.refraction import tilted_shift_mm
-from compensation.budget.states import capture_states, mean_state
+from compensation.budget.states import capture_states, mean_state, states_at
 from compensation.budget.table import Repeatability, home_residuals, v0_repeats
 from compensation.target import Target
 from drivers.interface import SessionError
@@ -58,7 +58,8 @@ def budget(session: Session, target: Target, geometry: Geometry) -> Budget:
             f"{session.path}: in no capture were all five thermometers alive: the stand cannot be judged"
         )
     reference = mean_state([c.state for c in captures if c.role == "reference"] or [captures[0].state])
-    states = [capture.state for capture in captures]
+    ends_ns = np.array([time_ns for capture in captures for time_ns in (capture.start_ns, capture.end_ns)], np.int64)
+    states = [*(capture.state for capture in captures), *filter(_is_known, states_at(session, ends_ns))]
     thermal = _thermal(states, reference, geometry, _outermost_mm(target))
     events = session.events()
     table = (

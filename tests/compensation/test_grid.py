@@ -10,6 +10,7 @@ import pytest
 
 from compensation.markers.bootstrap import Candidates
 from compensation.markers.grid import DetectionError, Identified, identify, roll_deg
+from compensation.markers.placement import placements
 from compensation.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, true_centres_px
@@ -142,6 +143,15 @@ def test_a_side_that_clutter_hides_is_found_or_refused_and_never_read_one_column
         outcomes.append(wrong(found, candidates, truth))
     assert len(outcomes) >= 10
     assert set(outcomes) == {0}
+
+
+def test_a_growth_that_missed_a_column_and_went_on_into_clutter_is_set_right():
+    truth = true_centres_px(Scene(roll_deg=5))
+    beyond = 2 * truth[8] - truth[7]
+    points = np.vstack([truth, beyond])
+    lattice = {(n % 9, n // 9): n for n in range(54) if n % 9} | {(9, 0): 54}
+    best = min(placements(lattice, points, PAPER), key=lambda p: p.residual_px)
+    assert sorted(best.candidate) == list(range(54))
 
 
 @pytest.mark.parametrize("roll", range(-180, 180, 60))

@@ -27,6 +27,15 @@ def test_other_targets_are_identified(name: str):
     assert judged(own(photograph(scene, render(scene), 3), target), scene, own_order=True) == "found"
 
 
+def test_the_first_stage_is_off_by_noise_alone_also_where_it_searches_a_reduced_image():
+    scene = posed("roll 20", 1)
+    centres_px = own(photograph(scene, render(scene), 1), PAPER)
+    assert centres_px is not None
+    off = centres_px - true_centres_px(scene)
+    assert np.abs(off.mean(axis=0)).max() < 0.05
+    assert np.abs(off).max() < 0.5
+
+
 def test_detection_keeps_the_corners_that_a_wide_lens_puts_off_the_homography():
     scene = posed("wide field, distortion", 1)
     detection = detect(photograph(scene, render(scene), 1), PAPER)
