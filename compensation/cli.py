@@ -11,9 +11,10 @@ import typer
 
 from compensation.budget_cli import budget_of_session
 from compensation.command_line import TargetOption, installed_target, named_target, one_line_errors
-from compensation.drift.fitting import check_degree
-from compensation.drift.fitting import fit as fit_model
-from compensation.drift.model import MAX_DEGREE, CompensationModel
+from compensation.drift.choosing import Form, check_request
+from compensation.drift.choosing import fit as fit_model
+from compensation.drift.model_file import load_model, save_model
+from compensation.drift.paper_model import MAX_DEGREE
 from compensation.drift.validation import evaluate, table
 from compensation.files import check_writable
 from compensation.finding.found import finder
@@ -37,7 +38,11 @@ app = typer.Typer(
 
 Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of recorded sessions.")]
 DegreeOption = Annotated[
-    int | None, typer.Option(help=f"Degree of the polynomial, 1 to {MAX_DEGREE}; else chosen by cross-validation.")
+    int | None,
+    typer.Option(help=f"Degree of the paper's polynomial, 1 to {MAX_DEGREE}; else chosen by cross-validation."),
+]
+FormOption = Annotated[
+    Form | None, typer.Option(help="The paper's polynomial or the thermal form; else chosen by cross-validation.")
 ]
 
 Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
@@ -82,25 +87,26 @@ def detect_images(
 def fit(
     sessions: Sessions,
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
+    form: FormOption = None,
     degree: DegreeOption = None,
     target: TargetOption = None,
     workers: Workers = 1,
     cluster: Cluster = None,
     cache: Cache = True,
 ) -> None:
-    """Fit the drift model to the reference and fit frames of sessions of one camera.
+    """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
     with one_line_errors():
-        check_degree(degree)
+        check_request(degree, form)
         check_writable(out)
         found_by = finder(workers, cluster, use_cache=cache)
         observations = observe_sessions(sessions, progress, named_target(target), found_by)
-        model = fit_model(observations, degree)
+        model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
-        model.save(out)
-        typer.echo(f"degree {model.degree}, {model.score.terms} terms, condition {model.score.condition:.0f}")
+        save_model(model, out)
+        typer.echo(f"{model.form}: {model.title}")
         typer.echo(table(evaluation))
 
 
@@ -121,7 +127,7 @@ def report(
     with one_line_errors():
         check_writable(out)
         found_by = finder(workers, cluster, use_cache=cache)
-        given = None if model is None else CompensationModel.load(model)
+        given = None if model is None else load_model(model)
         observations = observe_sessions(sessions, progress, named_target(target), found_by)
         used = given or fit_model(observations)
         evaluation = evaluate(used, observations)

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.drift.history import History, recorded_history
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
 from compensation.target import Target
@@ -74,7 +75,8 @@ class Observations:
     values of Role. chamber_degC (F,): set-point. camera_degC (F,): the camera's own temperature. air_degC (F,): near
     the camera. Temperatures are NaN when unknown. centres_px (F, N, 2), covariance_px2 (F, N, 2, 2): NaN when the
     marker is missing or flagged. flags (F, N): of markers.Flag. reasons (F): why the frame cannot be used, "" when it
-    can. preview: the first usable frame, reduced, grey. image_size: (width, height) of the frames, px.
+    can. preview: the first usable frame, reduced, grey. image_size: (width, height) of the frames, px. histories: what
+    each of the sessions recorded of the camera's surroundings; empty when that is not known.
     """
 
     target: Target
@@ -93,6 +95,7 @@ class Observations:
     covariance_px2: Float
     flags: NDArray[np.uint8]
     reasons: tuple[str, ...]
+    histories: tuple[History, ...] = ()
 
     @property
     def usable(self) -> Mask:
@@ -202,6 +205,7 @@ def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -
         covariance_px2=np.where(unusable[:, :, None, None], np.nan, found.covariance_px2),
         flags=np.where((found.reason == "")[:, None], found.flags, 0).astype(np.uint8),
         reasons=reasons,
+        histories=(recorded_history(session),),
     )
 
 
@@ -297,6 +301,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         covariance_px2=np.concatenate([part.covariance_px2 for part in parts]),
         flags=np.concatenate([part.flags for part in parts]),
         reasons=tuple(reason for part in parts for reason in part.reasons),
+        histories=tuple(history for part in parts for history in part.histories),
     )
 
 

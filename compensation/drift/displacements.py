@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from compensation.observations import Float, Mask, Observations, Role
 from drivers.interface import SessionError
 
+_ANCHOR_FRAMES = 20
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Displacements:
@@ -43,14 +45,28 @@ class Displacements:
         )
 
 
-def reference_centres(observations: Observations) -> tuple[Float, Float]:
-    """Mean centres (S, N, 2) and their variance (S, N, 2) over each session's own REFERENCE frames; NaN without any.
+def anchors(observations: Observations) -> Mask:
+    """(F,): the frames that displacements are measured against: each session's REFERENCE frames; in a session that has
+    none the last frames of its first warm-up, so that a recorded warm-up can be learned from by itself."""
+    found = observations.of(Role.REFERENCE)
+    warm_up = np.flatnonzero(observations.of(Role.WARM_UP))
+    for index in range(len(observations.sessions)):
+        own = warm_up[observations.session[warm_up] == index]
+        if len(own) and not found[observations.session == index].any():
+            first = [frame for frame in own.tolist() if observations.step_id[frame] == observations.step_id[own[0]]]
+            found[first[-_ANCHOR_FRAMES:]] = True
+    return found
+
+
+def reference_centres(observations: Observations, frames: Mask | None = None) -> tuple[Float, Float]:
+    """Mean centres (S, N, 2) and their variance (S, N, 2) over each session's own `frames` (F,), by default its
+    REFERENCE frames; NaN without any.
 
     Each session has a reference of its own: between sessions somebody may have moved the target.
     """
     shape = (len(observations.sessions), observations.target.count, 2)
     centres, variance = np.full(shape, np.nan), np.full(shape, np.nan)
-    frames = observations.of(Role.REFERENCE)
+    frames = observations.of(Role.REFERENCE) if frames is None else frames
     for index in range(len(observations.sessions)):
         own = frames & (observations.session == index)
         measured = observations.centres_px[own]
@@ -61,10 +77,11 @@ def reference_centres(observations: Observations) -> tuple[Float, Float]:
     return centres, variance
 
 
-def displacements(observations: Observations, frames: Mask) -> Displacements:
-    """The measured centres of `frames` (F,) against the references of their sessions; markers without either are
-    left out. SessionError when a session of these frames has no reference frames."""
-    centres, variance = reference_centres(observations)
+def displacements(observations: Observations, frames: Mask, against: Mask | None = None) -> Displacements:
+    """The measured centres of `frames` (F,) against the references of their sessions, the mean of the frames `against`
+    (F,), by default the REFERENCE frames; markers without either are left out. SessionError when a session of these
+    frames has no reference frames."""
+    centres, variance = reference_centres(observations, against)
     for index in np.unique(observations.session[frames]):
         if not np.isfinite(centres[index]).any():
             name = observations.sessions[index].session_id

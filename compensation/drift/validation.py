@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.displacements import Displacements, displacements
-from compensation.drift.fitting import degrees_for, left_out, scaling_of
-from compensation.drift.model import CompensationModel
-from compensation.observations import Float, Observations, Role
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.paper_fit import degrees_for, left_out, scaling_of
+from compensation.drift.paper_model import PaperModel
+from compensation.drift.states import States
+from compensation.drift.thermal_choice import left_out_thermal
+from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.training import frame_states
+from compensation.observations import Float, Mask, Observations, Role
 from drivers.interface import SessionError
 
 PAPER_BEFORE_PX = (0.191, 0.576)
@@ -62,55 +67,65 @@ class Evaluation:
         return rms_px(self.after_px)
 
 
-def evaluate(model: CompensationModel, observations: Observations) -> Evaluation:
+def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
     """Score the model on the VALIDATION frames; a session without any is scored by leaving out one temperature at a
-    time, each time with a new fit of the same degree. SessionError when the frames are of another camera or target."""
+    time, each time with a new fit of the same terms. SessionError when the frames are of another camera or target."""
     _check_same(model, observations)
     frames = observations.of(Role.VALIDATION)
+    states = frame_states(observations, model.memory)
     if frames.any():
         rows = displacements(observations, frames)
-        after = rows.displacement_px - model.shift(rows.measured_px, rows.camera_degC)
+        after = rows.displacement_px - model.shift(rows.measured_px, states.where(rows.frame))
         method = "held-out temperatures"
     else:
-        rows = displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
-        after = _left_out(model, observations, rows)
+        rows, after = _left_out(model, observations)
         method = "no held-out frames: one temperature left out at a time"
-    if len(rows.frame) == 0:
-        raise SessionError("no markers are left to score the model with")
+    rows, after = _answered(rows, after)
+    at_rows = states.where(rows.frame)
     return Evaluation(
         method=method,
         held_out=bool(frames.any()),
         frames=len(np.unique(rows.frame)),
         before_px=rows.displacement_px,
         after_px=after,
-        outside=~model.inside(rows.measured_px, rows.camera_degC),
-        coverage_95=_coverage(model, rows, after),
+        outside=~model.inside(rows.measured_px, at_rows),
+        coverage_95=_coverage(model, rows, at_rows, after),
         temperatures=_by_temperature(rows, after),
         simulated=observations.simulated,
     )
 
 
-def _check_same(model: CompensationModel, observations: Observations) -> None:
+def _check_same(model: DriftModel, observations: Observations) -> None:
     serial = observations.sessions[0].camera_serial
     if serial != model.camera_serial:
         raise SessionError(f"the model is of camera {model.camera_serial}, the session of camera {serial}")
-    if observations.image_size != model.scaling.image_size:
-        raise SessionError(
-            f"the model is of images of {model.scaling.image_size} px, the session of {observations.image_size}"
-        )
+    if observations.image_size != model.image_size:
+        raise SessionError(f"the model is of images of {model.image_size} px, the session of {observations.image_size}")
 
 
-def _left_out(model: CompensationModel, observations: Observations, rows: Displacements) -> Float:
-    """Residuals (M, 2) of new fits of the same degree."""
-    degrees_for(rows, model.degree)
+def _left_out(model: DriftModel, observations: Observations) -> tuple[Displacements, Float]:
+    """The rows at set-points, and their residuals (M, 2) of new fits of the same form."""
+    if isinstance(model, ThermalModel):
+        return left_out_thermal(model, observations)
+    rows = displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
+    degree = model.degree if isinstance(model, PaperModel) else 1
+    degrees_for(rows, degree)
     try:
-        return left_out(rows, model.degree, scaling_of(observations, rows))
+        return rows, left_out(rows, degree, scaling_of(observations, rows))
     except np.linalg.LinAlgError as error:
-        raise SessionError(f"the markers do not determine a polynomial of degree {model.degree}") from error
+        raise SessionError(f"the markers do not determine a polynomial of degree {degree}") from error
 
 
-def _coverage(model: CompensationModel, rows: Displacements, after: Float) -> tuple[float, float]:
-    claimed = np.diagonal(model.covariance(rows.measured_px, rows.camera_degC), axis1=1, axis2=2) + rows.variance_px2
+def _answered(rows: Displacements, after: Float) -> tuple[Displacements, Float]:
+    """What the model had an answer for; it has none where the thermal state is unknown."""
+    known: Mask = np.isfinite(after[:, 0])
+    if not known.any():
+        raise SessionError("no markers are left to score the model with")
+    return rows.where(known), after[known]
+
+
+def _coverage(model: DriftModel, rows: Displacements, states: States, after: Float) -> tuple[float, float]:
+    claimed = np.diagonal(model.covariance(rows.measured_px, states), axis1=1, axis2=2) + rows.variance_px2
     inside = (np.abs(after) <= _SIGMA_95 * np.sqrt(claimed)).mean(axis=0)
     return float(inside[0]), float(inside[1])
 

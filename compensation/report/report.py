@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from compensation.drift.fitting import fit
-from compensation.drift.model import CompensationModel
+from compensation.drift.choosing import fit
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.model_file import save_model
+from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import (
     PAPER_AFTER_PX,
     PAPER_BEFORE_PX,
@@ -39,24 +41,24 @@ def analyse(session_paths: Sequence[Path], model_path: Path, report_path: Path, 
         check_writable(path)
     observations = observe_sessions(session_paths, progress)
     with progress("fit and report", 3) as report:
-        report(0, "choosing the degree")
+        report(0, "choosing the form")
         model = fit(observations)
         report(1, "scoring")
         evaluation = evaluate(model, observations)
         report(2, "drawing")
         text = report_page(observations, model, evaluation)
-        model.save(model_path)
+        save_model(model, model_path)
         write_whole(report_path, text)
         report(3, "written")
     return evaluation
 
 
-def write_report(path: Path, observations: Observations, model: CompensationModel, evaluation: Evaluation) -> None:
+def write_report(path: Path, observations: Observations, model: DriftModel, evaluation: Evaluation) -> None:
     """Write the page, whole or not at all; SessionError when the place refuses."""
     write_whole(path, report_page(observations, model, evaluation))
 
 
-def report_page(observations: Observations, model: CompensationModel, evaluation: Evaluation) -> str:
+def report_page(observations: Observations, model: DriftModel, evaluation: Evaluation) -> str:
     """The report as HTML text; the same data give the same text."""
     title = f"Thermal compensation of camera {model.camera_serial}"
     parts = [
@@ -160,19 +162,12 @@ def _figures(observations: Observations, evaluation: Evaluation) -> Iterator[str
     )
 
 
-def _model(model: CompensationModel) -> str:
-    low, high = model.scaling.camera_degC
+def _model(model: DriftModel) -> str:
+    low, high = model.camera_range_degC
     (left, top), (right, bottom) = model.hull_px.min(axis=0), model.hull_px.max(axis=0)
     s_i, s_j = 1000 * model.discrepancy_px
     lines = [
-        (
-            "Form",
-            "displacement to the reference = P(I, J, T), one polynomial per coordinate; T is the camera's temperature",
-        ),
-        (
-            "Degree",
-            f"{model.degree}, {model.score.terms} terms per coordinate, condition {model.score.condition:.0f}",
-        ),
+        *_form(model),
         (
             "Reference",
             f"camera {model.reference_degC:.2f} °C, chamber {model.reference_chamber_degC:g} °C, "
@@ -188,17 +183,45 @@ def _model(model: CompensationModel) -> str:
         ),
         ("Fitted to", ", ".join(model.session_ids)),
     ]
-    rows = [
-        (f"{score.degree}", f"{score.terms}", f"{score.condition:.0f}", *(f"{value:.4f}" for value in score.rms_px))
-        for score in model.scores
-    ]
-    choice = paragraph(
+    return "\n".join([facts(lines), *_choice(model)])
+
+
+def _form(model: DriftModel) -> list[tuple[str, str]]:
+    if not isinstance(model, PaperModel):
+        return [("Form", f"displacement to the reference = {model.title}")]
+    polynomial = (
+        "displacement to the reference = P(I, J, T), one polynomial per coordinate; T is the camera's temperature"
+    )
+    terms = f"{model.degree}, {model.score.terms} terms per coordinate, condition {model.score.condition:.0f}"
+    return [("Form", polynomial), ("Degree", terms)]
+
+
+def _choice(model: DriftModel) -> Iterator[str]:
+    """What was tried: the degrees of the paper's form, and every form where there was more than one."""
+    yield paragraph(
         "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is "
         "the simplest degree within one standard error of the best, or the one asked for.",
         aside=True,
     )
-    heads = ("degree", "terms", "condition", "RMS I, px", "RMS J, px")
-    return "\n".join([facts(lines), choice, table(heads, rows, chosen=model.degree - 1)])
+    if isinstance(model, PaperModel):
+        rows = [
+            (f"{score.degree}", f"{score.terms}", f"{score.condition:.0f}", *(f"{value:.4f}" for value in score.rms_px))
+            for score in model.scores
+        ]
+        heads = ("degree", "terms", "condition", "RMS I, px", "RMS J, px")
+        yield table(heads, rows, chosen=model.degree - 1)
+    if any(one.form != "paper" for one in model.candidates):
+        rows = [
+            (
+                one.name,
+                f"{one.terms}",
+                *(f"{value:.4f}" for value in one.rms_px),
+                "" if one.bic is None else f"{one.bic:.0f}",
+            )
+            for one in model.candidates
+        ]
+        chosen = next((index for index, one in enumerate(model.candidates) if one.chosen), None)
+        yield table(("form", "coefficients", "RMS I, px", "RMS J, px", "BIC"), rows, chosen=chosen)
 
 
 def _data(observations: Observations) -> str:

@@ -15,7 +15,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from compensation import cli
-from compensation.drift.model import CompensationModel
+from compensation.drift.model_file import load_model
+from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import table
 from compensation.markers.table import COLUMNS
 from compensation.report.report import analyse
@@ -110,7 +111,9 @@ def test_fit_then_report_then_analyse_agree(recorded: Recorded, tmp_path: Path, 
 
 def test_the_degree_can_be_given(recorded: Recorded, tmp_path: Path):
     assert run("fit", recorded.path, "-o", tmp_path / "model.json", "--degree", "3").exit_code == 0
-    assert CompensationModel.load(tmp_path / "model.json").degree == 3
+    model = load_model(tmp_path / "model.json")
+    assert isinstance(model, PaperModel)
+    assert model.degree == 3
     assert json.loads((tmp_path / "model.json").read_text())["session_ids"] == ["night"]
 
 

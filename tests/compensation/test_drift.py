@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from compensation.drift.displacements import displacements
-from compensation.drift.fitting import choose, convex_hull, fit
-from compensation.drift.model import CompensationModel, DegreeScore
+from compensation.drift.hull import convex_hull
+from compensation.drift.model_file import load_model, save_model
+from compensation.drift.paper_fit import choose, fit_paper
+from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import condense, design, solve
 from compensation.files import write_whole
 from compensation.observations import Observations, Role, concatenate
@@ -32,14 +34,14 @@ def noisy() -> Observations:
 
 
 @pytest.fixture(scope="module")
-def model(noisy: Observations) -> CompensationModel:
-    return fit(noisy)
+def model(noisy: Observations) -> PaperModel:
+    return fit_paper(noisy)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4, 5])
 def test_a_drift_of_degree_n_is_recovered_everywhere_by_the_fit_of_degree_n(degree: int):
     drift, displacement = polynomial_drift(degree, seed=degree)
-    fitted = fit(observations(drift), degree)
+    fitted = fit_paper(observations(drift), degree)
     points = np.random.default_rng(0).uniform([0, 0], [2447, 2047], (200, 2))
     for above_K in (-13.0, 3.0, 27.0):
         got = fitted.shift(points, 24 + above_K + CAMERA_ABOVE_CHAMBER_K)
@@ -55,11 +57,11 @@ def test_the_fit_is_that_of_plain_monomials_in_pixels_and_degrees(noisy: Observa
     powers = [(a, b, c) for a in range(6) for b in range(6) for c in range(6) if a + b + c <= degree]
     raw = np.stack([i**a * j**b * t**c for a, b, c in powers], axis=1)
     positions = raw @ np.linalg.lstsq(raw, rows.measured_px + rows.displacement_px, rcond=1e-16)[0]
-    corrected = fit(noisy, degree).correct(rows.measured_px, rows.camera_degC)
+    corrected = fit_paper(noisy, degree).correct(rows.measured_px, rows.camera_degC)
     np.testing.assert_allclose(corrected, positions, rtol=0, atol=1e-5)
 
 
-def test_what_is_left_at_held_out_temperatures_is_the_noise(noisy: Observations, model: CompensationModel):
+def test_what_is_left_at_held_out_temperatures_is_the_noise(noisy: Observations, model: PaperModel):
     rows = displacements(noisy, noisy.of(Role.VALIDATION))
     after = rows.displacement_px - model.shift(rows.measured_px, rows.camera_degC)
     assert rms(rows.displacement_px) > 0.3
@@ -70,7 +72,7 @@ def test_what_is_left_at_held_out_temperatures_is_the_noise(noisy: Observations,
 @pytest.mark.parametrize(("degree", "seed"), [(1, 1), (2, 0), (3, 0)])
 def test_the_chosen_degree_is_the_simplest_that_explains_the_drift(degree: int, seed: int):
     drift, _ = polynomial_drift(degree, seed)
-    assert fit(observations(drift, NOISE_PX, seed)).degree == degree
+    assert fit_paper(observations(drift, NOISE_PX, seed)).degree == degree
 
 
 def score(degree: int, *fold_rms_px: float) -> DegreeScore:
@@ -88,14 +90,14 @@ def test_one_standard_error_of_the_difference_decides():
     assert choose((best, score(4, 0.10, 0.20, 0.10, 0.31))) == 3
 
 
-def test_only_reference_and_fit_frames_are_fitted(noisy: Observations, model: CompensationModel, tmp_path: Path):
+def test_only_reference_and_fit_frames_are_fitted(noisy: Observations, model: PaperModel, tmp_path: Path):
     other = ~noisy.of(Role.REFERENCE, Role.FIT)
     spoiled = noisy.centres_px.copy()
     spoiled[other] += 7.0
     role = noisy.role.astype("U16")
     role[np.flatnonzero(other)[:5]] = "warm_up"
-    fit(replace(noisy, centres_px=spoiled, role=role)).save(tmp_path / "spoiled.json")
-    model.save(tmp_path / "model.json")
+    save_model(fit_paper(replace(noisy, centres_px=spoiled, role=role)), tmp_path / "spoiled.json")
+    save_model(model, tmp_path / "model.json")
     assert (tmp_path / "spoiled.json").read_bytes() == (tmp_path / "model.json").read_bytes()
 
 
@@ -105,12 +107,12 @@ def test_an_uncertain_centre_counts_for_little_and_a_missing_one_for_nothing(noi
     covariance[12, 7] *= 1e6
     centres[13, 8] = np.nan
     reference = places_px()
-    before, after = fit(noisy, 2), fit(replace(noisy, centres_px=centres, covariance_px2=covariance), 2)
+    before, after = fit_paper(noisy, 2), fit_paper(replace(noisy, centres_px=centres, covariance_px2=covariance), 2)
     change = after.shift(reference, 50.0) - before.shift(reference, 50.0)
     assert 0 < np.abs(change).max() < 0.1 * NOISE_PX
 
 
-def test_the_covariance_of_the_coefficients_is_that_of_repeated_fits(model: CompensationModel):
+def test_the_covariance_of_the_coefficients_is_that_of_repeated_fits(model: PaperModel):
     rng = np.random.default_rng(3)
     xy, camera_degC = rng.uniform([0, 0], [2447, 2047], (60, 2)), rng.uniform(25, 67, 60)
     terms = design(xy, camera_degC, 2, model.scaling)
@@ -123,7 +125,7 @@ def test_the_covariance_of_the_coefficients_is_that_of_repeated_fits(model: Comp
     assert 1.0 <= min(ratio) <= float(np.median(ratio)) < 1.1  # inflated by chi^2 where that exceeds 1, never deflated
 
 
-def test_the_valid_range_is_the_hull_of_the_markers_and_the_temperatures_of_the_fit(model: CompensationModel):
+def test_the_valid_range_is_the_hull_of_the_markers_and_the_temperatures_of_the_fit(model: PaperModel):
     corners = np.array([[170.0, 375.0], [2274.0, 375.0], [2274.0, 1690.0], [170.0, 1690.0], [1200.0, 1000.0]])
     assert model.inside(corners, 45.0).all()
     out = np.array([[160.0, 1000.0], [2290.0, 1000.0], [1200.0, 360.0], [1200.0, 1700.0], [np.nan, 1000.0]])
@@ -140,23 +142,23 @@ def test_the_hull_has_the_corners_only():
     assert sorted(convex_hull(points).tolist()) == sorted(square.tolist())
 
 
-def test_nan_in_is_nan_out(model: CompensationModel):
+def test_nan_in_is_nan_out(model: PaperModel):
     got = model.correct(np.array([[np.nan, 5.0], [1000.0, 1000.0]]), np.array([40.0, np.nan]))
     assert np.isnan(got).all()
 
 
-def test_the_reference_is_the_mean_of_the_reference_frames(noisy: Observations, model: CompensationModel):
+def test_the_reference_is_the_mean_of_the_reference_frames(noisy: Observations, model: PaperModel):
     np.testing.assert_allclose(model.reference_centres_px, noisy.centres_px[:8].mean(axis=0), rtol=0, atol=1e-9)
     assert (model.reference_degC, model.reference_chamber_degC) == (39.0, 24.0)
 
 
-def test_a_model_is_read_back_number_for_number(model: CompensationModel, tmp_path: Path):
+def test_a_model_is_read_back_number_for_number(model: PaperModel, tmp_path: Path):
     centres = model.reference_centres_px.copy()
     centres[3] = np.nan
     saved = replace(model, reference_centres_px=centres)
-    saved.save(tmp_path / "model.json")
-    loaded = CompensationModel.load(tmp_path / "model.json")
-    for name in CompensationModel.__slots__:
+    save_model(saved, tmp_path / "model.json")
+    loaded = load_model(tmp_path / "model.json")
+    for name in PaperModel.__slots__:
         np.testing.assert_equal(getattr(loaded, name), getattr(saved, name), err_msg=name)
     assert [path.name for path in tmp_path.iterdir()] == ["model.json"]
 
@@ -171,7 +173,7 @@ def damaged(text: str) -> dict[str, str]:
         "empty": "",
         "list": "[]",
         "other format": json.dumps({**data, "format": "something else"}),
-        "later version": json.dumps({**data, "schema_version": 2}),
+        "later version": json.dumps({**data, "schema_version": 3}),
         "text for number": json.dumps({**data, "reference_degC": "warm"}),
         "nan": text.replace('"reference_degC": 39.0', '"reference_degC": NaN'),
         "key missing": json.dumps({name: value for name, value in data.items() if name != "hull_px"}),
@@ -188,27 +190,27 @@ def damaged(text: str) -> dict[str, str]:
     }
 
 
-def test_a_damaged_model_file_is_refused_with_a_sentence(model: CompensationModel, tmp_path: Path):
-    model.save(tmp_path / "good.json")
+def test_a_damaged_model_file_is_refused_with_a_sentence(model: PaperModel, tmp_path: Path):
+    save_model(model, tmp_path / "good.json")
     path = tmp_path / "bad.json"
     for what, text in damaged((tmp_path / "good.json").read_text()).items():
         path.write_text(text)
         with pytest.raises(SessionError, match=r"bad\.json: not a drift model of this program") as raised:
-            CompensationModel.load(path)
+            load_model(path)
         assert "\n" not in str(raised.value), what
     path.write_bytes(b"\xff\xfe\x00binary")
     with pytest.raises(SessionError, match=r"bad\.json: cannot be read"):
-        CompensationModel.load(path)
+        load_model(path)
     with pytest.raises(SessionError, match=r"none\.json: cannot be read"):
-        CompensationModel.load(tmp_path / "none.json")
+        load_model(tmp_path / "none.json")
 
 
-def test_a_model_that_cannot_be_written_leaves_nothing(model: CompensationModel, tmp_path: Path):
+def test_a_model_that_cannot_be_written_leaves_nothing(model: PaperModel, tmp_path: Path):
     with pytest.raises(SessionError, match="cannot be written"):
-        model.save(tmp_path / "nowhere" / "model.json")
+        save_model(model, tmp_path / "nowhere" / "model.json")
     (tmp_path / "folder").mkdir()
     with pytest.raises(SessionError, match="cannot be written"):
-        model.save(tmp_path / "folder")
+        save_model(model, tmp_path / "folder")
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
@@ -232,13 +234,13 @@ def test_too_few_temperatures_are_refused_with_a_sentence(
     fit_degC: tuple[float, ...], degree: int | None, sentence: str
 ):
     with pytest.raises(SessionError, match=sentence):
-        fit(observations(quadratic, fit_degC=fit_degC), degree)
+        fit_paper(observations(quadratic, fit_degC=fit_degC), degree)
 
 
-def test_a_warm_up_session_beside_it_changes_nothing(noisy: Observations, model: CompensationModel):
+def test_a_warm_up_session_beside_it_changes_nothing(noisy: Observations, model: PaperModel):
     warm_up = observations(quadratic, session=facts("warm-up"))
     warm_up = replace(warm_up, role=np.array(["warm_up"] * len(warm_up.frame)))
-    both = fit(concatenate([warm_up, noisy]))
+    both = fit_paper(concatenate([warm_up, noisy]))
     np.testing.assert_array_equal(both.coefficients, model.coefficients)
     np.testing.assert_array_equal(both.reference_centres_px, model.reference_centres_px)
     assert both.session_ids == ("warm-up", "night-1")
@@ -247,7 +249,7 @@ def test_a_warm_up_session_beside_it_changes_nothing(noisy: Observations, model:
 def test_two_nights_with_the_target_moved_between_them_are_one_fit(noisy: Observations):
     other = observations(quadratic, NOISE_PX, seed=9, session=facts("night-2"))
     other = replace(other, centres_px=other.centres_px + 3.0)
-    fitted = fit(concatenate([noisy, other]))
+    fitted = fit_paper(concatenate([noisy, other]))
     points = places_px()
     np.testing.assert_allclose(fitted.shift(points, 60.0), points - quadratic(points, 21.0), rtol=0, atol=NOISE_PX)
 
@@ -256,7 +258,7 @@ def test_nights_with_different_reference_temperatures_are_refused(noisy: Observa
     other = observations(quadratic, NOISE_PX, session=facts("night-2"))
     chamber = np.where(other.role == "reference", 20.0, other.chamber_degC)
     with pytest.raises(SessionError, match="different reference temperatures: 20, 24 degC"):
-        fit(concatenate([noisy, replace(other, chamber_degC=chamber)]))
+        fit_paper(concatenate([noisy, replace(other, chamber_degC=chamber)]))
 
 
 def test_markers_in_one_line_are_refused(noisy: Observations):
@@ -265,7 +267,7 @@ def test_markers_in_one_line_are_refused(noisy: Observations):
     level = row[:, :, 1].copy()
     row[:, :, 1] = np.where(np.isfinite(level), 1000.0, np.nan)
     with pytest.raises(SessionError, match="all in one line"):
-        fit(replace(noisy, centres_px=row))
+        fit_paper(replace(noisy, centres_px=row))
 
 
 @pytest.mark.parametrize("noise_px", [0.0, 0.05])
@@ -274,7 +276,7 @@ def test_markers_in_one_line_with_their_noise_are_refused(noise_px: float):
     night = observations(quadratic, noise_px, seed=3)
     row = np.where(np.arange(54)[:, None] < 9, night.centres_px, np.nan)
     with pytest.raises(SessionError, match="in one line"):
-        fit(replace(night, centres_px=row))
+        fit_paper(replace(night, centres_px=row))
 
 
 def test_two_rows_of_markers_do_not_determine_degree_4(noisy: Observations):
@@ -282,4 +284,4 @@ def test_two_rows_of_markers_do_not_determine_degree_4(noisy: Observations):
     rows[:, 18:] = np.nan
     few = replace(noisy, centres_px=rows)
     with pytest.raises(SessionError, match="do not determine a polynomial of degree 4"):
-        fit(few, 4)
+        fit_paper(few, 4)

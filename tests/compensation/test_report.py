@@ -10,8 +10,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from compensation.drift.fitting import fit
-from compensation.drift.model import CompensationModel
+from compensation.drift.paper_fit import fit_paper
+from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import Evaluation, evaluate
 from compensation.observations import Observations, Role, concatenate
 from compensation.report import figures
@@ -20,7 +20,7 @@ from drivers.interface import SessionError
 
 from .synthetic import facts, observations, quadratic
 
-Analysed = tuple[Observations, CompensationModel, Evaluation]
+Analysed = tuple[Observations, PaperModel, Evaluation]
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def analysed() -> Analysed:
     flags = night.flags.copy()
     flags[5, 7] = 2
     night = replace(night, role=role, reasons=reasons, flags=flags)
-    model = fit(night)
+    model = fit_paper(night)
     return night, model, evaluate(model, night)
 
 

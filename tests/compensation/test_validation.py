@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.drift.fitting import fit
-from compensation.drift.model import CompensationModel
+from compensation.drift.paper_fit import fit_paper
+from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import evaluate, improvement_percent, table
 from compensation.observations import Observations
 from drivers.interface import SessionError
@@ -24,15 +24,15 @@ def night() -> Observations:
 
 
 @pytest.fixture(scope="module")
-def model(night: Observations) -> CompensationModel:
-    return fit(night)
+def model(night: Observations) -> PaperModel:
+    return fit_paper(night)
 
 
 def true_rms(above_K: float) -> np.ndarray:
     return np.sqrt(((quadratic(places_px(), above_K) - places_px()) ** 2).mean(axis=0))
 
 
-def test_before_is_the_drift_and_after_is_the_noise(night: Observations, model: CompensationModel):
+def test_before_is_the_drift_and_after_is_the_noise(night: Observations, model: PaperModel):
     got = evaluate(model, night)
     truth = np.sqrt(np.mean([true_rms(degC - 24) ** 2 for degC in HELD_OUT_DEGC], axis=0))
     np.testing.assert_allclose(got.rms_before_px, truth, rtol=0.01)
@@ -41,12 +41,12 @@ def test_before_is_the_drift_and_after_is_the_noise(night: Observations, model: 
     assert not got.outside.any()
 
 
-def test_the_95_percent_interval_holds_95_percent(night: Observations, model: CompensationModel):
+def test_the_95_percent_interval_holds_95_percent(night: Observations, model: PaperModel):
     for part in evaluate(model, night).coverage_95:
         assert 0.92 <= part <= 0.98
 
 
-def test_each_temperature_has_its_own_rms(night: Observations, model: CompensationModel):
+def test_each_temperature_has_its_own_rms(night: Observations, model: PaperModel):
     got = evaluate(model, night).temperatures
     assert [row.chamber_degC for row in got] == list(HELD_OUT_DEGC)
     assert [row.camera_degC for row in got] == [degC + 15 for degC in HELD_OUT_DEGC]
@@ -58,7 +58,7 @@ def test_each_temperature_has_its_own_rms(night: Observations, model: Compensati
 
 def test_without_held_out_frames_one_temperature_is_left_out_at_a_time():
     all_fitted = observations(quadratic, NOISE_PX, seed=5, held_out_degC=())
-    model = fit(all_fitted)
+    model = fit_paper(all_fitted)
     got = evaluate(model, all_fitted)
     assert not got.held_out
     assert got.method == "no held-out frames: one temperature left out at a time"
@@ -67,30 +67,30 @@ def test_without_held_out_frames_one_temperature_is_left_out_at_a_time():
         np.testing.assert_allclose(row.after_px, fold)
 
 
-def test_a_model_scores_a_session_it_was_not_fitted_to(model: CompensationModel):
+def test_a_model_scores_a_session_it_was_not_fitted_to(model: PaperModel):
     other = observations(quadratic, NOISE_PX, seed=6, session=facts("night-2"))
     np.testing.assert_allclose(evaluate(model, other).rms_after_px, NOISE_PX * np.sqrt(1 + 1 / 8), rtol=0.06)
 
 
-def test_temperatures_beyond_the_fit_are_told(model: CompensationModel):
+def test_temperatures_beyond_the_fit_are_told(model: PaperModel):
     hotter = observations(quadratic, NOISE_PX, held_out_degC=(34.0, 60.0))
     np.testing.assert_array_equal(evaluate(model, hotter).outside, np.repeat([False, True], 2 * 54))
 
 
-def test_the_score_of_another_camera_is_refused(night: Observations, model: CompensationModel):
+def test_the_score_of_another_camera_is_refused(night: Observations, model: PaperModel):
     with pytest.raises(SessionError, match="the model is of camera TS-0001, the session of camera other"):
         evaluate(model, replace(night, sessions=(facts(camera="other"),)))
     with pytest.raises(SessionError, match="images of"):
         evaluate(model, replace(night, image_size=(640, 480)))
 
 
-def test_too_few_temperatures_to_leave_one_out_are_refused(model: CompensationModel):
+def test_too_few_temperatures_to_leave_one_out_are_refused(model: PaperModel):
     few = observations(quadratic, fit_degC=(31.0,), held_out_degC=())
     with pytest.raises(SessionError, match="a fit of degree 2 needs frames at 4 chamber temperatures or more, found 2"):
         evaluate(model, few)
 
 
-def test_the_table_stands_beside_the_papers(night: Observations, model: CompensationModel):
+def test_the_table_stands_beside_the_papers(night: Observations, model: PaperModel):
     exact = replace(
         evaluate(model, night), before_px=np.array([[0.2, -0.5]]), after_px=np.array([[-0.01, 0.05]]), frames=12
     )

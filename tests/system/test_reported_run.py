@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from compensation.drift.model import CompensationModel
+from compensation.drift.model_file import load_model
 from stand.config import packaged
 from stand.estimate import price
 from stand.exit_codes import NOT_REPORTED
@@ -85,7 +85,7 @@ def check_reported(ended: subprocess.CompletedProcess[str]) -> Path:
     directory = Path(session)
     assert verify(directory).is_sound
     assert lines[-2:] == [f"model    {directory / MODEL_NAME}", f"report   {directory / REPORT_NAME}"]
-    assert CompensationModel.load(directory / MODEL_NAME).session_ids == (directory.name,)
+    assert load_model(directory / MODEL_NAME).session_ids == (directory.name,)
     assert directory.name in (directory / REPORT_NAME).read_text(encoding="utf-8")
     return directory
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.drift.fitting import fit
-from compensation.drift.model import CompensationModel
+from compensation.drift.paper_fit import fit_paper
+from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import evaluate, rms_px
 from compensation.observations import Observations, Role, observe_sessions
 from drivers.clock import NS_PER_S
@@ -94,7 +94,7 @@ def true_centres(order: Order) -> object:
         return json.loads(lines.readline())["centres_px"]
 
 
-def true_rms_mpx(model: CompensationModel, third: Night) -> NDArray[np.float64]:
+def true_rms_mpx(model: PaperModel, third: Night) -> NDArray[np.float64]:
     """(2,) along I and J: what the model leaves of the true drift, mpx."""
     reference_px = third.true_px[third.observed.of(Role.REFERENCE)].mean(axis=0)
     frames = third.observed.of(Role.VALIDATION)
@@ -112,7 +112,7 @@ async def test_settled_dwells_save_a_quarter_of_the_cycle_at_little_cost(tmp_pat
     ]
     true_mpx, measured_mpx = [], []
     for name, cycle in (("fixed", fixed), ("settled", settled)):
-        model = fit(cycle.observed)
+        model = fit_paper(cycle.observed)
         true_mpx.append(true_rms_mpx(model, third))
         measured_mpx.append(1e3 * np.array(evaluate(model, third.observed).rms_after_px))
         print(  # noqa: T201

@@ -1,4 +1,4 @@
-"""Observations -> drift model: choose the degree by temperatures left out, fit, and say how far it can be trusted."""
+"""The paper's polynomial: choose its degree by temperatures left out, fit it, and say how far it can be trusted."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means
 from compensation.drift.displacements import Displacements, displacements, reference_centres
-from compensation.drift.model import MAX_DEGREE, CompensationModel, DegreeScore, is_area
+from compensation.drift.hull import convex_hull, is_area
+from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from compensation.observations import Mask, Observations, Role
 from drivers.interface import SessionError
@@ -18,7 +20,7 @@ _LEAST_TEMPERATURES = 3
 _LEAST_RANGE_K = 1.0
 
 
-def fit(observations: Observations, degree: int | None = None) -> CompensationModel:
+def fit_paper(observations: Observations, degree: int | None = None) -> PaperModel:
     """The model of the REFERENCE and FIT frames; nothing else is looked at.
 
     degree: 1..5; None takes the simplest within one standard error of the best (cross-validation, see `choose`).
@@ -36,17 +38,18 @@ def fit(observations: Observations, degree: int | None = None) -> CompensationMo
     hull_px = convex_hull(rows.measured_px)
     if not is_area(hull_px):
         raise SessionError("the markers lie in one line; a model of the image needs an area of them")
-    return CompensationModel(
+    return PaperModel(
         degree=chosen,
         scaling=scaling,
         coefficients=np.array([solution.coefficients for solution in solutions]),
         coefficient_covariance=np.array([solution.covariance for solution in solutions]),
-        discrepancy_px=_discrepancy_px(rows, held_out),
+        discrepancy_px=discrepancy_px(rows, held_out),
         hull_px=hull_px,
         reference_degC=float(observations.camera_degC[reference].mean()),
-        reference_chamber_degC=_reference_chamber_degC(observations),
+        reference_chamber_degC=reference_chamber_degC(observations),
         reference_centres_px=centres[observations.session[reference][0]],
         scores=scores,
+        candidates=candidates_of(scores, chosen),
         target_name=observations.target.name,
         camera_serial=observations.sessions[0].camera_serial,
         session_ids=tuple(facts.session_id for facts in observations.sessions),
@@ -54,7 +57,7 @@ def fit(observations: Observations, degree: int | None = None) -> CompensationMo
     )
 
 
-def _reference_chamber_degC(observations: Observations) -> float:
+def reference_chamber_degC(observations: Observations) -> float:
     """The set-point of the reference frames; displacements from two different ones cannot be mixed."""
     set_points = np.unique(observations.chamber_degC[observations.of(Role.REFERENCE)])
     if len(set_points) != 1:
@@ -109,7 +112,7 @@ def cross_validate(rows: Displacements, scaling: Scaling, degrees: range) -> tup
 
 
 def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
-    squares = _by_fold(rows, left_out(rows, degree, scaling) ** 2)
+    squares = fold_means(rows, left_out(rows, degree, scaling) ** 2)
     rms = np.sqrt(squares.mean(axis=0))
     return DegreeScore(
         degree=degree,
@@ -165,49 +168,31 @@ def choose(scores: tuple[DegreeScore, ...]) -> int:
     The standard error is that of the difference, fold by fold: what is common to both (a set-point that is hard for
     every degree) does not count.
     """
-    squares = np.array([[i**2 + j**2 for i, j in score.fold_rms_px] for score in scores])
-    best = int(np.argmin(squares.mean(axis=1)))
-    for index in range(best):
-        worse = squares[index] - squares[best]
-        if worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)):
-            return scores[index].degree
-    return scores[best].degree
+    squares = [np.array([i**2 + j**2 for i, j in score.fold_rms_px]) for score in scores]
+    return scores[as_good_as_best(squares)[0]].degree
+
+
+def candidates_of(scores: tuple[DegreeScore, ...], degree: int) -> tuple[Candidate, ...]:
+    """The degrees as rows of the table of choice."""
+    return tuple(
+        Candidate(
+            form="paper",
+            name=f"P^{score.degree}",
+            terms=2 * score.terms,
+            rms_px=score.rms_px,
+            bic=None,
+            chosen=score.degree == degree,
+            fold_chamber_degC=score.fold_chamber_degC,
+            fold_rms_px=score.fold_rms_px,
+        )
+        for score in scores
+    )
 
 
 def _given(scores: tuple[DegreeScore, ...], degree: int) -> int:
     if degree not in {score.degree for score in scores}:
         raise SessionError(f"the markers do not determine a polynomial of degree {degree}; at most {len(scores)}")
     return degree
-
-
-def _discrepancy_px(rows: Displacements, held_out: Float) -> Float:
-    """(2,): RMS of the held-out residuals, all folds counting the same, after the noise of the markers is taken off;
-    0 when noise explains all."""
-    return np.sqrt(np.maximum(_by_fold(rows, held_out**2 - rows.variance_px2).mean(axis=0), 0))
-
-
-def _by_fold(rows: Displacements, values: Float) -> Float:
-    """Means (folds, 2) of values (M, 2) over each chamber set-point."""
-    return np.array([values[rows.chamber_degC == fold].mean(axis=0) for fold in np.unique(rows.chamber_degC)])
-
-
-def convex_hull(points: Float) -> Float:
-    """The corners (H, 2) of points (M, 2), in the sense that turns x towards y (Andrew's monotone chain)."""
-    ordered = np.unique(points, axis=0).tolist()
-    halves = [_half_hull(ordered), _half_hull(ordered[::-1])]
-    return np.array(halves[0][:-1] + halves[1][:-1])
-
-
-def _half_hull(ordered: list[list[float]]) -> list[list[float]]:
-    chain: list[list[float]] = []
-    for x, y in ordered:
-        while len(chain) > 1:
-            (x0, y0), (x1, y1) = chain[-2:]
-            if (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > 0:
-                break
-            chain.pop()
-        chain.append([x, y])
-    return chain
 
 
 def _listed(values: Float) -> str:

@@ -1,0 +1,69 @@
+"""The one call that makes a drift model: the paper's form or the thermal one, or whichever predicts better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from compensation.drift.candidates import Candidate, as_good_as_best
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.paper_fit import check_degree, fit_paper
+from compensation.drift.paper_model import PaperModel
+from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_model import ThermalModel
+from compensation.observations import Observations
+from drivers.interface import SessionError
+
+Form = Literal["paper", "thermal"]
+
+
+def fit(observations: Observations, degree: int | None = None, form: Form | None = None) -> DriftModel:
+    """The model of these sessions.
+
+    form: None takes the paper's unless the thermal one is better by more than one standard error at temperatures left
+    out; sessions without the telemetry that the thermal form needs have the paper's. degree: of the paper's form, which
+    it implies. SessionError when the sessions cannot support what was asked for, or a degree was given for thermal.
+    """
+    check_request(degree, form)
+    if form == "thermal":
+        _check_histories(observations)
+        return fit_thermal(observations)
+    paper = fit_paper(observations, degree)
+    if form == "paper" or degree is not None or not _has_histories(observations):
+        return paper
+    try:
+        return _better(paper, fit_thermal(observations))
+    except SessionError:
+        return paper  # it was not asked for, and what the paper's form lacks stands in the report
+
+
+def check_request(degree: int | None, form: Form | None) -> None:
+    """SessionError when there is no such degree, or a degree is asked for of the thermal form."""
+    check_degree(degree)
+    if degree is not None and form == "thermal":
+        raise SessionError("the thermal form has no degree; leave out --degree, or ask for --form paper")
+
+
+def _better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
+    """By the squares at temperatures left out; each gets the table with the rows of both."""
+    both = paper.candidates + thermal.candidates
+    in_use = [next(one for one in model.candidates if one.chosen) for model in (paper, thermal)]
+    is_thermal = _comparable(*in_use) and 0 not in as_good_as_best([one.fold_squares for one in in_use])
+    form = "thermal" if is_thermal else "paper"
+    rows = tuple(one.model_copy(update={"chosen": one.chosen and one.form == form}) for one in both)
+    return replace(thermal, candidates=rows) if is_thermal else replace(paper, candidates=rows)
+
+
+def _comparable(one: Candidate, other: Candidate) -> bool:
+    return bool(np.array_equal(one.fold_chamber_degC, other.fold_chamber_degC))
+
+
+def _has_histories(observations: Observations) -> bool:
+    return bool(observations.histories) and any(history.has_ambient for history in observations.histories)
+
+
+def _check_histories(observations: Observations) -> None:
+    if not _has_histories(observations):
+        raise SessionError("the sessions have no history of the air near the camera; the thermal form needs it")

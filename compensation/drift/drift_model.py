@@ -1,0 +1,150 @@
+"""What every drift model can do, and what it says when it is asked beyond what it was calibrated for."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.drift.candidates import Candidate, Pair
+from compensation.drift.hull import MARGIN_PX, distances_px
+from compensation.drift.lags import Float
+from compensation.drift.states import Memory, States
+
+Flags = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Situation = States | Float | float
+"""Thermal states, one for each point or one for all; or only the camera's temperature, degC, which is enough for the
+paper's form and leaves the thermal one without an answer (NaN)."""
+
+
+class Outside(IntFlag):
+    """Why a correction is an extrapolation. PLACE: beyond the hull of the markers (plus 1 px). CAMERA: the camera's
+    temperature. AMBIENT: the air's, or how fast it changes. SWITCHED_ON: the camera was switched on more recently than
+    ever in the calibration. HISTORY: the record does not reach back far enough, or has a gap."""
+
+    PLACE = 1
+    CAMERA = 2
+    AMBIENT = 4
+    SWITCHED_ON = 8
+    HISTORY = 16
+
+
+class DriftModel(Protocol):
+    """Maps measured positions of one camera to those at the reference temperature; made by choosing.fit, saved and
+    loaded by model_file. `memory` is what has to be remembered: history.states_at and states.ThermalState take it."""
+
+    @property
+    def form(self) -> str:
+        """paper or thermal."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """The form in words."""
+        ...
+
+    @property
+    def memory(self) -> Memory:
+        """What has to be remembered for it."""
+        ...
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height), px."""
+        ...
+
+    @property
+    def camera_range_degC(self) -> Pair:
+        """The calibrated interval of the camera's temperature."""
+        ...
+
+    @property
+    def discrepancy_px(self) -> Float:
+        """(2,): what the form leaves unexplained, one standard deviation."""
+        ...
+
+    @property
+    def hull_px(self) -> Float:
+        """(H, 2): convex hull of the training markers."""
+        ...
+
+    @property
+    def reference_degC(self) -> float:
+        """The camera's temperature at the reference."""
+        ...
+
+    @property
+    def reference_chamber_degC(self) -> float:
+        """The set-point of the reference."""
+        ...
+
+    @property
+    def reference_centres_px(self) -> Float:
+        """(N, 2): NaN for a marker never seen."""
+        ...
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """The table of choice."""
+        ...
+
+    @property
+    def target_name(self) -> str:
+        """Of the target it was fitted to."""
+        ...
+
+    @property
+    def camera_serial(self) -> str:
+        """Of the camera it is of."""
+        ...
+
+    @property
+    def session_ids(self) -> tuple[str, ...]:
+        """What it was fitted to."""
+        ...
+
+    @property
+    def software_version(self) -> str:
+        """What it was fitted by."""
+        ...
+
+    def shift(self, xy_px: Float, state: Situation) -> Float:
+        """Displacement (N, 2), px, to the reference of points (N, 2)."""
+        ...
+
+    def correct(self, xy_px: Float, state: Situation) -> Float:
+        """Where the points (N, 2), px, would be at the reference."""
+        ...
+
+    def covariance(self, xy_px: Float, state: Situation) -> Float:
+        """Covariance (N, 2, 2), px^2, of `shift`."""
+        ...
+
+    def flags(self, xy_px: Float, state: Situation) -> Flags:
+        """(N,): of Outside; 0 is a correction as good as `covariance` says."""
+        ...
+
+    def inside(self, xy_px: Float, state: Situation) -> Mask:
+        """(N,): no flag."""
+        ...
+
+
+def states_of(state: Situation, count: int, memory: Memory) -> States:
+    """One state for each of `count` points."""
+    if not isinstance(state, States):
+        return States.at_degC(state, count, memory)
+    return state if len(state.camera_degC) == count else state.where(np.zeros(count, np.int64))
+
+
+def place_flags(xy_px: Float, hull_px: Float) -> Flags:
+    """(N,): PLACE outside the hull, or without a place."""
+    outside = ~(distances_px(xy_px, hull_px) >= -MARGIN_PX).all(axis=1)
+    return np.where(outside, np.uint8(Outside.PLACE), np.uint8(0))
+
+
+def range_flags(values: Float, limits: Pair, flag: Outside) -> Flags:
+    """(N,): the flag where a value is outside the limits, or NaN."""
+    return np.where((values >= limits[0]) & (values <= limits[1]), np.uint8(0), np.uint8(flag))

@@ -1,0 +1,200 @@
+"""The recorded history of a camera's surroundings, and the thermal states that follow from it.
+
+From one session: the chamber's air near the camera, the camera's supply and its own temperature. Temperatures are
+linear between readings, the supply holds until the next reading or power step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.drift.lags import Float
+from compensation.drift.states import Memory, States, ThermalState
+from drivers.clock import NS_PER_S
+from drivers.interface import SessionError
+from stand.hub import StepState
+from stand.recording.session import Session
+
+TimesNs = NDArray[np.int64]
+
+GAP_NS = 120 * NS_PER_S
+"""Readings further apart than this say nothing of the time between them."""
+
+_STEP_NS = 10 * NS_PER_S
+"""How far the state is moved at once: the inputs' means over it are exact, and the fastest lag takes minutes."""
+
+_SHAPE_TAUS_S = (40.0, 150.0, 480.0, 1200.0, 4000.0)
+_SHAPE_RIDGE = 1e-10
+_FINE_K, _ROUNDING_K = 0.02, 1e-6
+"""A display finer than this needs no refinement; readings closer together than that are the same."""
+_FEWEST_READINGS = 200
+_CHANGE_NS = 30 * NS_PER_S
+"""Two readings further apart do not tell when the display changed."""
+
+_AMBIENT, _POWER, _CAMERA = "thermometers.air", "relays.camera_power", "camera.temperature"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class History:
+    """One session's record: instants, ns, ascending, and values; without BAD readings.
+
+    ambient_degC: of the air near the camera. powered: 0 or 1, until the next instant. camera_degC: as it tells itself,
+    in steps of resolution_K (0: none), refined within them.
+    """
+
+    ambient_ns: TimesNs
+    ambient_degC: Float
+    powered_ns: TimesNs
+    powered: Float
+    camera_ns: TimesNs
+    camera_degC: Float
+    resolution_K: float = 0.0
+
+    @property
+    def has_ambient(self) -> bool:
+        """Whether lags can be computed at all."""
+        return len(self.ambient_ns) > 1
+
+
+def recorded_history(session: Session) -> History:
+    """What the session's telemetry has of it; a channel that was not recorded is empty."""
+    ambient_ns, ambient_degC = _good(session, _AMBIENT)
+    camera_ns, camera_degC = _good(session, _CAMERA)
+    powered_ns, powered = _powered(session)
+    return refined(History(ambient_ns, ambient_degC, powered_ns, powered, camera_ns, camera_degC))
+
+
+def refined(history: History) -> History:
+    """With the camera's temperature between the steps of its display.
+
+    Many cameras tell theirs in quarters of a degree, at which the image moves by several mpx. Where the display changes
+    the temperature is half way between its steps. In between runs a linear function of lags of ambient and power,
+    fitted to all readings of the session, moved so that it goes through the two changes; the display is never
+    overruled by more than half a step.
+    """
+    step_K = _step_K(history.camera_degC)
+    if step_K < _FINE_K or not history.has_ambient or len(history.camera_ns) < _FEWEST_READINGS:
+        return history
+    told, seconds = history.camera_degC, (history.camera_ns - history.camera_ns[0]) / NS_PER_S
+    states = states_at(history, Memory(_SHAPE_TAUS_S), history.camera_ns, told)
+    ambient = _line(history.ambient_ns, history.ambient_degC, history.camera_ns)
+    terms = np.column_stack([np.ones(len(told)), ambient, states.ambient_lag_degC, states.power_lag])
+    known = np.isfinite(terms).all(axis=1)
+    shape = np.where(known, terms @ _least_squares(terms[known], told[known]), told)
+    changes = np.flatnonzero((np.diff(told) != 0) & (np.diff(history.camera_ns) < _CHANGE_NS))
+    if len(changes) == 0:
+        return history
+    middle_s = (seconds[changes] + seconds[changes + 1]) / 2
+    edge_degC = (told[changes] + told[changes + 1]) / 2
+    shift = np.interp(seconds, middle_s, edge_degC - np.interp(middle_s, seconds, shape))
+    camera_degC = np.clip(shape + shift, told - step_K / 2, told + step_K / 2)
+    return replace(history, camera_degC=camera_degC, resolution_K=step_K)
+
+
+def _step_K(readings_degC: Float) -> float:
+    """The smallest difference between two readings that is not rounding; 0 without any."""
+    steps = np.diff(np.unique(readings_degC))
+    steps = steps[steps > _ROUNDING_K]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def _least_squares(terms: Float, values: Float) -> Float:
+    normal = terms.T @ terms
+    damped = normal + _SHAPE_RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    return np.linalg.solve(damped, terms.T @ values)
+
+
+def _good(session: Session, channel: str) -> tuple[TimesNs, Float]:
+    try:
+        times_ns, values = session.readings(channel)
+    except SessionError:
+        return np.empty(0, np.int64), np.empty(0)
+    good = np.isfinite(values)
+    return times_ns[good], values[good]
+
+
+def _powered(session: Session) -> tuple[TimesNs, Float]:
+    """The relay's readings, and the instants of the steps that switched it: between two readings lie seconds, in which
+    a camera that has just been switched on drifts fastest."""
+    times_ns, values = _good(session, _POWER)
+    switched = [
+        (mark.time_ns, float(bool(mark.parameters.get("on"))))
+        for mark in session.steps()
+        if mark.kind == "PowerCamera" and mark.state is StepState.STARTED
+    ]
+    times_ns = np.concatenate([times_ns, np.array([time_ns for time_ns, _ in switched], np.int64)])
+    values = np.concatenate([values, [on for _, on in switched]])
+    order = np.argsort(times_ns, kind="stable")
+    return times_ns[order], values[order]
+
+
+def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: Float) -> States:
+    """The thermal states at instants (F,), ascending, ns, at which the camera told these temperatures (F,)."""
+    unknown = States.at_degC(camera_degC, len(time_ns), memory)
+    if not history.has_ambient or len(time_ns) == 0 or time_ns[-1] <= history.ambient_ns[0]:
+        return unknown
+    begin_ns = int(history.ambient_ns[0])
+    marks_ns = np.unique(np.concatenate([np.arange(begin_ns, int(time_ns[-1]) + 1, _STEP_NS), time_ns]))
+    marks_ns = marks_ns[marks_ns >= begin_ns]
+    camera = _camera(history, marks_ns, time_ns, camera_degC)
+    inputs = np.column_stack([np.diff(marks_ns) / NS_PER_S, *_means(history, marks_ns), camera[1:]])
+    rows = np.concatenate([unknown.rows[:1] * np.nan, _followed(ThermalState(memory), inputs)])
+    found = rows[np.clip(np.searchsorted(marks_ns, time_ns), 0, len(rows) - 1)]
+    return States.from_rows(memory, np.where(np.isfinite(found[:, :1]), found, unknown.rows))
+
+
+def _followed(state: ThermalState, inputs: Float) -> Float:
+    """The state's rows after each sample (dt, ambient, power, camera)."""
+    rows: list[Float] = []
+    for sample in inputs.tolist():
+        state.advance(*sample)
+        rows.append(state.row)
+    return np.array(rows)
+
+
+def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
+    """The camera's temperature at the marks, NaN where it tells none: at the frames what it told with them, but for the
+    place within the display's step, which only the whole record knows."""
+    camera = _line(history.camera_ns, history.camera_degC, marks_ns)
+    at = np.searchsorted(marks_ns, time_ns)
+    told = np.isfinite(camera_degC) & (time_ns >= marks_ns[0])
+    known, half_K = camera[at[told]], history.resolution_K / 2
+    own = camera_degC[told]
+    camera[at[told]] = np.where(np.isfinite(known), np.clip(known, own - half_K, own + half_K), own)
+    return camera
+
+
+def _means(history: History, marks_ns: TimesNs) -> tuple[Float, Float]:
+    """Mean ambient, by the trapezoidal rule, and powered share between the marks (M,), (M - 1,) each; NaN where the
+    record does not tell."""
+    ambient = _line(history.ambient_ns, history.ambient_degC, marks_ns)
+    return (ambient[1:] + ambient[:-1]) / 2, _powered_share(history, marks_ns)
+
+
+def _line(times_ns: TimesNs, values: Float, at_ns: TimesNs) -> Float:
+    """Linear between readings; NaN before and after them and across gaps."""
+    if len(times_ns) == 0:
+        return np.full(len(at_ns), np.nan)
+    after = np.clip(np.searchsorted(times_ns, at_ns), 1, max(len(times_ns) - 1, 1))
+    near = (times_ns[np.minimum(after, len(times_ns) - 1)] - times_ns[after - 1]) <= GAP_NS
+    inside = (at_ns >= times_ns[0] - GAP_NS) & (at_ns <= times_ns[-1] + GAP_NS)
+    origin_ns = int(times_ns[0])
+    found = np.interp((at_ns - origin_ns) / NS_PER_S, (times_ns - origin_ns) / NS_PER_S, values)
+    return np.where(near & inside, found, np.nan)
+
+
+def _powered_share(history: History, marks_ns: TimesNs) -> Float:
+    """Exact means of the supply. A camera that tells its temperature is on where nobody recorded the relay."""
+    if len(history.powered_ns) == 0:
+        return np.ones(len(marks_ns) - 1)
+    origin_ns = int(marks_ns[0])
+    times_s = (history.powered_ns - origin_ns) / NS_PER_S
+    marks_s = (marks_ns - origin_ns) / NS_PER_S
+    knots_s = np.concatenate([[min(times_s[0], marks_s[0])], times_s, [max(times_s[-1], marks_s[-1]) + 1]])
+    held = np.concatenate([history.powered[:1], history.powered])
+    area_s = np.concatenate([[0.0], np.cumsum(held * np.diff(knots_s))])
+    share = np.diff(np.interp(marks_s, knots_s, area_s)) / np.diff(marks_s)
+    return np.where(share > 1 - 1e-9, 1.0, np.clip(share, 0, 1))

@@ -1,0 +1,238 @@
+"""Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
+
+from compensation.drift.candidates import Candidate, Pair
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.hull import is_area
+from compensation.drift.lags import Float
+from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
+from compensation.drift.polynomial import Scaling, exponents
+from compensation.drift.terms import MOTIONS, Kind, Origin, Term
+from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from compensation.files import write_whole
+from drivers.documents import Document
+from drivers.interface import SessionError
+
+FORMAT = "thermostand drift model"
+SCHEMA_VERSION = 2
+
+Positive = Annotated[int, Field(gt=0)]
+Rows = tuple[tuple[float, ...], ...]
+
+
+class _File(Document):
+    """What the files of all forms have."""
+
+    format: Literal["thermostand drift model"] = FORMAT
+    schema_version: Literal[2] = SCHEMA_VERSION
+    software_version: str
+    camera_serial: str
+    session_ids: tuple[str, ...]
+    target_name: str
+    image_size_px: tuple[Positive, Positive]
+    camera_range_degC: Pair
+    reference_degC: float
+    reference_chamber_degC: float
+    reference_centres_px: tuple[Pair | None, ...]
+    hull_px: Annotated[tuple[Pair, ...], Field(min_length=3)]
+    discrepancy_px: Pair
+    candidates: tuple[Candidate, ...]
+
+
+class PaperFile(_File):
+    """The paper's form."""
+
+    form: Literal["paper"] = "paper"
+    degree: Annotated[int, Field(ge=1, le=MAX_DEGREE)]
+    terms_abc: tuple[tuple[int, int, int], ...]
+    coefficients_px: tuple[tuple[float, ...], tuple[float, ...]]
+    coefficient_covariance_px2: tuple[Rows, Rows]
+    scores: tuple[DegreeScore, ...]
+
+
+class TermFile(Document):
+    """A term; the parameter is a time constant, s, or the radius of a play, K."""
+
+    kind: Kind
+    parameter: Annotated[float, Field(ge=0)]
+
+
+class ThermalFile(_File):
+    """The thermal form. least_on_s: null when the camera was never switched on within the record."""
+
+    form: Literal["thermal"] = "thermal"
+    terms: tuple[TermFile, ...]
+    reference_ambient_degC: float
+    reference_features: tuple[float, ...]
+    self_heating_K: Annotated[float, Field(gt=0)]
+    has_warm_up: bool
+    coefficients_px: Rows
+    coefficient_covariance_px2: Rows
+    ambient_range_degC: Pair
+    rate_range_K_per_h: Pair
+    least_on_s: float | None
+
+
+_ANY: TypeAdapter[PaperFile | ThermalFile] = TypeAdapter(
+    Annotated[PaperFile | ThermalFile, Field(discriminator="form")]
+)
+
+
+def save_model(model: DriftModel, path: Path) -> None:
+    """Write the model as JSON, whole or not at all; SessionError when the place refuses."""
+    write_whole(path, _document(model).model_dump_json(indent=1) + "\n")
+
+
+def load_model(path: Path) -> DriftModel:
+    """The model in a file that `save_model` wrote, number for number; SessionError when it is anything else."""
+    try:
+        file = _ANY.validate_json(path.read_text(encoding="utf-8"), strict=True)
+        return _paper(file) if isinstance(file, PaperFile) else _thermal(file)
+    except (OSError, UnicodeDecodeError) as error:
+        raise SessionError(f"{path}: cannot be read ({error})") from error
+    except ValidationError as error:
+        fault = error.errors()[0]
+        where = ".".join(str(part) for part in fault["loc"]) or "the file"
+        raise SessionError(f"{path}: not a drift model of this program ({where}: {fault['msg']})") from error
+    except ValueError as error:
+        raise SessionError(f"{path}: not a drift model of this program ({error})") from error
+
+
+def _document(model: DriftModel) -> PaperFile | ThermalFile:
+    common = {
+        "software_version": model.software_version,
+        "camera_serial": model.camera_serial,
+        "session_ids": model.session_ids,
+        "target_name": model.target_name,
+        "image_size_px": model.image_size,
+        "camera_range_degC": model.camera_range_degC,
+        "reference_degC": model.reference_degC,
+        "reference_chamber_degC": model.reference_chamber_degC,
+        "reference_centres_px": [None if math.isnan(x) else (x, y) for x, y in model.reference_centres_px.tolist()],
+        "hull_px": model.hull_px.tolist(),
+        "discrepancy_px": model.discrepancy_px.tolist(),
+        "candidates": model.candidates,
+    }
+    match model:
+        case PaperModel():
+            return PaperFile.model_validate({**common, **_paper_fields(model)})
+        case ThermalModel():
+            return ThermalFile.model_validate({**common, **_thermal_fields(model)})
+        case _:
+            raise TypeError(f"no file form for a model of form {model.form}")
+
+
+def _paper_fields(model: PaperModel) -> dict[str, object]:
+    return {
+        "degree": model.degree,
+        "terms_abc": exponents(model.degree),
+        "coefficients_px": model.coefficients.tolist(),
+        "coefficient_covariance_px2": model.coefficient_covariance.tolist(),
+        "scores": model.scores,
+    }
+
+
+def _thermal_fields(model: ThermalModel) -> dict[str, object]:
+    return {
+        "terms": [{"kind": term.kind, "parameter": term.parameter} for term in model.terms],
+        "reference_ambient_degC": model.origin.ambient_degC,
+        "reference_features": model.reference_features.tolist(),
+        "self_heating_K": model.self_heating_K,
+        "has_warm_up": model.has_warm_up,
+        "coefficients_px": model.coefficients.tolist(),
+        "coefficient_covariance_px2": model.coefficient_covariance.tolist(),
+        "ambient_range_degC": model.valid.ambient_degC,
+        "rate_range_K_per_h": model.valid.rate_K_per_h,
+        "least_on_s": None if math.isinf(model.valid.least_on_s) else model.valid.least_on_s,
+    }
+
+
+def _paper(file: PaperFile) -> PaperModel:
+    """The model of a file; ValueError when its parts do not fit together."""
+    count = len(exponents(file.degree))
+    if list(file.terms_abc) != exponents(file.degree):
+        raise ValueError(f"terms_abc: not the {count} terms of degree {file.degree}, in order")
+    if file.degree not in {score.degree for score in file.scores}:
+        raise ValueError(f"scores: none for degree {file.degree}")
+    _check(file)
+    return PaperModel(
+        degree=file.degree,
+        scaling=Scaling(file.image_size_px, file.camera_range_degC),
+        coefficients=_shaped("coefficients_px", file.coefficients_px, (2, count)),
+        coefficient_covariance=_shaped(
+            "coefficient_covariance_px2", file.coefficient_covariance_px2, (2, count, count)
+        ),
+        discrepancy_px=np.array(file.discrepancy_px),
+        hull_px=np.array(file.hull_px),
+        reference_degC=file.reference_degC,
+        reference_chamber_degC=file.reference_chamber_degC,
+        reference_centres_px=_centres(file),
+        scores=file.scores,
+        candidates=file.candidates,
+        target_name=file.target_name,
+        camera_serial=file.camera_serial,
+        session_ids=file.session_ids,
+        software_version=file.software_version,
+    )
+
+
+def _thermal(file: ThermalFile) -> ThermalModel:
+    """The model of a file; ValueError when its parts do not fit together."""
+    count = len(file.terms)
+    _check(file)
+    return ThermalModel(
+        terms=tuple(Term(term.kind, term.parameter) for term in file.terms),
+        origin=Origin(file.reference_degC, file.reference_ambient_degC),
+        self_heating_K=file.self_heating_K,
+        reference_features=_shaped("reference_features", file.reference_features, (count,)),
+        coefficients=_shaped("coefficients_px", file.coefficients_px, (MOTIONS, count)),
+        coefficient_covariance=_shaped(
+            "coefficient_covariance_px2", file.coefficient_covariance_px2, (MOTIONS * count, MOTIONS * count)
+        ),
+        discrepancy_px=np.array(file.discrepancy_px),
+        valid=ThermalRange(
+            camera_degC=file.camera_range_degC,
+            ambient_degC=file.ambient_range_degC,
+            rate_K_per_h=file.rate_range_K_per_h,
+            least_on_s=math.inf if file.least_on_s is None else file.least_on_s,
+        ),
+        has_warm_up=file.has_warm_up,
+        image_size=file.image_size_px,
+        hull_px=np.array(file.hull_px),
+        reference_chamber_degC=file.reference_chamber_degC,
+        reference_centres_px=_centres(file),
+        candidates=file.candidates,
+        target_name=file.target_name,
+        camera_serial=file.camera_serial,
+        session_ids=file.session_ids,
+        software_version=file.software_version,
+    )
+
+
+def _check(file: PaperFile | ThermalFile) -> None:
+    if not file.camera_range_degC[0] < file.camera_range_degC[1]:
+        raise ValueError("camera_range_degC: not low, high")
+    if not is_area(np.array(file.hull_px)):
+        raise ValueError("hull_px: not the corners of a convex area, in order")
+
+
+def _centres(file: PaperFile | ThermalFile) -> Float:
+    return np.array([centre or (math.nan, math.nan) for centre in file.reference_centres_px])
+
+
+def _shaped(name: str, values: object, shape: tuple[int, ...]) -> Float:
+    try:
+        array = np.array(values, np.float64)
+    except ValueError as error:
+        raise ValueError(f"{name}: rows of different lengths") from error
+    if array.shape != shape:
+        raise ValueError(f"{name}: shape {array.shape} instead of {shape}")
+    return array

@@ -1,0 +1,125 @@
+"""The paper's drift model: where would this point have been at the reference temperature?
+
+The paper's form (section 6.1), one polynomial per coordinate of total degree n in the measured position (I, J) and the
+camera's own temperature T, fitted to the displacement (reference minus measured). For n >= 1 the position itself is in
+the space, so this is the same fit as that of the reference positions. compensation/drift/paper_fit.py makes the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from compensation.drift.candidates import Candidate
+from compensation.drift.drift_model import Flags, Mask, Outside, Situation, place_flags, range_flags, states_of
+from compensation.drift.polynomial import Float, Scaling, design
+from compensation.drift.states import Memory
+from drivers.documents import Document
+
+MAX_DEGREE = 5
+Pair = tuple[float, float]
+
+
+class DegreeScore(Document):
+    """What leave-temperatures-out says of one degree; a fold is one chamber set-point with all its visits.
+
+    condition: 2-norm condition number of the weighted terms, all folds together. rms_px: held-out RMS along I and J,
+    all folds counting the same. fold_chamber_degC, fold_rms_px: the same for each fold.
+    """
+
+    degree: Annotated[int, Field(ge=1, le=MAX_DEGREE)]
+    terms: int
+    condition: float
+    rms_px: Pair
+    fold_chamber_degC: tuple[float, ...]
+    fold_rms_px: tuple[Pair, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PaperModel:
+    """Maps measured positions of one camera to those at the reference temperature.
+
+    degree: n. scaling: image and calibrated temperature range. coefficients (2, K) px and their covariance (2, K, K)
+    px^2, rows I and J, terms in the order of polynomial.exponents. discrepancy_px (2,): what the form leaves
+    unexplained at temperatures not fitted, one standard deviation, marker noise taken off. hull_px (H, 2): convex hull
+    of the training markers. reference_degC: the camera's temperature at the reference, reference_chamber_degC the
+    set-point. reference_centres_px (N, 2): of the first session with reference frames, NaN for a marker never seen.
+    scores: of every degree tried. candidates: the table of choice, of every form tried.
+    """
+
+    degree: int
+    scaling: Scaling
+    coefficients: Float
+    coefficient_covariance: Float
+    discrepancy_px: Float
+    hull_px: Float
+    reference_degC: float
+    reference_chamber_degC: float
+    reference_centres_px: Float
+    scores: tuple[DegreeScore, ...]
+    candidates: tuple[Candidate, ...]
+    target_name: str
+    camera_serial: str
+    session_ids: tuple[str, ...]
+    software_version: str
+
+    @property
+    def form(self) -> str:
+        """Of all models of this kind."""
+        return "paper"
+
+    @property
+    def memory(self) -> Memory:
+        """It needs nothing remembered."""
+        return Memory()
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height), px."""
+        return self.scaling.image_size
+
+    @property
+    def camera_range_degC(self) -> Pair:
+        """The calibrated interval of the camera's temperature."""
+        return self.scaling.camera_degC
+
+    @property
+    def title(self) -> str:
+        """The form in words."""
+        return f"degree {self.degree}, {self.score.terms} terms, condition {self.score.condition:.0f}"
+
+    def shift(self, xy_px: Float, state: Situation) -> Float:
+        """Displacement (N, 2), px, to the reference temperature of points (N, 2) measured in these states, of which
+        only the camera's temperature counts. Outside the valid range it extrapolates: ask `flags`. NaN in, NaN out."""
+        return self._terms(xy_px, state) @ self.coefficients.T
+
+    def correct(self, xy_px: Float, state: Situation) -> Float:
+        """Where the points (N, 2), px, would be at the reference temperature."""
+        return xy_px + self.shift(xy_px, state)
+
+    def covariance(self, xy_px: Float, state: Situation) -> Float:
+        """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself."""
+        terms = self._terms(xy_px, state)
+        variance = np.einsum("nk,ckl,nl->nc", terms, self.coefficient_covariance, terms) + self.discrepancy_px**2
+        return variance[:, :, None] * np.eye(2)
+
+    def flags(self, xy_px: Float, state: Situation) -> Flags:
+        """(N,): of Outside: PLACE and CAMERA."""
+        camera_degC = states_of(state, len(xy_px), self.memory).camera_degC
+        return place_flags(xy_px, self.hull_px) | range_flags(camera_degC, self.scaling.camera_degC, Outside.CAMERA)
+
+    def inside(self, xy_px: Float, state: Situation) -> Mask:
+        """(N,): whether points and states are in the calibrated range: no flag."""
+        return self.flags(xy_px, state) == 0
+
+    @property
+    def score(self) -> DegreeScore:
+        """The cross-validation of the degree in use."""
+        return next(score for score in self.scores if score.degree == self.degree)
+
+    def _terms(self, xy_px: Float, state: Situation) -> Float:
+        camera_degC = states_of(state, len(xy_px), self.memory).camera_degC
+        return design(xy_px, camera_degC, self.degree, self.scaling)

@@ -1,0 +1,207 @@
+"""Observations -> thermal model: time constants by BIC, the family by temperatures left out, then the fit of all.
+
+In use is the simplest family within one standard error of the best; of two as simple, the one of less BIC.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means
+from compensation.drift.displacements import Displacements, reference_centres
+from compensation.drift.families import PLAYS_K, TAUS_S, Family, Terms, all_terms, families
+from compensation.drift.hull import convex_hull, is_area
+from compensation.drift.lags import Float
+from compensation.drift.paper_fit import reference_chamber_degC
+from compensation.drift.states import Memory
+from compensation.drift.terms import MOTIONS, Kind, motions
+from compensation.drift.thermal_fit import RIDGE, RIDGE_WITH_PLAYS, Equations, equations, solve_thermal
+from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
+from compensation.drift.training import Training, self_heating_K, training
+from compensation.observations import Observations, Role
+from drivers.interface import SessionError
+
+_FEWEST_FOLDS = 3
+_NO_MATTER_PX = 0.0005
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tried:
+    """A family with its best time constants. held_out (M, 2): residuals of the rows at set-points."""
+
+    terms: Terms
+    ridge: float
+    bic: float
+    held_out: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """The normal equations for every term, of all instants and of those of each fold."""
+
+    trained: Training
+    whole: Equations
+    folds: dict[float, Equations]
+
+    def columns(self, terms: Terms) -> NDArray[np.int64]:
+        """Where the terms are among all."""
+        return np.array([self.trained.terms.index(term) for term in terms])
+
+
+def fit_thermal(observations: Observations) -> ThermalModel:
+    """The model of the REFERENCE, FIT and WARM_UP frames; SessionError when the sessions cannot support it.
+
+    Lags of the power are only tried when there is a warm-up: with a camera that is always on nothing tells them.
+    """
+    with_power = bool(observations.of(Role.WARM_UP).any())
+    memory = Memory(TAUS_S, PLAYS_K, self_heating_K(observations))
+    trained = training(observations, all_terms(with_power=with_power), memory)
+    problem = _problem(trained)
+    tried = [found for family in families(with_power=with_power) if (found := _tried(problem, family)) is not None]
+    if not tried:
+        raise SessionError("the markers and temperatures do not determine a thermal model")
+    rows = trained.fold_rows
+    squares = [fold_means(rows, one.held_out**2).sum(axis=1) for one in tried]
+    chosen = min(_as_good(squares), key=lambda index: (len(tried[index].terms), tried[index].bic))
+    candidates = tuple(_candidate(trained, one, index == chosen) for index, one in enumerate(tried))
+    return _model(problem, tried[chosen], memory.self_heating_K, candidates)
+
+
+def _as_good(squares: list[Float]) -> set[int]:
+    """Within one standard error of the best, or worse by less than anybody measures."""
+    rms_px = np.sqrt([own.mean() for own in squares])
+    near = np.flatnonzero(rms_px <= rms_px.min() + _NO_MATTER_PX)
+    return set(as_good_as_best(squares)) | set(near.tolist())
+
+
+def left_out_thermal(model: ThermalModel, observations: Observations) -> tuple[Displacements, Float]:
+    """The rows at set-points of other observations, and their residuals (M, 2), each from a new fit of the same terms
+    that has not seen its set-point."""
+    trained = training(observations, model.terms, model.memory)
+    plays = any(term.kind is Kind.PLAY for term in model.terms)
+    try:
+        held_out = _held_out(_problem(trained), model.terms, RIDGE_WITH_PLAYS if plays else RIDGE)
+    except np.linalg.LinAlgError as error:
+        raise SessionError("the markers and temperatures do not determine a thermal model of these terms") from error
+    return trained.fold_rows, held_out
+
+
+def _problem(trained: Training) -> _Problem:
+    instants = trained.instants()
+    set_points = np.unique(instants.chamber_degC[np.isfinite(instants.chamber_degC)]).tolist()
+    if len(set_points) < _FEWEST_FOLDS:
+        raise SessionError(
+            f"a thermal fit needs frames at {_FEWEST_FOLDS} chamber temperatures or more, found {len(set_points)}"
+        )
+    folds = {degC: equations(instants.where(instants.chamber_degC == degC)) for degC in set_points}
+    return _Problem(trained, equations(instants), folds)
+
+
+def _tried(problem: _Problem, family: Family) -> _Tried | None:
+    """The family with the time constants of least BIC; None when the instants do not determine any."""
+    ridge = RIDGE_WITH_PLAYS if family.plays else RIDGE
+    best: tuple[float, Terms] | None = None
+    for terms in family.forms:
+        try:
+            bic = solve_thermal(problem.whole, problem.columns(terms), ridge).bic
+        except np.linalg.LinAlgError:
+            return None
+        if best is None or bic < best[0]:
+            best = bic, terms
+    if best is None:
+        return None
+    try:
+        return _Tried(best[1], ridge, best[0], _held_out(problem, best[1], ridge))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _held_out(problem: _Problem, terms: Terms, ridge: float) -> Float:
+    """Residuals (M, 2) of the rows at set-points, each from a fit that has not seen its set-point."""
+    trained, columns = problem.trained, problem.columns(terms)
+    rows = trained.fold_rows
+    residual = rows.displacement_px.copy()
+    for chamber_degC, fold in problem.folds.items():
+        coefficients = solve_thermal(problem.whole - fold, columns, ridge).coefficients
+        here = rows.chamber_degC == chamber_degC
+        amounts = trained.features[rows.frame[here]][:, columns] @ coefficients.T
+        moved = motions(rows.measured_px[here], trained.observations.image_size)
+        residual[here] -= np.einsum("nak,nk->na", moved, amounts)
+    return residual
+
+
+def _candidate(trained: Training, one: _Tried, chosen: bool) -> Candidate:
+    rows = trained.fold_rows
+    squares = fold_means(rows, one.held_out**2)
+    i, j = np.sqrt(squares.mean(axis=0))
+    return Candidate(
+        form="thermal",
+        name=form_name(one.terms),
+        terms=MOTIONS * len(one.terms),
+        rms_px=(float(i), float(j)),
+        bic=one.bic,
+        chosen=chosen,
+        fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
+        fold_rms_px=tuple((float(i), float(j)) for i, j in np.sqrt(squares)),
+    )
+
+
+def _model(problem: _Problem, one: _Tried, heating_K: float, candidates: tuple[Candidate, ...]) -> ThermalModel:
+    trained = problem.trained
+    observations = trained.observations
+    columns = problem.columns(one.terms)
+    solution = solve_thermal(problem.whole, columns, one.ridge)
+    reference = observations.of(Role.REFERENCE)
+    hull_px = convex_hull(trained.fold_rows.measured_px)
+    if not is_area(hull_px):
+        raise SessionError("the markers lie in one line; a model of the image needs an area of them")
+    count = MOTIONS * len(columns)
+    return ThermalModel(
+        terms=one.terms,
+        origin=trained.origin,
+        self_heating_K=heating_K,
+        reference_features=trained.reference_features[columns],
+        coefficients=solution.coefficients,
+        coefficient_covariance=solution.covariance.reshape(count, count),
+        discrepancy_px=_discrepancy_px(trained, one.held_out),
+        valid=_range(trained, one.terms),
+        has_warm_up=any(term.kind is Kind.POWER_LAG for term in trained.terms),
+        image_size=observations.image_size,
+        hull_px=hull_px,
+        reference_chamber_degC=reference_chamber_degC(observations),
+        reference_centres_px=reference_centres(observations)[0][observations.session[reference][0]],
+        candidates=candidates,
+        target_name=observations.target.name,
+        camera_serial=observations.sessions[0].camera_serial,
+        session_ids=tuple(facts.session_id for facts in observations.sessions),
+        software_version=importlib.metadata.version("thermostand"),
+    )
+
+
+def _discrepancy_px(trained: Training, held_out: Float) -> Float:
+    """(2,): of the set-points between others. Without the coldest or the warmest the fit has to extrapolate, which the
+    model is flagged for and need not claim to do."""
+    rows = trained.fold_rows
+    between = (rows.chamber_degC > rows.chamber_degC.min()) & (rows.chamber_degC < rows.chamber_degC.max())
+    return discrepancy_px(rows.where(between), held_out[between])
+
+
+def _range(trained: Training, terms: Terms) -> ThermalRange:
+    """What the training frames covered; the slowest time constant of the chosen terms stands for the ambient."""
+    states = trained.states.where(np.unique(trained.rows.frame))
+    taus = [term.parameter for term in terms if term.parameter > 0 and term.kind is not Kind.PLAY]
+    slowest = states.memory.taus_s.index(max(taus)) if taus else 0
+    return ThermalRange(
+        camera_degC=_extent(states.camera_degC),
+        ambient_degC=_extent(states.ambient_lag_degC[:, slowest]),
+        rate_K_per_h=_extent(states.rate_K_per_h),
+        least_on_s=float(states.on_s.min()),
+    )
+
+
+def _extent(values: Float) -> tuple[float, float]:
+    return float(values.min()), float(values.max())

@@ -1,0 +1,145 @@
+"""The thermal drift model: a homography whose eight motions follow the camera's thermal state.
+
+A function of the camera's temperature alone cannot tell a lens that is still warming from one that is warm. This form
+knows what the camera has been through: air, supply and own temperature, remembered by first-order lags and plays.
+compensation/drift/thermal_choice.py makes the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensation.drift.candidates import Candidate, Pair
+from compensation.drift.drift_model import Flags, Mask, Outside, Situation, place_flags, range_flags, states_of
+from compensation.drift.lags import Float
+from compensation.drift.states import SETTLED_TAUS, Memory, States
+from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
+
+_MARGIN = 0.02
+"""Of a calibrated range: it is known to no better than the noise of its ends."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThermalRange:
+    """What the calibration covered: the camera's temperature, the slowest lag of the ambient, how fast the ambient
+    changed, K/h, and the shortest time since the camera was switched on, s."""
+
+    camera_degC: Pair
+    ambient_degC: Pair
+    rate_K_per_h: Pair
+    least_on_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThermalModel:
+    """Maps measured positions of one camera to those at the reference temperature.
+
+    terms: H features of the thermal state. coefficients (8, H) px, covariance (8 H, 8 H) px^2, in row order.
+    reference_features (H,): subtracted, so that the shift at the reference is about 0. discrepancy_px (2,): what the
+    form leaves unexplained at temperatures not fitted, one standard deviation, marker noise taken off. has_warm_up:
+    whether a warm-up was among the training frames; without one there are no lags of the power. hull_px,
+    reference_..., candidates: as in PaperModel.
+    """
+
+    terms: tuple[Term, ...]
+    origin: Origin
+    self_heating_K: float
+    reference_features: Float
+    coefficients: Float
+    coefficient_covariance: Float
+    discrepancy_px: Float
+    valid: ThermalRange
+    has_warm_up: bool
+    image_size: tuple[int, int]
+    hull_px: Float
+    reference_chamber_degC: float
+    reference_centres_px: Float
+    candidates: tuple[Candidate, ...]
+    target_name: str
+    camera_serial: str
+    session_ids: tuple[str, ...]
+    software_version: str
+
+    @property
+    def form(self) -> str:
+        """Of all models of this kind."""
+        return "thermal"
+
+    @property
+    def title(self) -> str:
+        """The form in words."""
+        without = "" if self.has_warm_up else "; no warm-up was recorded: no lags of the power"
+        return f"{form_name(self.terms)}, {self.coefficients.size} coefficients{without}"
+
+    @property
+    def memory(self) -> Memory:
+        """What has to be remembered for it."""
+        return memory_of(self.terms, self.self_heating_K)
+
+    @property
+    def camera_range_degC(self) -> Pair:
+        """The calibrated interval of the camera's temperature."""
+        return self.valid.camera_degC
+
+    @property
+    def reference_degC(self) -> float:
+        """The camera's temperature at the reference."""
+        return self.origin.camera_degC
+
+    def shift(self, xy_px: Float, state: Situation) -> Float:
+        """Displacement (N, 2), px, to the reference of points (N, 2) measured in these states. Outside the valid range
+        it extrapolates: ask `flags`. NaN in, and an unknown state, NaN out."""
+        amounts = self._features(state, len(xy_px)) @ self.coefficients.T
+        return np.einsum("nak,nk->na", motions(xy_px, self.image_size), amounts)
+
+    def correct(self, xy_px: Float, state: Situation) -> Float:
+        """Where the points (N, 2), px, would be at the reference."""
+        return xy_px + self.shift(xy_px, state)
+
+    def covariance(self, xy_px: Float, state: Situation) -> Float:
+        """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself."""
+        found = self._features(state, len(xy_px))
+        terms = motions(xy_px, self.image_size)[:, :, :, None] * found[:, None, None, :]
+        terms = terms.reshape(len(xy_px), 2, -1)
+        of_coefficients = (terms @ self.coefficient_covariance) @ terms.transpose(0, 2, 1)
+        return of_coefficients + np.diag(self.discrepancy_px**2)
+
+    def flags(self, xy_px: Float, state: Situation) -> Flags:
+        """(N,): of Outside."""
+        states = states_of(state, len(xy_px), self.memory)
+        return place_flags(xy_px, self.hull_px) | self._state_flags(states)
+
+    def inside(self, xy_px: Float, state: Situation) -> Mask:
+        """(N,): whether points and states are in the calibrated range: no flag."""
+        return self.flags(xy_px, state) == 0
+
+    def _features(self, state: Situation, count: int) -> Float:
+        states = states_of(state, count, self.memory)
+        return features(states, self.terms, self.origin) - self.reference_features
+
+    def _state_flags(self, states: States) -> Flags:
+        valid = self.valid
+        found = range_flags(states.camera_degC, _widened(valid.camera_degC), Outside.CAMERA)
+        found |= range_flags(states.rate_K_per_h, _widened(valid.rate_K_per_h, 1.0), Outside.AMBIENT)
+        found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
+        if self.memory.taus_s:
+            found |= range_flags(states.ambient_lag_degC[:, -1], _widened(valid.ambient_degC), Outside.AMBIENT)
+        needed_s = SETTLED_TAUS * max(self.memory.taus_s, default=0.0)
+        return found | range_flags(states.settled_s, (needed_s, np.inf), Outside.HISTORY)
+
+
+def _widened(limits: Pair, least: float = 0.0) -> Pair:
+    margin = max(_MARGIN * (limits[1] - limits[0]), least)
+    return limits[0] - margin, limits[1] + margin
+
+
+def form_name(terms: tuple[Term, ...]) -> str:
+    """`homography x (1, T, T^2), ambient lag 11, 70 min, camera lag 11 min`."""
+    parts = ["homography x (1, T, T^2)"]
+    for kind in (Kind.AMBIENT_LAG, Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE):
+        taus = ", ".join(f"{term.parameter / 60:g}" for term in terms if term.kind is kind)
+        parts += [f"{kind} {taus} min"] if taus else []
+    radii = ", ".join(f"{term.parameter:g}" for term in terms if term.kind is Kind.PLAY)
+    return ", ".join([*parts, *([f"plays {radii} K"] if radii else [])])

@@ -1,0 +1,129 @@
+"""What the thermal form learns from: frames, their states and features, each against its session's own reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensation.drift.displacements import Displacements, anchors, displacements
+from compensation.drift.history import states_at
+from compensation.drift.instants import Instants, condense_instants
+from compensation.drift.lags import Float
+from compensation.drift.states import Memory, States
+from compensation.drift.terms import Kind, Origin, Term, features
+from compensation.observations import Mask, Observations, Role
+from drivers.interface import SessionError
+
+_TRUSTED_S = 3600.0
+"""After a gap the state is a guess; frames within this time teach nothing, unless the reference is one of them."""
+
+_SAME_PLACE_PX = 10.0
+"""A warm-up seen this far from the reference was of a camera that had been moved or rolled."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Training:
+    """rows: of REFERENCE, FIT and WARM_UP frames. frames (F,): which ones. states, features (F, H): of all frames, the
+    features of `terms` minus those of each session's reference. reference_features (H,): of the first session's."""
+
+    observations: Observations
+    rows: Displacements
+    frames: Mask
+    terms: tuple[Term, ...]
+    origin: Origin
+    states: States
+    features: Float
+    reference_features: Float
+
+    @property
+    def set_points(self) -> Mask:
+        """(F,): frames at a set-point, which can be left out with all its visits."""
+        return self.observations.of(Role.REFERENCE, Role.FIT)
+
+    @property
+    def fold_rows(self) -> Displacements:
+        """The rows at set-points."""
+        return self.rows.where(self.set_points[self.rows.frame])
+
+    def instants(self) -> Instants:
+        """The rows condensed."""
+        return condense_instants(self.observations, self.rows, self.features, self.set_points)
+
+
+def frame_states(observations: Observations, memory: Memory) -> States:
+    """The thermal state at every frame (F,) of all sessions, each from its own history."""
+    if not observations.histories:
+        return States.at_degC(observations.camera_degC, len(observations.frame), memory)
+    rows = States.at_degC(observations.camera_degC, len(observations.frame), memory).rows
+    for index, history in enumerate(observations.histories):
+        own = observations.session == index
+        found = states_at(history, memory, observations.time_ns[own], observations.camera_degC[own])
+        rows[own] = found.rows
+    return States.from_rows(memory, rows)
+
+
+def self_heating_K(observations: Observations) -> float:
+    """How much warmer than the air the camera is at the reference; SessionError when the air there is unknown."""
+    reference = observations.of(Role.REFERENCE)
+    excess_K = (observations.camera_degC - observations.air_degC)[reference]
+    if not np.isfinite(excess_K).any():
+        raise SessionError("the sessions have no air temperature near the camera; the thermal form needs it")
+    return max(float(np.nanmean(excess_K)), 1.0)
+
+
+def training(observations: Observations, terms: tuple[Term, ...], memory: Memory) -> Training:
+    """SessionError when no frame's thermal state is known."""
+    reference = observations.of(Role.REFERENCE)
+    states = frame_states(observations, memory)
+    origin = Origin(
+        float(np.nanmean(states.camera_degC[reference])), float(np.nanmean(observations.air_degC[reference]))
+    )
+    found = features(states, terms, origin)
+    against = anchors(observations)
+    frames = observations.of(Role.REFERENCE, Role.FIT, Role.WARM_UP) & np.isfinite(found).all(axis=1)
+    frames &= _trusted(observations, states, against)
+    if not (frames & reference).any():
+        raise SessionError("the sessions' telemetry does not tell the thermal state at the reference frames")
+    relative, first = _relative(observations, terms, found, against & frames)
+    rows = displacements(observations, frames & _anchored(observations, against & frames), against)
+    rows = rows.where(_same_place(rows)[rows.frame])
+    return Training(observations, rows, frames, terms, origin, states, relative, first)
+
+
+def _trusted(observations: Observations, states: States, against: Mask) -> Mask:
+    """(F,): frames whose state is no guess; all of a session whose own reference is one."""
+    trusted = states.settled_s >= _TRUSTED_S
+    known = np.unique(observations.session[trusted & against])
+    return trusted | ~np.isin(observations.session, known)
+
+
+def _anchored(observations: Observations, against: Mask) -> Mask:
+    """(F,): frames of sessions that have something to be measured against."""
+    return np.isin(observations.session, np.unique(observations.session[against]))
+
+
+def _relative(observations: Observations, terms: tuple[Term, ...], found: Float, against: Mask) -> tuple[Float, Float]:
+    """Features (F, H) minus those of each session's reference, and these (H,) of the first with REFERENCE frames.
+
+    The constant is the misfit at the reference: 1, and 0 in a session that has none.
+    """
+    constant = np.array([term.kind is Kind.CONSTANT for term in terms])
+    has_reference = np.unique(observations.session[observations.of(Role.REFERENCE)])
+    relative, first = found.copy(), np.zeros(len(terms))
+    for index in np.unique(observations.session[against]):
+        own = observations.session == index
+        mean = found[own & against].mean(axis=0)
+        keeps = index in has_reference
+        relative[own] -= np.where(constant & keeps, 0.0, mean)
+        if index == has_reference[0]:
+            first = np.where(constant, 0.0, mean)
+    return relative, first
+
+
+def _same_place(rows: Displacements) -> Mask:
+    """(F,): frames that show the target about where the reference has it."""
+    count = int(rows.frame.max()) + 1
+    distance = np.linalg.norm(rows.displacement_px, axis=1)
+    mean_px = np.bincount(rows.frame, distance, count) / np.maximum(np.bincount(rows.frame, minlength=count), 1)
+    return mean_px < _SAME_PLACE_PX

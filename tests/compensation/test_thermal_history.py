@@ -1,0 +1,112 @@
+"""What a camera remembers: exact lags and plays, cold and warm starts, gaps, and the same state sample by sample."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensation.drift.history import History, refined, states_at
+from compensation.drift.states import Memory, States, ThermalState
+
+S = 1_000_000_000
+MEMORY = Memory((600.0, 3600.0), (2.0,), 20.0)
+STEP_AT_S, END_S = 3600, 4 * 3600
+
+
+def history(
+    camera_excess_K: float = 20.0, gap: tuple[int, int] | None = None, resolution_K: float = 0.0, on_at_s: int = 0
+) -> History:
+    """The air steps from 24 to 34 degC after an hour, the camera follows at once with its excess."""
+    times_s = np.arange(0, END_S + 1, 5)
+    if gap is not None:
+        times_s = times_s[(times_s < gap[0]) | (times_s > gap[1])]
+    air = np.where(times_s > STEP_AT_S, 34.0, 24.0)
+    told = air + camera_excess_K
+    if resolution_K:
+        told = resolution_K * np.round(told / resolution_K)
+    on = times_s >= on_at_s
+    powered_ns, powered = np.array([0, on_at_s], np.int64) * S, np.array([float(on_at_s == 0), 1.0])
+    return History(times_s * S, air, powered_ns, powered, times_s[on] * S, told[on])
+
+
+def at(record: History, *seconds: int, camera_degC: float = 54.0) -> States:
+    times_ns = np.array(seconds, np.int64) * S
+    return states_at(record, MEMORY, times_ns, np.full(len(times_ns), camera_degC))
+
+
+@pytest.mark.parametrize("after_s", [600, 1800, 7200])
+def test_a_lag_follows_a_step_as_the_exponential_does(after_s: int):
+    found = at(history(), STEP_AT_S + after_s)
+    for column, tau_s in enumerate(MEMORY.taus_s):
+        expected = 34 - 10 * np.exp(-after_s / tau_s)
+        assert found.ambient_lag_degC[0, column] == pytest.approx(expected, abs=0.05)  # the step takes 5 s
+        assert found.camera_lag_degC[0, column] == pytest.approx(expected + 20, abs=0.06)
+    assert found.power_lag[0].tolist() == [1.0, 1.0]
+    assert found.play_degC[0, 0] == pytest.approx(52.0)  # 2 K behind 54 degC
+    assert found.rate_K_per_h[0] == pytest.approx(6 * 10 * np.exp(-after_s / 600), abs=0.2)
+
+
+def test_a_warm_start_is_a_guess_and_a_cold_one_is_known():
+    warm = at(history(), 1800)
+    assert warm.settled_s[0] == pytest.approx(1800)
+    assert warm.on_s[0] == np.inf
+    cold = at(history(camera_excess_K=0.5), 1800, camera_degC=24.5)
+    assert cold.settled_s[0] == np.inf
+    assert cold.on_s[0] == pytest.approx(1800)
+    np.testing.assert_allclose(cold.power_lag[0], -np.expm1(-1800 / np.array(MEMORY.taus_s)), rtol=1e-9)
+    half = at(history(camera_excess_K=10.0), 0 + 10, camera_degC=34.0)
+    np.testing.assert_allclose(half.power_lag[0], 0.5, atol=0.02)
+
+
+def test_power_counts_from_the_instant_it_came_on():
+    found = at(history(on_at_s=1803), 1803 + 600, camera_degC=44.0)
+    np.testing.assert_allclose(found.power_lag[0], -np.expm1(-600 / np.array(MEMORY.taus_s)), rtol=1e-4)
+    assert found.on_s[0] == pytest.approx(600)
+
+
+def test_after_a_gap_the_state_is_a_guess_again():
+    gap = (5000, 7000)
+    before, during, after = (at(history(gap=gap), second) for second in (4990, 6000, 7600))
+    assert before.settled_s[0] == pytest.approx(4990)
+    assert np.isnan(during.settled_s[0])
+    assert np.isnan(during.ambient_lag_degC).all()
+    assert during.camera_degC[0] == 54.0  # the frame itself tells it
+    assert 580 < after.settled_s[0] <= 600
+    np.testing.assert_allclose(after.ambient_lag_degC, 34.0)  # as in equilibrium
+    short = at(history(gap=(5000, 5100)), 7600)
+    assert short.settled_s[0] == pytest.approx(7600)
+
+
+def test_samples_one_by_one_give_the_same_state_as_the_recording():
+    record = history()
+    state = ThermalState(MEMORY)
+    for second in range(10, 6001, 10):
+        air = [24.0 if edge <= STEP_AT_S else 34.0 for edge in (second - 10, second)]
+        state.advance(10.0, sum(air) / 2, 1.0, air[1] + 20.0)
+    np.testing.assert_allclose(state.row, at(record, 6000).rows[0], rtol=1e-9)
+    assert state.states.camera_degC[0] == 54.0
+
+
+def test_before_the_record_and_without_one_only_the_camera_is_known():
+    late = History(*(np.array([5000, 5005], np.int64) * S, np.full(2, 24.0)) * 3)
+    empty = History(*(np.empty(0, np.int64), np.empty(0)) * 3)
+    for record in (late, empty):
+        found = at(record, 100)
+        assert found.camera_degC[0] == 54.0
+        assert np.isnan(found.ambient_lag_degC).all()
+        assert np.isnan(found.settled_s).all()
+
+
+def test_a_display_in_quarters_is_refined_between_its_steps():
+    times_s = np.arange(0, 10_000, 5)
+    true = 24 + 18 * -np.expm1(-times_s / 700) + 2 * -np.expm1(-times_s / 3000)
+    told = 0.25 * np.round(true / 0.25)
+    powered_ns = np.array([0], np.int64)
+    record = refined(History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, told))
+    assert record.resolution_K == 0.25
+    error = record.camera_degC - true
+    assert np.std(told - true) > 0.06
+    assert np.std(error) < 0.02
+    assert np.abs(record.camera_degC - told).max() <= 0.125 + 1e-9
+    fine = History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, true)
+    np.testing.assert_array_equal(refined(fine).camera_degC, true)
