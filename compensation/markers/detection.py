@@ -40,6 +40,8 @@ Float = NDArray[np.float64]
 
 _FIRST_BLUR_PX = 1.2
 _POOR_CHI = 1.25
+_POOR_MISFIT = 1.6
+"""Of 36 sectors less the ellipse's five numbers: chance reaches it once in 10 million markers."""
 _LEAST_CONTRAST_SIGMA = 5.0
 _SIZE_TOLERANCE = 1.35
 _PLACE_TOLERANCE_PITCH = 0.2
@@ -191,10 +193,15 @@ def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> 
 
 def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Target, relative: bool) -> Detection:
     """The detection of a fit whose markers are `good` or missing; missing ones are expected where the others say."""
-    chi = np.where(good, fit.chi, np.nan)
+    chi, misfit = np.where(good, fit.chi, np.nan), np.where(good, fit.misfit, np.nan)
+    usual = max(float(np.nanmedian(chi)), 1e-9)
+    # A print or a lens that the model does not know makes all markers worse; a bad one is worse than the others.
+    poor = (chi > _POOR_CHI * (usual if relative else max(usual, 1.0))) | (
+        misfit > _POOR_MISFIT * max(float(np.nanmedian(misfit)), usual if relative else 1.0)
+    )
     if relative:
-        chi = chi / max(float(np.nanmedian(chi)), 1e-9)
-    flags = np.where(good, fit.flags, fit.flags | Flag.MISSING) | np.where(chi > _POOR_CHI, Flag.POOR_FIT, 0)
+        chi = chi / usual
+    flags = np.where(good, fit.flags, fit.flags | Flag.MISSING) | np.where(poor, Flag.POOR_FIT, 0)
     expected = _expected_edges(homography, target)
     scale = np.median(fit.state.radii_px()[good] / expected.radii_px()[good])
     parameters = expected.parameters

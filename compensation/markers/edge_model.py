@@ -10,8 +10,7 @@ with planes b = b0 + bx x + by y (ground) and f = f0 + fx x + fy y (disc), Phi t
 density, n the outline's normal. The last term is what blurring does to a step between two slopes; without it a light
 gradient of 30 % across a 5 MP frame shifts every centre by 0.15 mpx. Twelve parameters per marker, one row of
 `EdgeState.parameters`:  cx cy m11 m12 m22 sigma b0 bx by f0 fx fy.  M is symmetric positive definite and has no
-angle, so a circle is not a singular case. sigma contains the pixel box (1/12 px^2). All arrays are
-(markers, pixels).
+angle, so a circle is not a singular case. sigma contains the pixel box (1/12 px^2).
 """
 
 from __future__ import annotations
@@ -22,13 +21,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.markers.noise import Noise
+from compensation.compiled import compiled
+from compensation.markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, VALUE, Pixels, U, V
 
 CX, CY, M11, M12, M22, SIGMA, B0, BX, BY, F0, FX, FY = range(12)
+PARAMETERS = 12
 
 Float = NDArray[np.float64]
+Variance = tuple[float, float]
+"""floor_DN2 and slope_DN of a `Noise`."""
 
 _TINY = 1e-12
+_BLOCK = 256
+"""Pixels whose derivatives are held at a time: they stay in the processor's nearest cache."""
+_ERROR = PARAMETERS
+_PIXEL = PARAMETERS + 1
+_ROWS = PARAMETERS + 7
+"""Rows of a block: the derivatives, the residuals, then the rows of `Pixels.table`."""
+_TABLE_END = 6.0
+_TABLE_CELLS = 8192
+_NODES = np.linspace(-_TABLE_END, _TABLE_END, _TABLE_CELLS + 1)
+_STEP = np.array([0.5 * math.erfc(-t / math.sqrt(2)) for t in _NODES])
+_DENSITY = np.exp(-0.5 * _NODES * _NODES) / math.sqrt(2 * math.pi)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,107 +75,170 @@ class EdgeState:
         return EdgeState(self.parameters[which], self.scale_px[which])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Band:
-    """The pixels of a chunk of markers, each (markers, pixels) and padded where `used` is 0."""
-
-    column: Float
-    row: Float
-    value: Float
-    used: Float
-    width_px: Float
-    saturated: NDArray[np.bool_]
-    cut: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Geometry:
-    """Pixels as their marker sees them: x, y and F of the module; distance_px, positive outside; the outline's unit
-    normal (nx, ny); length: |M (x, y)|.
-    """
-
-    x: Float
-    y: Float
-    F: Float
-    distance_px: Float
-    nx: Float
-    ny: Float
-    length: Float
-
-
-def geometry(p: Float, scale: Float, column: Float, row: Float) -> Geometry:
-    """Where pixels lie; `p` has the parameters on axis 1, everything else broadcasts over the other axes."""
-    x, y = (column - p[:, CX]) / scale, (row - p[:, CY]) / scale
-    gx, gy = p[:, M11] * x + p[:, M12] * y, p[:, M12] * x + p[:, M22] * y
-    F = np.sqrt(np.maximum(gx * x + gy * y, _TINY))
-    length = np.sqrt(gx * gx + gy * gy) + _TINY
-    return Geometry(x, y, F, (F - 1) * (F / length) * scale, gx / length, gy / length, length)
-
-
-def set_start_levels(p: Float, scale: Float, band: Band) -> None:
-    """Where the levels in `p` are unknown (NaN), set them to the band's means on either side of the outline."""
-    place = geometry(p[:, :, None], scale[:, None], band.column, band.row)
-    outside = (place.distance_px > 0) * band.used
-    unknown = np.isnan(p[:, B0])
-    for level, part in ((B0, outside), (F0, band.used - outside)):
-        mean = (band.value * part).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
-        p[unknown, level] = mean[unknown]
-        p[unknown, level + 1 : level + 3] = 0
-
-
+@compiled
 def normal_equations(
-    p: Float, scale: Float, band: Band, noise: Noise, free: NDArray[np.bool_]
-) -> tuple[Float, Float, Float]:
-    """J'WJ (N, 12, 12), J'We (N, 12) and chi (N,) at `p`; rows of parameters that are not free are those of the unit
-    matrix, so that they stay.
+    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float
+) -> tuple[float, float]:
+    """Set J'WJ (12, 12) and J'We (12,) at the parameters `p`, write each pixel's residual, and return the sum of
+    squared residuals and the sum of the pixels' shares."""
+    normal[:] = 0
+    right[:] = 0
+    squares, weights = _core_equations(pixels.table[CORE], pixels.counts[CORE], p, scale, noise, normal, right)
+    for region, first in ((GROUND, B0), (DISC, F0)):
+        more = _level_equations(pixels.table[region], pixels.counts[region], p, scale, noise, normal, right, first)
+        squares += more[0]
+        weights += more[1]
+    for i in range(PARAMETERS):
+        for j in range(i):
+            normal[i, j] = normal[j, i]
+    return squares, weights
+
+
+@compiled
+def _core_equations(
+    table: Float, count: int, p: Float, scale: float, noise: Variance, normal: Float, right: Float
+) -> tuple[float, float]:
+    """Add the pixels near the outline to the upper half of `normal`, and to `right`."""
+    rows = np.empty((_ROWS, _BLOCK))
+    block = rows.ravel()
+    squares, weights = 0.0, 0.0
+    for first in range(0, count, _BLOCK):
+        size = min(_BLOCK, count - first)
+        for row in range(4):
+            rows[_PIXEL + row, :size] = table[row, first : first + size]
+        more = _derivatives(block, size, p, scale, noise)
+        squares += more[0]
+        weights += more[1]
+        for row in (RESIDUAL, RISE):
+            table[row, first : first + size] = rows[_PIXEL + row, :size]
+        for i in range(0, PARAMETERS, 3):
+            for j in range(i, PARAMETERS, 3):
+                _add_products(rows, i, j, size, normal)
+            _add_right(rows, i, size, right)
+    return squares, weights
+
+
+@compiled
+def _derivatives(block: Float, size: int, p: Float, scale: float, noise: Variance) -> tuple[float, float]:
+    """From the first `size` pixels of `block` its weighted derivatives by the parameters and weighted residuals.
+
+    Terms that vanish on the outline are left out: the fit still ends where J'We = 0, which is free of bias while the
+    model holds. The rows of `block` lie one after the other, _BLOCK numbers each, so that the compiler sees that they
+    do not overlap and does eight pixels at a time.
     """
-    place = geometry(p[:, :, None], scale[:, None], band.column, band.row)
-    x, y, nx, ny = place.x, place.y, place.nx, place.ny
-    sigma = p[:, SIGMA, None]
-    t = place.distance_px / sigma
-    step, density = normal_cdf(t), np.exp(-0.5 * t * t) * (1 / math.sqrt(2 * math.pi))
-    disc = p[:, F0, None] + p[:, FX, None] * x + p[:, FY, None] * y
-    contrast = p[:, B0, None] + p[:, BX, None] * x + p[:, BY, None] * y - disc
-    lean = (p[:, BX, None] - p[:, FX, None]) * nx + (p[:, BY, None] - p[:, FY, None]) * ny
-    model = disc + contrast * step + lean * density * (sigma / scale[:, None])
-    root_weight = np.sqrt(band.used / noise.variance_DN2(model))
-    residual = (band.value - model) * root_weight
-    slope = contrast * density * (root_weight / sigma)
-    jacobian = _jacobian(place, scale, t, slope, step * root_weight, root_weight)
-    if not free.all():
-        jacobian *= free[:, :, None]
-    normal = jacobian @ jacobian.transpose(0, 2, 1)
-    index = np.arange(p.shape[1])
-    normal[:, index, index] += ~free
-    right = (jacobian @ residual[:, :, None])[:, :, 0]
-    freedom = np.maximum(band.used.sum(axis=1) - free.sum(axis=1), 1)
-    return normal, right, np.sqrt((residual**2).sum(axis=1) / freedom)
+    m11, m12, m22, sigma = p[M11], p[M12], p[M22], p[SIGMA]
+    cx, cy, b0, bx, by, f0, fx, fy = p[CX], p[CY], p[B0], p[BX], p[BY], p[F0], p[FX], p[FY]
+    floor, gain = noise[0], noise[1]
+    per_scale, per_sigma, sharpness = 1 / scale, 1 / sigma, sigma / scale
+    slope_x, slope_y = bx - fx, by - fy
+    squares, weights = 0.0, 0.0
+    for k in range(size):
+        x = (block[(_PIXEL + U) * _BLOCK + k] - cx) * per_scale
+        y = (block[(_PIXEL + V) * _BLOCK + k] - cy) * per_scale
+        gx, gy = m11 * x + m12 * y, m12 * x + m22 * y
+        F = math.sqrt(max(gx * x + gy * y, _TINY))
+        per_length = 1 / (math.sqrt(gx * gx + gy * gy) + _TINY)
+        nx, ny = gx * per_length, gy * per_length
+        t = (F - 1) * F * per_length * scale * per_sigma
+        step, density = normal_distribution(t)
+        disc = f0 + fx * x + fy * y
+        contrast = b0 + bx * x + by * y - disc
+        model = disc + contrast * step + (slope_x * nx + slope_y * ny) * density * sharpness
+        root = math.sqrt(1 / (floor + gain * max(model, 0.0)))
+        residual = (block[(_PIXEL + VALUE) * _BLOCK + k] - model) * root
+        weight = block[(_PIXEL + SHARE) * _BLOCK + k]
+        share = math.sqrt(weight)
+        rise = contrast * density * per_sigma * root
+        block[(_PIXEL + RESIDUAL) * _BLOCK + k] = residual
+        block[(_PIXEL + RISE) * _BLOCK + k] = rise
+        squares += weight * residual * residual
+        weights += weight
+        root *= share
+        rise *= share
+        bend = rise * scale * per_length
+        block[CX * _BLOCK + k] = -rise * nx
+        block[CY * _BLOCK + k] = -rise * ny
+        block[M11 * _BLOCK + k] = 0.5 * bend * x * x
+        block[M12 * _BLOCK + k] = bend * x * y
+        block[M22 * _BLOCK + k] = 0.5 * bend * y * y
+        block[SIGMA * _BLOCK + k] = -rise * t
+        ground, inside = step * root, (1 - step) * root
+        block[B0 * _BLOCK + k] = ground
+        block[BX * _BLOCK + k] = ground * x
+        block[BY * _BLOCK + k] = ground * y
+        block[F0 * _BLOCK + k] = inside
+        block[FX * _BLOCK + k] = inside * x
+        block[FY * _BLOCK + k] = inside * y
+        block[_ERROR * _BLOCK + k] = residual * share
+    return squares, weights
 
 
-def _jacobian(place: Geometry, scale: Float, t: Float, slope: Float, ground: Float, level: Float) -> Float:
-    """Derivatives of the weighted model, (N, 12, pixels); `slope` is that across the outline, `ground` that by b0 and
-    `level` that by both levels. Terms that vanish on the outline are left out: the fit still ends where J'We = 0,
-    which is free of bias while the model holds.
-    """
-    x, y = place.x, place.y
-    bend = slope * scale[:, None] / place.length
-    jacobian = np.empty((len(x), 12, x.shape[1]))
-    jacobian[:, CX], jacobian[:, CY] = -slope * place.nx, -slope * place.ny
-    jacobian[:, M11], jacobian[:, M12], jacobian[:, M22] = 0.5 * bend * x * x, bend * x * y, 0.5 * bend * y * y
-    jacobian[:, SIGMA] = -slope * t
-    for first, part in ((B0, ground), (F0, level - ground)):
-        jacobian[:, first], jacobian[:, first + 1], jacobian[:, first + 2] = part, part * x, part * y
-    return jacobian
+@compiled
+def normal_distribution(t: float) -> tuple[float, float]:
+    """The normal distribution function and its density, by linear interpolation in tables; error below 2e-7."""
+    place = (min(max(t, -_TABLE_END), _TABLE_END) + _TABLE_END) * (_TABLE_CELLS / (2 * _TABLE_END))
+    cell = np.uint32(min(place, _TABLE_CELLS - 1.0))
+    part = place - cell
+    return (
+        _STEP[cell] + part * (_STEP[cell + np.uint32(1)] - _STEP[cell]),
+        _DENSITY[cell] + part * (_DENSITY[cell + np.uint32(1)] - _DENSITY[cell]),
+    )
 
 
-_TABLE_END = 6.0
-_TABLE_STEP = 2 * _TABLE_END / 8192
-_TABLE = np.array([0.5 * math.erfc(-t / math.sqrt(2)) for t in np.linspace(-_TABLE_END, _TABLE_END, 8193)])
-_TABLE_RISE = np.append(np.diff(_TABLE), 0.0)
+@compiled
+def _add_products(rows: Float, i: int, j: int, size: int, normal: Float) -> None:
+    """Add the products of rows i..i+2 with rows j..j+2: nine sums at a time stay in registers."""
+    a0 = a1 = a2 = b0 = b1 = b2 = c0 = c1 = c2 = 0.0
+    a, b, c, x0, x1, x2 = rows[i], rows[i + 1], rows[i + 2], rows[j], rows[j + 1], rows[j + 2]
+    for k in range(size):
+        a0, a1, a2 = a0 + a[k] * x0[k], a1 + a[k] * x1[k], a2 + a[k] * x2[k]
+        b0, b1, b2 = b0 + b[k] * x0[k], b1 + b[k] * x1[k], b2 + b[k] * x2[k]
+        c0, c1, c2 = c0 + c[k] * x0[k], c1 + c[k] * x1[k], c2 + c[k] * x2[k]
+    for row, sums in enumerate(((a0, a1, a2), (b0, b1, b2), (c0, c1, c2))):
+        for column in range(3):
+            normal[i + row, j + column] += sums[column]
 
 
-def normal_cdf(t: Float) -> Float:
-    """The normal distribution function, by linear interpolation in a table; error below 2e-7 (numpy has no erf)."""
-    place = (np.clip(t, -_TABLE_END, _TABLE_END) + _TABLE_END) * (1 / _TABLE_STEP)
-    index = place.astype(np.int32)
-    return _TABLE[index] + (place - index) * _TABLE_RISE[index]
+@compiled
+def _add_right(rows: Float, i: int, size: int, right: Float) -> None:
+    """Add the products of rows i..i+2 with the residuals."""
+    sa = sb = sc = 0.0
+    a, b, c, residual = rows[i], rows[i + 1], rows[i + 2], rows[_ERROR]
+    for k in range(size):
+        sa, sb, sc = sa + a[k] * residual[k], sb + b[k] * residual[k], sc + c[k] * residual[k]
+    right[i] += sa
+    right[i + 1] += sb
+    right[i + 2] += sc
+
+
+@compiled
+def _level_equations(
+    table: Float, count: int, p: Float, scale: float, noise: Variance, normal: Float, right: Float, first: int
+) -> tuple[float, float]:
+    """Add pixels that see only the plane whose parameters begin at `first`."""
+    per_scale = 1 / scale
+    n, sx, sy, sxx, sxy, syy, e, ex, ey = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    squares, weights = 0.0, 0.0
+    for k in range(count):
+        x, y = (table[U, k] - p[CX]) * per_scale, (table[V, k] - p[CY]) * per_scale
+        model = p[first] + p[first + 1] * x + p[first + 2] * y
+        weight = 1 / (noise[0] + noise[1] * max(model, 0.0))
+        difference = table[VALUE, k] - model
+        table[RESIDUAL, k] = difference * math.sqrt(weight)
+        weight *= table[SHARE, k]
+        squares += weight * difference * difference
+        weights += table[SHARE, k]
+        n, sx, sy = n + weight, sx + weight * x, sy + weight * y
+        sxx, sxy, syy = sxx + weight * x * x, sxy + weight * x * y, syy + weight * y * y
+        weight *= difference
+        e, ex, ey = e + weight, ex + weight * x, ey + weight * y
+    normal[first, first] += n
+    normal[first, first + 1] += sx
+    normal[first, first + 2] += sy
+    normal[first + 1, first + 1] += sxx
+    normal[first + 1, first + 2] += sxy
+    normal[first + 2, first + 2] += syy
+    right[first] += e
+    right[first + 1] += ex
+    right[first + 2] += ey
+    return squares, weights

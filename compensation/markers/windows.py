@@ -12,7 +12,7 @@ from compensation.markers.noise import Image
 from compensation.target import Target
 
 MARGIN_px = 20
-"""Around each marker's outline. The edge fit reads 7 blurs, 14 px for a lens that blurs by sigma = 2 px; the rest is
+"""Around each marker's outline. The edge fit reads 9 blurs, 18 px for a lens that blurs by sigma = 2 px; the rest is
 for the few tenths of a pixel that heat moves the image, and for the first stage's own error."""
 
 Float = NDArray[np.float64]

@@ -64,11 +64,11 @@ def test_the_next_frame_follows_the_target_however_far_it_moved(shift_mm: tuple[
 
 
 def test_tracking_agrees_with_a_fresh_search_far_below_the_noise():
-    """Within 0.5 mpx; the noise scatters these centres by 3.4 mpx."""
+    """Within 1 mpx; the noise scatters these centres by 3.4 mpx."""
     image = photograph(HALF, half_frame(), 5)
     fresh = detect(image, PAPER, noise=CAMERA)
     tracked = detect(image, PAPER, previous=detect(photograph(HALF, half_frame(), 6), PAPER), noise=CAMERA)
-    np.testing.assert_allclose(tracked.centres_px, fresh.centres_px, atol=5e-4)
+    np.testing.assert_allclose(tracked.centres_px, fresh.centres_px, atol=1e-3)
 
 
 def test_a_turned_target_keeps_its_numbers_when_tracked_past_a_quarter_turn():

@@ -1,0 +1,54 @@
+"""Discs' centres from ellipses' centres, against the reference renderer's projection."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensation.markers.detection import detect
+from compensation.markers.eccentricity import disc_centres_px, ellipse_centre_offset_px
+from compensation.target import load_target
+
+from .rendered import Scene, photograph, project, render, true_centres_px
+
+PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
+TILTED = {
+    30: Scene(tilt_y_deg=30, tilt_x_deg=5, roll_deg=20, distance_mm=1040),
+    45: Scene(tilt_y_deg=45, distance_mm=1040),
+}
+
+
+def middles_px(scene):
+    return project(scene, scene.discs_mm()[:, :2])
+
+
+def rms_mpx(errors_px):
+    return 1e3 * np.sqrt(np.mean(np.square(errors_px)))
+
+
+@pytest.mark.parametrize("tilt_deg", TILTED)
+def test_the_homography_gives_the_centres_of_the_discs(tilt_deg):
+    scene = TILTED[tilt_deg]
+    found = detect(photograph(scene, render(scene), 1), PAPER)
+    assert rms_mpx(found.centres_px - middles_px(scene)) > 30, "without the correction the test would prove nothing"
+    assert rms_mpx(disc_centres_px(found, PAPER) - middles_px(scene)) < 3.2
+
+
+def test_without_noise_the_correction_is_exact_and_missing_markers_stay_missing():
+    scene = TILTED[30]
+    seen = detect(photograph(scene, render(scene), 1), PAPER)
+    centres_px = true_centres_px(scene)
+    centres_px[7] = np.nan
+    corrected = disc_centres_px(dataclasses.replace(seen, centres_px=centres_px), PAPER)
+    assert np.isnan(corrected[7]).all()
+    assert rms_mpx(np.delete(corrected - middles_px(scene), 7, axis=0)) < 0.02
+
+
+@pytest.mark.parametrize(
+    "scene", [*TILTED.values(), Scene(k1=-0.15, k2=0.1, tilt_y_deg=20, f_px=3000, distance_mm=350)]
+)
+def test_the_camera_gives_the_offset_of_each_ellipse_with_distortion_too(scene):
+    offset_px = ellipse_centre_offset_px(lambda points_mm: project(scene, points_mm), PAPER)
+    assert rms_mpx(offset_px) > 10
+    np.testing.assert_allclose(offset_px, true_centres_px(scene) - middles_px(scene), atol=2e-5)
