@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from compensation.budget_cli import budget_of_session
+from compensation.calibration_cli import calibrate_session
 from compensation.command_line import TargetOption, installed_target, named_target, one_line_errors
 from compensation.drift.choosing import Form, check_request
 from compensation.drift.choosing import fit as fit_model
@@ -54,6 +55,7 @@ Cache = Annotated[bool, typer.Option("--cache/--no-cache", help="Keep what was f
 _DEFAULT_TARGET = "paper-9x6"
 
 app.command("budget")(budget_of_session)
+app.command("calibrate")(calibrate_session)
 
 
 @app.command("detect")

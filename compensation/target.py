@@ -40,9 +40,10 @@ class Target(Document):
     layout: in a staggered grid (OpenCV's asymmetric one) every second row is half a pitch further to the right, and
     rows are half a pitch apart. columns: markers in a row; the long side of a square grid. pitch_mm: between
     neighbours in a row. polarity: discs darker or lighter than the ground. cmm_mm: measured centres (X, Y) in mm,
-    marker 1 first, in the object frame. nominal_roll_deg: counter-clockwise angle of the rows in the image as the
-    target is mounted; decides between the orientations a symmetrical grid leaves open. minimum_markers: identification
-    is refused below this count (default three quarters of the markers).
+    marker 1 first, in the object frame. cmm_uncertainty_mm, printing_error_mm: standard uncertainty of a measured and
+    of a nominal coordinate; flatness_mm: of a marker's height above the plane. nominal_roll_deg: counter-clockwise
+    angle of the rows in the image as the target is mounted; decides between the orientations a symmetrical grid leaves
+    open. minimum_markers: identification is refused below this count (default three quarters of the markers).
     """
 
     name: str
@@ -56,6 +57,9 @@ class Target(Document):
     odd_marker: OddMarker | None = None
     minimum_markers: Annotated[int, Field(ge=6)] | None = None
     cmm_mm: tuple[tuple[float, float], ...] | None = None
+    cmm_uncertainty_mm: Positive = 0.001
+    printing_error_mm: Positive = 0.02
+    flatness_mm: Positive = 0.005
 
     @model_validator(mode="after")
     def _consistent(self) -> Target:

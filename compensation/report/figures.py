@@ -42,7 +42,7 @@ _RASTER_DPI = 150
 _NS_PER_H = 3.6e12
 
 
-def _style() -> AbstractContextManager[None]:
+def style() -> AbstractContextManager[None]:
     """The look of all figures."""
     return mpl.rc_context(_STYLE)  # pyright: ignore[reportArgumentType] - the keys are checked at run time
 
@@ -50,7 +50,7 @@ def _style() -> AbstractContextManager[None]:
 def as_svg(figure: Figure, name: str) -> str:
     """The figure as an <svg> element for a page; every id begins with `name`, so that several fit in one page."""
     text = io.StringIO()
-    with _style():
+    with style():
         figure.savefig(text, format="svg", dpi=_RASTER_DPI, metadata=_NO_METADATA)
     svg = text.getvalue()
     svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", svg)
@@ -75,8 +75,8 @@ def trajectories(observations: Observations, frames: Mask) -> Figure:
     """Each marker's path over `frames` (F,), x100, on the first frame; coloured by the camera's temperature."""
     moved = drift(observations)[frames]
     start = observations.centres_px[frames] - moved
-    with _style():
-        figure, (axes,) = _figure(7.4, 5.5, 1, 1)
+    with style():
+        figure, (axes,) = new_figure(7.4, 5.5, 1, 1)
         width, height = observations.image_size
         axes.imshow(
             observations.preview,
@@ -112,8 +112,8 @@ def against_time(observations: Observations) -> Figure:
     hours, starts = _recorded_hours(observations)
     mean = _mean_over_markers(drift(observations))
     warm_up = observations.role == str(Role.WARM_UP)
-    with _style():
-        figure, (above, below) = _figure(7.4, 4.6, 2, 1)
+    with style():
+        figure, (above, below) = new_figure(7.4, 4.6, 2, 1)
         for (name, colour), values in zip(_AXES, mean.T, strict=True):
             _sparse(above, hours, values, observations, colour, f"mean over markers, {name}")
         _sparse(below, hours, observations.camera_degC, observations, "#CC79A7", "camera")
@@ -124,8 +124,8 @@ def against_time(observations: Observations) -> Figure:
                 axes.axvline(start, color=_GREY, linewidth=0.8, linestyle="--")
         above.set_ylabel("drift (px)")
         below.set(ylabel="temperature (°C)", xlabel="time since the first frame (h)")
-        _legend_above(above)
-        _legend_above(below)
+        legend_above(above)
+        legend_above(below)
     return figure
 
 
@@ -167,8 +167,8 @@ def _shade(axes: Axes, hours: Float, warm_up: Mask) -> None:
 
 def histogram(evaluation: Evaluation) -> Figure:
     """Deviations of the held-out centres before and after compensation, along each axis."""
-    with _style():
-        figure, panels = _figure(7.4, 2.9, 1, 2)
+    with style():
+        figure, panels = new_figure(7.4, 2.9, 1, 2)
         for index, (axes, (name, colour)) in enumerate(zip(panels, _AXES, strict=True)):
             before, after = evaluation.before_px[:, index], evaluation.after_px[:, index]
             bins = np.histogram_bin_edges(np.concatenate([before, after]), 80)
@@ -180,7 +180,7 @@ def histogram(evaluation: Evaluation) -> Figure:
                 after, bins.tolist(), histtype="step", color=colour, linewidth=1.4, label=f"after, RMS {rms[1]:.3f} px"
             )
             axes.set_xlabel(f"deviation along {name} (px)")
-            _legend_above(axes, columns=1)
+            legend_above(axes, columns=1)
         panels[0].set_ylabel("marker centres")
     return figure
 
@@ -188,8 +188,8 @@ def histogram(evaluation: Evaluation) -> Figure:
 def against_temperature(evaluation: Evaluation) -> Figure:
     """RMS deviation at each held-out chamber temperature, before and after compensation."""
     chamber_degC = [row.chamber_degC for row in evaluation.temperatures]
-    with _style():
-        figure, panels = _figure(7.4, 3.0, 1, 2)
+    with style():
+        figure, panels = new_figure(7.4, 3.0, 1, 2)
         for index, (axes, (name, colour)) in enumerate(zip(panels, _AXES, strict=True)):
             before = [row.before_px[index] for row in evaluation.temperatures]
             after = [row.after_px[index] for row in evaluation.temperatures]
@@ -199,13 +199,13 @@ def against_temperature(evaluation: Evaluation) -> Figure:
                 chamber_degC, after, "o-", color=colour, linewidth=1.3, label=f"{name}, after ({gain:.0f} % better)"
             )
             axes.set_xlabel("chamber temperature (°C)")
-            _legend_above(axes)
+            legend_above(axes)
         panels[0].set_ylabel("RMS deviation (px)")
         panels[0].set_ylim(bottom=0)
     return figure
 
 
-def _figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple[Figure, list[Axes]]:
+def new_figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple[Figure, list[Axes]]:
     """A figure of panels; those in a column share their x, those in a row their y axis."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
@@ -218,6 +218,6 @@ def _figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple
     return figure, panels
 
 
-def _legend_above(axes: Axes, columns: int = 3) -> None:
+def legend_above(axes: Axes, columns: int = 3) -> None:
     """A legend over the axes, where no data are."""
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.2, handlelength=1.6)

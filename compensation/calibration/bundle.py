@@ -1,0 +1,160 @@
+"""The joint adjustment's residuals and their derivatives.
+
+    minimise  sum |W (project(p) - centre)|^2 + sum ((X - X0)/s_X)^2 + sum (d/s_d)^2 + sum (w/s_w)^2
+
+W: inverse square root of a marker's covariance; X0, s_X: the measured or nominal board; d, w: the table's errors at a
+position (compensation/calibration/table.py). Everything that is known enters with its uncertainty: taking board or
+table as exact would put their errors into the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.calibration.board import Board
+from compensation.calibration.least_squares import Float, whiteners
+from compensation.calibration.pinhole import Pinhole
+from compensation.calibration.positions import Positions
+from compensation.calibration.table import PARAMETERS, Table, TableSigma
+
+_LENS_PRIOR = 0.05
+_LENS_ORDERS = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])
+"""Power of the radius that each distortion term is multiplied by, relative to the radius itself."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Camera, table, its errors (P, 6) in mm and rad, and board points (N, 3), mm: what the adjustment looks for."""
+
+    lens: Pinhole
+    table: Table
+    errors: Float
+    points_mm: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """The whitened problem: M used markers, at position[m] with board point marker[m]."""
+
+    position: NDArray[np.int64]
+    marker: NDArray[np.int64]
+    linear_mm: Float
+    rotary_deg: Float
+    centres_px: Float
+    whitener: Float
+    prior_mm: Float
+    sigma_mm: Float
+    freed: NDArray[np.bool_]
+    errors_sigma: Float
+    lens_sigma: Float
+
+    @property
+    def count(self) -> int:
+        """How many residuals there are, those of the priors included."""
+        errors = int(self.freed.sum()) * len(self.linear_mm)
+        return 2 * len(self.position) + len(self.lens_sigma) + errors + self.prior_mm.size
+
+    def residuals(self, scene: Scene) -> Float:
+        """(count,): markers (x, y each), distortion, table errors, board; all of unit variance."""
+        seen = _seen_points(scene, self)
+        off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(seen) - self.centres_px)
+        return np.concatenate(
+            [
+                off.ravel(),
+                scene.lens.distortion / self.lens_sigma,
+                (scene.errors / self.errors_sigma)[:, self.freed].ravel(),
+                ((scene.points_mm - self.prior_mm) / self.sigma_mm).ravel(),
+            ]
+        )
+
+    def jacobian(self, scene: Scene) -> Float:
+        """Derivatives (count, n) with respect to a step of camera, table, free table errors and board points."""
+        points = scene.points_mm[self.marker]
+        seen = _seen_points(scene, self)
+        linear, rotary = self.linear_mm[self.position], self.rotary_deg[self.position]
+        to_table, to_errors, to_points = scene.table.jacobian(points, linear, rotary, scene.errors[self.position])
+        by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
+        lens, free = len(scene.lens.vector), int(self.freed.sum())
+        first_error = lens + PARAMETERS
+        first_point = first_error + free * len(scene.errors)
+        rows, count = len(self.position), first_point + scene.points_mm.size
+        slopes = np.zeros((rows, 2, count))
+        slopes[:, :, :lens] = self.whitener @ scene.lens.vector_jacobian(seen)
+        slopes[:, :, lens:first_error] = by_point @ to_table
+        each = np.arange(rows)[:, None]
+        slopes[each, :, first_error + free * self.position[:, None] + np.arange(free)] = np.swapaxes(
+            by_point @ to_errors[:, :, self.freed], 1, 2
+        )
+        slopes[each, :, first_point + 3 * self.marker[:, None] + np.arange(3)] = np.swapaxes(by_point @ to_points, 1, 2)
+        priors = np.zeros((count, count))
+        priors[range(4, lens), range(4, lens)] = 1 / self.lens_sigma
+        errors = range(first_error, first_point)
+        priors[errors, errors] = np.tile(1 / self.errors_sigma[self.freed], len(scene.errors))
+        last = range(first_point, count)
+        priors[last, last] = 1 / self.sigma_mm.ravel()
+        has_prior = np.diag(priors) > 0
+        return np.concatenate([slopes.reshape(-1, count), priors[has_prior]])
+
+    def stepped(self, scene: Scene, change: Float) -> Scene:
+        """The scene a step (n,) away."""
+        lens, free = len(scene.lens.vector), int(self.freed.sum())
+        first_point = len(change) - scene.points_mm.size
+        errors = scene.errors.copy()
+        errors[:, self.freed] += change[lens + PARAMETERS : first_point].reshape(-1, free)
+        return Scene(
+            scene.lens.stepped(change[:lens]),
+            scene.table.stepped(change[lens : lens + PARAMETERS]),
+            errors,
+            scene.points_mm + change[first_point:].reshape(-1, 3),
+        )
+
+
+def problem_of(
+    positions: Positions,
+    shifts_px: Float,
+    used: NDArray[np.bool_],
+    board: Board,
+    sigma: TableSigma,
+    discrepancy_px: float,
+    lens: Pinhole,
+) -> Problem:
+    """The problem of the markers `used` (P, N), their ellipses' centres moved by -shifts_px (P, N, 2) to the discs'."""
+    position, marker = np.nonzero(used)
+    covariance = positions.covariance_px2[used] + discrepancy_px**2 * np.eye(2)
+    sigma_vector = sigma.vector
+    freed = sigma_vector > 0
+    return Problem(
+        position=position,
+        marker=marker,
+        linear_mm=positions.linear_mm,
+        rotary_deg=positions.rotary_deg,
+        centres_px=(positions.centres_px - shifts_px)[used],
+        whitener=whiteners(covariance),
+        prior_mm=board.points_mm,
+        sigma_mm=board.sigma_mm,
+        freed=freed,
+        errors_sigma=np.where(freed, sigma_vector, 1.0),
+        lens_sigma=_lens_sigma(lens),
+    )
+
+
+def _seen_points(scene: Scene, problem: Problem) -> Float:
+    """(M, 3): the used markers in the camera's frame, mm."""
+    rotations, translations = scene.table.poses(problem.linear_mm, problem.rotary_deg, scene.errors)
+    points = scene.points_mm[problem.marker]
+    turned = np.einsum("mij,mj->mi", rotations[problem.position], points)
+    return turned + translations[problem.position]
+
+
+def _lens_sigma(lens: Pinhole) -> Float:
+    """Weak priors of the distortion: each term moves the image's corner by a part of its radius.
+
+    They bound only combinations that the markers do not see, such as k1 against k4.
+    """
+    width, height = lens.image_size
+    corner = math.hypot(width, height) / 2 / float(lens.focal_px.mean())
+    return _LENS_PRIOR / corner ** _LENS_ORDERS[: len(lens.distortion)]

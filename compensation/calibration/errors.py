@@ -1,0 +1,9 @@
+"""What cannot be calibrated."""
+
+from __future__ import annotations
+
+from drivers.interface import StandError
+
+
+class CalibrationError(StandError):
+    """Observations that do not determine a camera, or a pose; the sentence says why."""

@@ -1,0 +1,102 @@
+"""Levenberg-Marquardt for whitened residuals of anything that can be linearised and stepped.
+
+Residuals have unit variance, so the inverse of the normal matrix at the solution is the covariance of the parameters.
+Dense: with 34 positions of 54 markers a step of some 240 parameters takes 30 ms, less than a sparse solver's overhead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from compensation.calibration.errors import CalibrationError
+
+Float = NDArray[np.float64]
+State = TypeVar("State")
+
+_STEPS = 200
+_FIRST_DAMPING = 1e-6
+_GREATEST_DAMPING = 1e8
+_CONVERGED = 1e-7
+"""Expected fall of the sum of squares, relative to it (or to 1): a small part of any parameter's standard deviation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution(Generic[State]):
+    """The state with the least sum of squares `cost`, and the covariance (n, n) of steps away from it."""
+
+    state: State
+    cost: float
+    covariance: Float
+
+
+def minimise(
+    start: State,
+    residuals: Callable[[State], Float],
+    jacobian: Callable[[State], Float],
+    step: Callable[[State, Float], State],
+) -> Solution[State]:
+    """Minimise the sum of squares of residuals (m,), their derivatives (m, n) being with respect to `step`'s vector.
+
+    CalibrationError when it does not converge, or when some parameter leaves all residuals unchanged.
+    """
+    state, damping = start, _FIRST_DAMPING
+    current = residuals(state)
+    for _ in range(_STEPS):
+        slopes = jacobian(state)
+        normal, gradient = slopes.T @ slopes, slopes.T @ current
+        scale = _scale(normal)
+        while True:
+            change = -scale * _solved(normal * scale[:, None] * scale, gradient * scale, damping)
+            cost = float(current @ current)
+            expected = -float(change @ (2 * gradient + normal @ change))
+            if expected <= _CONVERGED * max(cost, 1.0):
+                return Solution(state, cost, _inverse(normal, scale))
+            tried = step(state, change)
+            after = residuals(tried)
+            gain = (cost - float(after @ after)) / expected
+            if gain > 0:
+                break
+            damping = max(10 * damping, 1e-3)
+            if damping > _GREATEST_DAMPING:
+                raise CalibrationError("the fit does not converge: every step makes the residuals larger")
+        state, current = tried, after
+        damping *= max(0.1, 1 - (2 * gain - 1) ** 3)  # Nielsen's rule: trust as far as the prediction held
+    raise CalibrationError(f"the fit does not converge in {_STEPS} steps")
+
+
+def whiteners(covariance: Float) -> Float:
+    """Matrices (..., n, n) that give vectors of these covariances (..., n, n) unit variance."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
+
+
+def _scale(normal: Float) -> Float:
+    diagonal = np.diag(normal)
+    if not np.all(np.isfinite(diagonal)) or np.any(diagonal <= 0):
+        raise CalibrationError("the observations do not determine all parameters")
+    return 1 / np.sqrt(diagonal)
+
+
+def _solved(scaled: Float, gradient: Float, damping: float) -> Float:
+    """The damped step; damping grows until the matrix is positive definite."""
+    identity = np.eye(len(scaled))
+    while damping <= _GREATEST_DAMPING:
+        try:
+            return cho_solve(cho_factor(scaled + damping * identity), gradient)
+        except LinAlgError:
+            damping = max(10 * damping, 1e-12)
+    raise CalibrationError("the observations do not determine all parameters")
+
+
+def _inverse(normal: Float, scale: Float) -> Float:
+    try:
+        factor = cho_factor(normal * scale[:, None] * scale)
+    except LinAlgError as error:
+        raise CalibrationError("the observations do not determine all parameters") from error
+    inverse = cho_solve(factor, np.eye(len(normal)))
+    return inverse * scale[:, None] * scale

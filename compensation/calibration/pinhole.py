@@ -1,0 +1,144 @@
+"""The pinhole camera with the lens distortion OpenCV and its relatives share.
+
+    x = X/Z, y = Y/Z, r^2 = x^2 + y^2, g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+    u = fx (x g + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx
+    v = fy (y g + p1 (r^2 + 2 y^2) + 2 p2 x y) + cy
+
+Camera frame: x right, y down, z forward, mm. Pixels: integers are pixel centres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from compensation.calibration.least_squares import Float
+
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""The order of a camera's vector: that of OpenCV and mrcal."""
+
+_UNDISTORTIONS = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pinhole:
+    """vector: the first 9 (Brown) or all 12 (rational) of NAMES, px for the first four. image_size: (width, height)."""
+
+    vector: Float
+    image_size: tuple[int, int]
+
+    @property
+    def focal_px(self) -> Float:
+        """(fx, fy)."""
+        return self.vector[:2]
+
+    @property
+    def distortion(self) -> Float:
+        """k1 k2 p1 p2 k3, for the rational model also k4 k5 k6: the order of OpenCV."""
+        return self.vector[4:]
+
+    @property
+    def matrix(self) -> Float:
+        """The camera matrix (3, 3)."""
+        fx, fy, cx, cy = self.vector[:4]
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    def stepped(self, change: Float) -> Pinhole:
+        """The camera with `change` added to its vector."""
+        return replace(self, vector=self.vector + change)
+
+    def project(self, points_mm: Float) -> Float:
+        """Images (..., 2), px, of points (..., 3) of the camera frame."""
+        return _distorted(points_mm[..., :2] / points_mm[..., 2:], self.distortion) * self.focal_px + self.vector[2:4]
+
+    def slopes(self, pixels: Float) -> Float:
+        """(..., 2): X/Z and Y/Z of the rays that are seen at `pixels` (..., 2); NaN where the lens folds over."""
+        wanted = (pixels - self.vector[2:4]) / self.focal_px
+        slopes = wanted.copy()
+        for _ in range(_UNDISTORTIONS):
+            off = wanted - _distorted(slopes, self.distortion)
+            slopes = slopes + np.linalg.solve(_bend(slopes, self.distortion), off[..., None])[..., 0]
+        off = np.abs(wanted - _distorted(slopes, self.distortion)).max(axis=-1)
+        above, below, _ = _radial(np.sum(slopes**2, axis=-1), self.distortion)
+        upright = (above / below > 0) & (np.linalg.det(_bend(slopes, self.distortion)) > 0)
+        return np.where(((off < 1e-10) & upright)[..., None], slopes, np.nan)
+
+    def misfit(self, points_mm: Float, pixels: Float) -> Float:
+        """Where points (..., 3) are seen, minus where they should be, px."""
+        return self.project(points_mm) - pixels
+
+    def point_jacobian(self, points_mm: Float, pixels: Float) -> Float:
+        """Derivative (..., 2, 3) of the misfit with respect to the points, px/mm."""
+        slopes = points_mm[..., :2] / points_mm[..., 2:]
+        bend = self.focal_px[:, None] * _bend(slopes, self.distortion)
+        return np.concatenate([bend, -bend @ slopes[..., None]], axis=-1) / points_mm[..., None, 2:]
+
+    def vector_jacobian(self, points_mm: Float) -> Float:
+        """Derivative (..., 2, 9 or 12) of the projection with respect to the camera's vector."""
+        slopes = points_mm[..., :2] / points_mm[..., 2:]
+        lens = _lens_jacobian(slopes, self.distortion) * self.focal_px[:, None]
+        distorted = _distorted(slopes, self.distortion)
+        frame = np.zeros((*slopes.shape, 4))
+        frame[..., 0, 0], frame[..., 1, 1] = distorted[..., 0], distorted[..., 1]
+        frame[..., 0, 2] = frame[..., 1, 3] = 1.0
+        return np.concatenate([frame, lens], axis=-1)
+
+
+def _radial(square: Float, distortion: Float) -> tuple[Float, Float, Float]:
+    """Numerator, denominator and g'(r^2) of the radial factor."""
+    k1, k2, _, _, k3 = distortion[:5]
+    k4, k5, k6 = distortion[5:] if len(distortion) > 5 else (0.0, 0.0, 0.0)
+    above = 1 + square * (k1 + square * (k2 + square * k3))
+    below = 1 + square * (k4 + square * (k5 + square * k6))
+    above_slope = k1 + square * (2 * k2 + 3 * square * k3)
+    below_slope = k4 + square * (2 * k5 + 3 * square * k6)
+    return above, below, (above_slope * below - above * below_slope) / below**2
+
+
+def _distorted(slopes: Float, distortion: Float) -> Float:
+    x, y = np.moveaxis(slopes, -1, 0)
+    p1, p2 = distortion[2:4]
+    square = x**2 + y**2
+    above, below, _ = _radial(square, distortion)
+    gain = above / below
+    return np.stack(
+        [
+            x * gain + 2 * p1 * x * y + p2 * (square + 2 * x**2),
+            y * gain + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _bend(slopes: Float, distortion: Float) -> Float:
+    """Derivative (..., 2, 2) of the distorted with respect to the ideal slopes."""
+    x, y = np.moveaxis(slopes, -1, 0)
+    p1, p2 = distortion[2:4]
+    above, below, gain_slope = _radial(x**2 + y**2, distortion)
+    gain = above / below
+    mixed = 2 * x * y * gain_slope + 2 * p1 * x + 2 * p2 * y
+    return np.stack(
+        [
+            np.stack([gain + 2 * x**2 * gain_slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1),
+            np.stack([mixed, gain + 2 * y**2 * gain_slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def _lens_jacobian(slopes: Float, distortion: Float) -> Float:
+    """Derivative (..., 2, 5 or 8) of the distorted slopes with respect to the distortion."""
+    x, y = np.moveaxis(slopes, -1, 0)
+    square = x**2 + y**2
+    above, below, _ = _radial(square, distortion)
+    powers = [square, square**2, square**3]
+    radial = [power / below for power in powers]
+    tangential = [
+        np.stack([2 * x * y, square + 2 * y**2], axis=-1),
+        np.stack([square + 2 * x**2, 2 * x * y], axis=-1),
+    ]
+    columns = [slopes * radial[0][..., None], slopes * radial[1][..., None], *tangential, slopes * radial[2][..., None]]
+    if len(distortion) > 5:
+        columns += [slopes * (-above / below**2 * power)[..., None] for power in powers]
+    return np.stack(columns, axis=-1)

@@ -1,0 +1,113 @@
+"""How well a calibration knows where a point is seen, pixel by pixel, at a stated distance.
+
+A point is held still among the table's targets, not in the camera's frame: an error of the camera's axis that the
+poses share changes no image. As mrcal's: the point moves with the mean of all adjusted target poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensation.calibration.adjustment import Adjustment
+from compensation.calibration.least_squares import Float
+from compensation.calibration.rotation import nearest
+from compensation.calibration.table import ERRORS, PARAMETERS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UncertaintyMap:
+    """pixels (H, W, 2), covariance_px2 (H, W, 2, 2) of the projection at distance_mm."""
+
+    distance_mm: float
+    pixels: Float
+    covariance_px2: Float
+
+    @property
+    def sigma_px(self) -> Float:
+        """(H, W): root mean square of the two coordinates' standard uncertainties."""
+        return np.sqrt(np.trace(self.covariance_px2, axis1=-2, axis2=-1) / 2)
+
+
+def grid_pixels(image_size: tuple[int, int], columns: int) -> Float:
+    """Evenly spread pixels (H, W, 2) from corner to corner."""
+    width, height = image_size
+    rows = max(2, round(columns * height / width))
+    return np.stack(np.meshgrid(np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows)), axis=-1)
+
+
+def projection_uncertainty(adjustment: Adjustment, distance_mm: float, columns: int = 25) -> UncertaintyMap:
+    """The covariance of the projection on a grid of pixels, of points at Z = distance_mm."""
+    lens = adjustment.scene.lens
+    pixels = grid_pixels(lens.image_size, columns)
+    slopes = lens.slopes(pixels.reshape(-1, 2))
+    points = np.column_stack([slopes, np.ones(len(slopes))]) * distance_mm
+    jacobian = _jacobian(adjustment, points, pixels.reshape(-1, 2))
+    covariance = adjustment.covariance[: jacobian.shape[2], : jacobian.shape[2]]
+    return UncertaintyMap(
+        distance_mm, pixels, (jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).reshape(*pixels.shape, 2)
+    )
+
+
+def _jacobian(adjustment: Adjustment, points_mm: Float, pixels: Float) -> Float:
+    """Derivative (K, 2, n) of the images of points (K, 3) with respect to camera, table and its errors."""
+    scene, positions, free = adjustment.scene, adjustment.positions, int(adjustment.freed.sum())
+    rotations, translations = adjustment.poses()
+    count = len(rotations)
+    first_error = len(scene.lens.vector) + PARAMETERS
+    moves = np.zeros((len(points_mm), 3, first_error + free * count - len(scene.lens.vector)))
+    for index in range(count):
+        on_target = (points_mm - translations[index]) @ rotations[index]
+        at = np.full(len(points_mm), index)
+        table, errors, _ = scene.table.jacobian(
+            on_target, positions.linear_mm[at], positions.rotary_deg[at], scene.errors[at]
+        )
+        moves[:, :, :PARAMETERS] += table / count
+        begin = PARAMETERS + free * index
+        moves[:, :, begin : begin + free] = errors[:, :, adjustment.freed] / count
+    by_point = scene.lens.point_jacobian(points_mm, pixels)
+    return np.concatenate([scene.lens.vector_jacobian(points_mm), by_point @ moves], axis=2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Difference:
+    """pixels (H, W, 2), shift_px (H, W, 2): where the second camera sees what the first one sees at the pixels."""
+
+    distance_mm: float
+    pixels: Float
+    shift_px: Float
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square per coordinate over the grid."""
+        return float(np.sqrt(np.mean(self.shift_px**2)))
+
+
+def difference(first: Adjustment, second: Adjustment, distance_mm: float, columns: int = 25) -> Difference:
+    """How two calibrations from different positions of one table differ, their frames brought together by the table."""
+    turn, shift = _between(first, second)
+    pixels = grid_pixels(first.scene.lens.image_size, columns)
+    slopes = first.scene.lens.slopes(pixels)
+    points = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1) * distance_mm
+    return Difference(distance_mm, pixels, second.scene.lens.project(points @ turn.T + shift) - pixels)
+
+
+def _between(first: Adjustment, second: Adjustment) -> tuple[Float, Float]:
+    """Rotation and translation (mm) from the first camera's frame to the second's: the same target, where either
+    table's axes put it, in the sense of least squares over both sessions' positions."""
+    linear = np.concatenate([first.positions.linear_mm, second.positions.linear_mm])
+    rotary = np.concatenate([first.positions.rotary_deg, second.positions.rotary_deg])
+    clouds: list[Float] = []
+    for adjustment in (first, second):
+        rotations, translations = adjustment.scene.table.poses(linear, rotary, np.zeros((len(linear), ERRORS)))
+        points = adjustment.board.points_mm
+        clouds.append((np.einsum("pij,nj->pni", rotations, points) + translations[:, None]).reshape(-1, 3))
+    return _rigid(*clouds)
+
+
+def _rigid(source: Float, destination: Float) -> tuple[Float, Float]:
+    """Rotation and translation of least squares between two clouds (K, 3), by Kabsch."""
+    from_mean, to_mean = source.mean(axis=0), destination.mean(axis=0)
+    turn = nearest((destination - to_mean).T @ (source - from_mean))
+    return turn, to_mean - turn @ from_mean

@@ -1,0 +1,102 @@
+"""`compensate calibrate`: from a calibration session to the camera file, its exports and its report."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.calibration.calibrate import Calibration, Model, calibrate
+from compensation.calibration.camera_file import CameraFile, camera_file
+from compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
+from compensation.calibration.pinhole import NAMES
+from compensation.calibration.positions import observe_positions
+from compensation.calibration.table import TableSigma
+from compensation.command_line import TargetOption, named_target, one_line_errors
+from compensation.files import check_writable, write_whole
+from compensation.observations import session_target
+from compensation.report.calibration_report import report_page
+from stand.progress import progress
+from stand.recording.session import Session
+
+_TABLE = TableSigma()
+
+
+def calibrate_session(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded calibration.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The camera file (JSON) to write.")],
+    export: Annotated[
+        Path | None, typer.Option(help="A folder for the OpenCV, ROS, Kalibr and mrcal files of the pinhole.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="A page (HTML) with residuals and uncertainty.")] = None,
+    target: TargetOption = None,
+    model: Annotated[
+        Model, typer.Option(help="The pinhole; auto: what does better at held-out positions.")
+    ] = Model.AUTO,
+    linear_um: Annotated[float, typer.Option(min=0.001, help="Standard uncertainty of a linear position.")] = (
+        1e3 * _TABLE.linear_mm
+    ),
+    rotary_arcmin: Annotated[float, typer.Option(min=0.0001, help="Standard uncertainty of a rotary position.")] = (
+        _TABLE.rotary_arcmin
+    ),
+    straightness_um: Annotated[float, typer.Option(min=0, help="Of the table across its axis; 0: straight.")] = 0.0,
+    wobble_arcmin: Annotated[float, typer.Option(min=0, help="Of the table's tilt; 0: none.")] = 0.0,
+) -> None:
+    """Calibrate the camera: pinhole and ray model, with board and table adjusted within their uncertainties.
+
+    Example: compensate calibrate sessions/20260101T180000Z-calibration -o camera.json --export exports
+    """
+    with one_line_errors():
+        for path in (out, report, *([] if export is None else [export / name for name in EXPORTS])):
+            if path is not None:
+                check_writable(path)
+        opened = Session.open(session)
+        used = named_target(target) or session_target(opened)
+        sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)
+        with progress("find markers", opened.frame_count) as shown:
+            positions = observe_positions(opened, used, shown)
+        found = calibrate(positions, used, sigma, model)
+        file = _file(opened, used.name, found)
+        file.save(out)
+        if export is not None:
+            write_exports(export, file.lens, file.camera_serial or "camera", file.fit.rms_px)
+        if report is not None:
+            write_whole(report, report_page(file, found))
+        typer.echo(summary(file))
+
+
+def summary(file: CameraFile) -> str:
+    """The calibration in a few lines."""
+    sigma = [file.covariance[index][index] ** 0.5 for index in range(len(file.vector))]
+    lines = [f"{file.model}: {file.fit.markers} markers at {len(file.table.linear_mm)} positions"]
+    lines += [
+        f"  {name} {value:12.6g} +- {uncertainty:.2g}"
+        for name, value, uncertainty in zip(NAMES, file.vector, sigma, strict=False)
+    ]
+    fit = file.fit
+    lines += [
+        f"residual {1e3 * fit.rms_px:.2f} mpx per coordinate, {fit.ratio:.3f} x the detection sigma "
+        f"({1e3 * fit.detection_sigma_px:.2f} mpx); discrepancy {1e3 * fit.discrepancy_px:.2f} mpx; "
+        f"{fit.outliers} outliers",
+        "held-out positions, mpx per coordinate: "
+        + ", ".join(f"{score.model} {1e3 * score.rms_px:.2f}" for score in file.scores),
+        f"the halves differ by {1e3 * file.uncertainty.halves_rms_px:.2f} mpx RMS at "
+        f"{file.uncertainty.distance_mm:.0f} mm",
+    ]
+    refit = refit_radtan(file.lens)
+    lines.append(
+        f"Kalibr's model without k3 differs by {1e3 * refit.rms_px:.2f} mpx RMS, {1e3 * refit.worst_px:.1f} at most"
+    )
+    return "\n".join(lines)
+
+
+def _file(session: Session, target_name: str, found: Calibration) -> CameraFile:
+    return camera_file(
+        found,
+        camera_serial=session.metadata.get("camera_serial", ""),
+        session_ids=(session.metadata.get("session_id", ""),),
+        target_name=target_name,
+        software_version=importlib.metadata.version("thermostand"),
+    )

@@ -1,0 +1,86 @@
+"""The page of a calibration: one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+from compensation.calibration.calibrate import Calibration
+from compensation.calibration.camera_file import CameraFile
+from compensation.report import calibration_figures as figures
+from compensation.report.figures import as_svg
+from compensation.report.page import facts, figure, heading, page, paragraph, table
+
+_FIGURES = (
+    (
+        figures.residual_vectors,
+        "residuals",
+        "Residuals of all markers, drawn longer as the bar tells; they should have no pattern.",
+    ),
+    (figures.residual_sizes, "sizes", "RMS residual of each table position and of each marker."),
+    (
+        figures.normalised_histogram,
+        "histogram",
+        "Residuals in units of the detection sigma; the line is what noise alone gives.",
+    ),
+    (
+        figures.uncertainty_map,
+        "uncertainty",
+        "Standard uncertainty of the projection at the mean distance, and how far the calibrations of the two halves "
+        "of the positions differ there. White dots are the markers.",
+    ),
+    (figures.model_scores, "scores", "Models at positions they were not fitted to; bars are standard errors."),
+    (figures.rays_against_pinhole, "rays", "Where the ray model sees what the pinhole sees, at the mean distance."),
+    (
+        figures.corrections,
+        "corrections",
+        "What the adjustment made of the board's coordinates and of the table's positions.",
+    ),
+)
+
+
+def report_page(file: CameraFile, calibration: Calibration) -> str:
+    """The report as HTML text; the same data give the same text."""
+    drawn = [figure(as_svg(draw(calibration), name), caption) for draw, name, caption in _FIGURES]
+    title = f"Calibration of camera {file.camera_serial}"
+    parts = [
+        heading(title, 1),
+        paragraph(f"From {', '.join(file.session_ids)}, target {file.target_name}.", aside=True),
+        heading("Camera"),
+        _camera(file),
+        _facts(file),
+        heading("Held-out positions"),
+        _scores(file),
+        heading("Figures"),
+        *drawn,
+    ]
+    return page(title, parts)
+
+
+def _camera(file: CameraFile) -> str:
+    sigma = [file.covariance[index][index] ** 0.5 for index in range(len(file.vector))]
+    rows = [
+        [name, f"{value:.7g}", f"{uncertainty:.2g}"]
+        for name, value, uncertainty in zip(file.names, file.vector, sigma, strict=True)
+    ]
+    return table([file.model, "value", "standard uncertainty"], rows)
+
+
+def _facts(file: CameraFile) -> str:
+    fit = file.fit
+    return facts(
+        [
+            ("Residual", f"{1e3 * fit.rms_px:.2f} mpx per coordinate, {fit.ratio:.3f} x the detection sigma"),
+            ("Detection sigma", f"{1e3 * fit.detection_sigma_px:.2f} mpx per coordinate, mean of a position's frames"),
+            ("Unexplained", f"{1e3 * fit.discrepancy_px:.2f} mpx per coordinate beyond noise and priors"),
+            ("Markers", f"{fit.markers} at {len(file.table.linear_mm)} positions, {fit.outliers} outliers left out"),
+            ("Ray model", f"degree {file.rays.degree}, {file.rays.range_mm[0]:.0f} to {file.rays.range_mm[1]:.0f} mm"),
+            ("Halves", f"{1e3 * file.uncertainty.halves_rms_px:.2f} mpx RMS apart"),
+        ]
+    )
+
+
+def _scores(file: CameraFile) -> str:
+    rows = [
+        [score.model, f"{1e3 * score.rms_px:.3f}", f"{1e3 * score.sigma_px:.3f}", str(score.positions)]
+        for score in file.scores
+    ]
+    chosen = next((index for index, score in enumerate(file.scores) if score.model == file.model), None)
+    return table(["model", "RMS per coordinate (mpx)", "standard error (mpx)", "positions"], rows, chosen)
