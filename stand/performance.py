@@ -20,6 +20,7 @@ from stand.guard import Guard
 from stand.hub import Event, Item
 from stand.interlocks import Fault
 from stand.journal import Again, Cleared, Ended, Entry, Gap, Journal
+from stand.learned import load_learned
 from stand.logbook import Logbook
 from stand.poller import Poller
 from stand.recording.instants import utc_text
@@ -135,7 +136,7 @@ async def _answer(work: Performance, log: Logbook) -> None:
     """Answer at the control socket until cancelled; a run goes on without one."""
     assembly, before = work.assembly, work.before
     progress = Progress() if before is None else before.progress
-    steps = price(work.order.recipe.plan(), work.order.config)
+    steps = price(work.order.recipe.plan(), work.order.config, load_learned(work.recorder.directory.parent))
     gate, stop, clock = assembly.stand.gate, work.stop, assembly.clock
     board = StatusBoard(work.order.recipe.name, steps, progress, gate, stop, work.recorder, clock)
     assembly.hub.subscribe(board)

@@ -15,7 +15,7 @@ from stand.config import load_config, packaged
 from stand.exit_codes import INTERRUPTED, one_line_errors
 from stand.order_files import load_order
 from stand.queue_file import Entry, Queue
-from stand.queue_run import run_entry
+from stand.queue_run import conclude, run_entry
 from stand.queue_work import Notes, work
 from stand.recording.instants import date_time, duration
 from stand.stop import Interrupted
@@ -109,6 +109,7 @@ def start(
         bool, typer.Option("--virtual-time", help="As fast as it goes, each with a simulated laboratory of its own.")
     ] = False,
     clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
+    report: Annotated[bool, typer.Option("--report", help="As of `stand run`, after each run with a drift.")] = False,
 ) -> None:
     """Run what is queued, one after another, until nothing is left; what was interrupted is resumed first.
 
@@ -123,7 +124,9 @@ def start(
             queue.clear(directory)
 
         async def run_one(entry: Entry, notes: Notes) -> Path:
-            return await run_entry(directory, entry, notes, _say, virtual_time=virtual_time)
+            session = await run_entry(directory, entry, notes, _say, virtual_time=virtual_time)
+            await asyncio.to_thread(conclude, entry, session, _say, report=report)
+            return session
 
         try:
             asyncio.run(work(directory, run_one, WallClock(), _say))

@@ -7,17 +7,19 @@ from collections.abc import Callable, Collection, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from drivers.interface import SessionError, StandError, StandTripped
+from drivers.interface import ConfigError, SessionError, StandError, StandTripped
 from stand.estimate import price
 from stand.follow import Follow
 from stand.hub import Event, Hub, Item, StepMark, StepState
 from stand.journal import Ended, Journal
+from stand.learned import learn, load_learned
 from stand.progress import progress
 from stand.queue import order_of
 from stand.queue_file import Entry
 from stand.queue_work import Halt, Notes
 from stand.resume import Interruption, interruption
 from stand.run import resume, run_real, run_virtual
+from stand.session_report import NotReported, check_reportable, report_session
 from stand.session_setup import Order
 from stand.stop import Interrupted
 
@@ -38,7 +40,7 @@ async def run_entry(
     before = None if session is None else await asyncio.to_thread(_interruption, session)
     watch = _Watch(frozenset() if before is None else before.progress.done, notes.step_done)
     try:
-        with _followed(order, before, tell) as follow:
+        with _followed(directory, order, before, tell) as follow:
 
             def subscribe(hub: Hub) -> None:
                 hub.subscribe(follow)
@@ -72,9 +74,32 @@ class _Watch:
             self._step_done()
 
 
+def conclude(entry: Entry, session: Path, tell: Callable[[str], None], *, report: bool) -> None:
+    """What follows a complete run, which none of it makes fail: what it teaches about durations is kept for the next,
+    and with `report` the drift is fitted and reported in the session's folder, when the recipe has any. Takes a minute.
+    """
+    order = order_of(entry)
+    try:
+        learn(session.parent, order.config)
+    except (SessionError, OSError) as error:
+        tell(f"warning: {error}")
+    if not report:
+        return
+    try:
+        check_reportable(order.recipe.plan())
+        for line in report_session(session, session):
+            tell(line)
+    except (ConfigError, NotReported) as error:
+        tell(f"{session.name}: {error}")
+    except Exception as error:  # noqa: BLE001 - the night goes on, whatever a fit makes of one session
+        tell(f"{session.name}: is recorded, but not reported: {type(error).__name__}: {error}")
+
+
 @contextmanager
-def _followed(order: Order, before: Interruption | None, tell: Callable[[str], None]) -> Generator[Follow]:
-    steps = price(order.recipe.plan(), order.config)
+def _followed(
+    directory: Path, order: Order, before: Interruption | None, tell: Callable[[str], None]
+) -> Generator[Follow]:
+    steps = price(order.recipe.plan(), order.config, load_learned(directory))
     with progress("run", sum(step.duration_s for step in steps)) as report:
         if before is None:
             yield Follow(steps, report, tell)

@@ -8,6 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated
@@ -34,6 +35,10 @@ app = typer.Typer(add_completion=False)
 
 ReportOption = Annotated[
     bool, typer.Option("--report", help="Then fit the drift: model.json and report.html, in the session's folder.")
+]
+
+AttendedOption = Annotated[
+    bool, typer.Option("--attended", help="Somebody is there: the run waits at each prompt until `stand continue`.")
 ]
 
 
@@ -68,6 +73,7 @@ def run(
         bool, typer.Option("--virtual-time", help="As fast as it goes, with a simulated laboratory of its own.")
     ] = False,
     seed: Annotated[int | None, typer.Option(help="The simulated laboratory's seed (with --virtual-time).")] = None,
+    attended: AttendedOption = False,
     report: ReportOption = False,
 ) -> None:
     """Run a recipe and record it; prints the session's folder.
@@ -79,7 +85,7 @@ def run(
             raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
         if seed is not None and seed < 0:
             raise ConfigError(f"--seed is 0 or more, not {seed}")
-        order = load_order(recipe, config)
+        order = replace(load_order(recipe, config), attended=attended)
         if report:
             check_reportable(order.recipe.plan())
         directory = out or order.config.recording.directory
@@ -97,6 +103,7 @@ def run(
 def resume_run(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="The session of a run that did not end.")],
     clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
+    attended: AttendedOption = False,
     report: ReportOption = False,
 ) -> None:
     """Go on with a run that was killed or interrupted, in its session: what is done is not done again.
@@ -105,7 +112,8 @@ def resume_run(
     """
     with _run_errors():
         before = interruption(directory, clear=clear)
-        order = before.order
+        order = replace(before.order, attended=attended)
+        before = replace(before, order=order)
         try:
             if report:
                 check_reportable(order.recipe.plan())

@@ -9,6 +9,7 @@ from pathlib import Path
 from experiments.steps import Capture
 from stand import queue
 from stand.hub import StepState
+from stand.learned import load_learned
 from stand.order_files import load_order
 from stand.queue_work import MOST_FRUITLESS_STARTS
 from stand.recording.session import Session
@@ -63,7 +64,7 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
     assert (first.state, second.state) == ("interrupted", "waiting")
     assert first.session.endswith("-queued")
 
-    ended = subprocess.run([*COMMAND, str(out)], capture_output=True, text=True, check=False, timeout=60)
+    ended = subprocess.run([*COMMAND, str(out), "--report"], capture_output=True, text=True, check=False, timeout=60)
     assert ended.returncode == 0, ended.stderr
     assert f"run 1 (queued) goes on in {first.session}" in ended.stderr
     entries = queue.queued(out).entries
@@ -75,6 +76,9 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
         assert session.frame_count == sum(captures.values()) == 4
         done = [step.step_id for step in session.steps() if step.state is StepState.DONE and step.kind == "Capture"]
         assert sorted(done) == sorted(captures)
+        # One temperature is too few for a fit, which is no reason for a run to fail.
+        assert f"{out / entry.session} is recorded, but not reported" in ended.stderr
+    assert load_learned(out).nights == tuple(sorted(entry.session for entry in entries))
 
 
 def test_a_run_that_dies_whenever_it_goes_on_makes_way_for_the_next(tmp_path: Path, config_text: Callable[..., str]):
