@@ -12,6 +12,7 @@ import cv2
 
 from tests.bench import (
     abort,
+    calibration,
     camera,
     codec,
     identification,
@@ -37,6 +38,7 @@ BENCHMARKS = {
     "modbus": modbus.figures,
     "ximc": ximc.figures,
     "camera": camera.figures,
+    "calibration": calibration.figures,
     "codec": codec.figures,
     "recorder": recorder.figures,
     "line_rate": line_rate.figures,
