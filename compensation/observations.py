@@ -50,6 +50,9 @@ class Role(StrEnum):
     VALIDATION = "validation"
     WARM_UP = "warm_up"
     SETTLING = "settling"
+    CALIBRATION = "calibration"
+    POSE = "pose"
+    REPEATABILITY = "repeatability"
     OTHER = "other"
 
 
