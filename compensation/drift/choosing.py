@@ -17,6 +17,7 @@ from compensation.observations import Observations
 from drivers.interface import SessionError
 
 Form = Literal["paper", "thermal"]
+FORMS: tuple[Form, ...] = ("paper", "thermal")
 
 
 def fit(observations: Observations, degree: int | None = None, form: Form | None = None) -> DriftModel:

@@ -19,6 +19,8 @@ from drivers.sim.plant import Plant, PlantSpec
 from .synthetic import SIZE, TARGET
 
 Float = NDArray[np.float64]
+Seen = tuple[Observations, Float]
+"""Observations, and the noise-free centres (F, 54, 2) of their frames, px."""
 
 NS_PER_S = 1_000_000_000
 START_NS = 1_767_290_400 * NS_PER_S
@@ -157,10 +159,8 @@ class Night:
         )
 
 
-def night(
-    kind: CameraKind, seed: int, parts: Sequence[WarmUp | Dwell], session_id: str = "night-1"
-) -> tuple[Observations, Float]:
-    """The observations of a night and the true centres (F, 54, 2)."""
+def night(kind: CameraKind, seed: int, parts: Sequence[WarmUp | Dwell], session_id: str = "night-1") -> Seen:
+    """One session from a cold camera in a chamber at 24 degC."""
     session = Night(kind, seed)
     session.wait(600)
     for part in parts:

@@ -1,0 +1,161 @@
+"""How much a camera's drift depends on the way: heating against cooling branches, closure, and repeatability.
+
+A visit is a set-point with its frames; its branch is the side from which it was reached. All figures are of the mean
+over the markers seen in both visits, along I and J, px. Lag and hysteresis both open the branches; a set-point with a
+doubled dwell tells them apart: lag shrinks, hysteresis does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations, groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.drift.displacements import displacements
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.lags import Float
+from compensation.drift.training import frame_states
+from compensation.observations import Mask, Observations, Role
+
+_CYCLE = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gap:
+    """Heating minus cooling branch at one set-point: difference_px and its standard uncertainty, each (I, J); rms_px:
+    over the markers, of both coordinates' difference."""
+
+    chamber_degC: float
+    difference_px: Float
+    uncertainty_px: Float
+    rms_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hysteresis:
+    """Of one session. gaps: of each set-point that was reached from below and from above. largest_px, rms_px (2,): of
+    the gaps along I and J. area_px_K (2,): between the branches. range_px (2,): of the whole drift. closure_px (2,):
+    last visit of the reference set-point minus the first, NaN when there was only one. repeatability_px (2,): standard
+    deviation of visits of the same set-point from the same side, NaN when none was repeated."""
+
+    session_id: str
+    gaps: tuple[Gap, ...]
+    range_px: Float
+    closure_px: Float
+    repeatability_px: Float
+
+    @property
+    def largest_px(self) -> Float:
+        """(2,): NaN without gaps."""
+        return np.abs(self._differences()).max(axis=0, initial=-np.inf) if self.gaps else np.full(2, np.nan)
+
+    @property
+    def rms_px(self) -> Float:
+        """(2,): NaN without gaps."""
+        return np.sqrt((self._differences() ** 2).mean(axis=0)) if self.gaps else np.full(2, np.nan)
+
+    @property
+    def area_px_K(self) -> Float:
+        """(2,): the integral of the absolute gap over the set-points; 0 with fewer than two."""
+        temperatures = np.array([gap.chamber_degC for gap in self.gaps])
+        return np.asarray(np.trapezoid(np.abs(self._differences()), temperatures, axis=0)).reshape(-1)
+
+    def _differences(self) -> Float:
+        return np.array([gap.difference_px for gap in self.gaps]).reshape(-1, 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Visit:
+    """Mean place relative to the reference of each marker (N, 2) and its variance; NaN for one not seen. from_below:
+    None for the first visit, which came from nowhere."""
+
+    chamber_degC: float
+    from_below: bool | None
+    place_px: Float
+    variance_px2: Float
+
+
+def hysteresis(observations: Observations, model: DriftModel | None = None) -> tuple[Hysteresis, ...]:
+    """Of each session that has reference frames; after compensation with `model`, before it without."""
+    found: list[Hysteresis] = []
+    for index, facts in enumerate(observations.sessions):
+        own = observations.of(*_CYCLE) & (observations.session == index)
+        if (own & observations.of(Role.REFERENCE)).any():
+            found.append(_of_session(facts.session_id, _visits(observations, own, model)))
+    return tuple(found)
+
+
+def _visits(observations: Observations, own: Mask, model: DriftModel | None) -> list[_Visit]:
+    """In order of time; frames of one set-point that follow each other are a visit."""
+    rows = displacements(observations, own)
+    place = -rows.displacement_px
+    if model is not None:
+        states = frame_states(observations, model.memory)
+        place = place + model.shift(rows.measured_px, states.where(rows.frame))
+    shape = (len(observations.frame), observations.target.count, 2)
+    of_frame, variance = np.full(shape, np.nan), np.full(shape, np.nan)
+    of_frame[rows.frame, rows.marker], variance[rows.frame, rows.marker] = place, rows.variance_px2
+    visits: list[_Visit] = []
+    for chamber_degC, group in groupby(np.flatnonzero(own).tolist(), key=lambda k: float(observations.chamber_degC[k])):
+        frames = np.array(list(group))
+        before = visits[-1].chamber_degC if visits else None
+        mean, uncertain = _mean(of_frame[frames], variance[frames])
+        visits.append(_Visit(chamber_degC, None if before is None else chamber_degC > before, mean, uncertain))
+    return visits
+
+
+def _mean(values: Float, variance: Float) -> tuple[Float, Float]:
+    """Over the frames that have the marker."""
+    count = np.isfinite(values).sum(axis=0)
+    safe = np.maximum(count, 1)
+    mean = np.where(count > 0, np.nansum(values, axis=0) / safe, np.nan)
+    return mean, np.where(count > 0, np.nansum(variance, axis=0) / safe**2, np.nan)
+
+
+def _of_session(session_id: str, visits: list[_Visit]) -> Hysteresis:
+    centres = np.array([np.nanmean(visit.place_px, axis=0) for visit in visits])
+    reference = [visit for visit in visits if visit.chamber_degC == visits[0].chamber_degC]
+    closure = reference[-1].place_px - reference[0].place_px
+    return Hysteresis(
+        session_id=session_id,
+        gaps=tuple(_gaps(visits)),
+        range_px=np.ptp(centres, axis=0),
+        closure_px=np.nanmean(closure, axis=0) if len(reference) > 1 else np.full(2, np.nan),
+        repeatability_px=_repeatability_px(visits),
+    )
+
+
+def _gaps(visits: list[_Visit]) -> Iterator[Gap]:
+    """By set-point, the mean of the visits from below minus that of the visits from above."""
+    for chamber_degC in sorted({visit.chamber_degC for visit in visits}):
+        sides = [
+            [visit for visit in visits if visit.chamber_degC == chamber_degC and visit.from_below is side]
+            for side in (True, False)
+        ]
+        if all(sides):
+            up, down = (np.mean([visit.place_px for visit in side], axis=0) for side in sides)
+            variance = sum(np.sum([visit.variance_px2 for visit in side], axis=0) / len(side) ** 2 for side in sides)
+            yield _gap(chamber_degC, up - down, np.asarray(variance))
+
+
+def _gap(chamber_degC: float, difference: Float, variance: Float) -> Gap:
+    seen: NDArray[np.bool_] = np.isfinite(difference[:, 0])
+    return Gap(
+        chamber_degC=chamber_degC,
+        difference_px=difference[seen].mean(axis=0),
+        uncertainty_px=np.sqrt(variance[seen].sum(axis=0)) / max(int(seen.sum()), 1),
+        rms_px=float(np.sqrt((difference[seen] ** 2).mean())),
+    )
+
+
+def _repeatability_px(visits: list[_Visit]) -> Float:
+    """From the differences of all pairs of visits of the same set-point from the same side."""
+    pairs = [
+        np.nanmean(one.place_px - other.place_px, axis=0)
+        for one, other in combinations(visits, 2)
+        if (one.chamber_degC, one.from_below) == (other.chamber_degC, other.from_below)
+    ]
+    return np.sqrt(np.mean(np.square(pairs), axis=0) / 2) if pairs else np.full(2, np.nan)

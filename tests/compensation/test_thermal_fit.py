@@ -1,0 +1,174 @@
+"""The thermal form against cameras of heat reservoirs that share no code with it: what it gains, and what it says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensation.drift.choosing import fit
+from compensation.drift.drift_model import DriftModel, Outside
+from compensation.drift.history import states_at
+from compensation.drift.model_file import load_model, save_model
+from compensation.drift.paper_fit import fit_paper
+from compensation.drift.states import States, ThermalState
+from compensation.drift.terms import Kind
+from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.training import frame_states
+from compensation.drift.validation import evaluate
+from compensation.observations import Observations, Role, concatenate
+from drivers.interface import SessionError
+
+from .reservoirs import cycle, reference, session, warm_up
+from .synthetic import observations as without_histories
+from .synthetic import quadratic
+
+Seen = tuple[Observations, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def night() -> Seen:
+    return session(warm_up(24.0) + reference() + cycle())
+
+
+@pytest.fixture(scope="module")
+def thermal(night: Seen) -> ThermalModel:
+    return fit_thermal(night[0])
+
+
+def left_mpx(model: DriftModel, seen: Seen, role: Role, reference_px: np.ndarray | None = None) -> float:
+    """RMS of both coordinates against the noise-free truth, pooled."""
+    observed, truth = seen
+    at_reference = truth[observed.of(Role.REFERENCE)].mean(axis=0) if reference_px is None else reference_px
+    states = frame_states(observed, model.memory)
+    frames = np.flatnonzero(observed.of(role))
+    left = [at_reference - model.correct(truth[frame], states.where(np.array([frame]))) for frame in frames]
+    return 1e3 * float(np.sqrt(np.mean(np.square(left))))
+
+
+def test_a_polynomial_of_the_temperature_is_limited_by_the_lag_and_the_thermal_form_is_not(
+    night: Seen, thermal: ThermalModel
+):
+    for degree in (2, 4):
+        assert left_mpx(fit_paper(night[0], degree), night, Role.VALIDATION) > 8.0
+    assert left_mpx(thermal, night, Role.VALIDATION) <= 2.0
+
+
+def test_what_is_asked_for_without_a_form_is_the_one_that_predicts_better(night: Seen):
+    model = fit(night[0])
+    assert model.form == "thermal"
+    assert {one.form for one in model.candidates} == {"paper", "thermal"}
+    assert [one.form for one in model.candidates if one.chosen] == ["thermal"]
+    assert all(one.bic is not None and np.isfinite(one.bic) for one in model.candidates if one.form == "thermal")
+    assert fit(night[0], form="paper").form == "paper"
+    assert fit(night[0], degree=2).form == "paper"
+    assert fit(without_histories(quadratic, 0.005)).form == "paper"
+
+
+@pytest.mark.parametrize("air_degC", [15.0, 34.0])
+def test_a_warm_up_elsewhere_is_predicted_when_one_was_recorded_and_not_otherwise(
+    night: Seen, thermal: ThermalModel, air_degC: float
+):
+    elsewhere = session(reference() + warm_up(air_degC), seed=3)
+    assert left_mpx(thermal, elsewhere, Role.WARM_UP) <= 3.0
+    untaught = fit_thermal(session(reference() + cycle())[0])
+    assert not untaught.has_warm_up
+    assert not any(term.kind is Kind.POWER_LAG for term in untaught.terms)
+    assert "no warm-up was recorded" in untaught.title
+    assert left_mpx(untaught, elsewhere, Role.WARM_UP) > 3 * left_mpx(thermal, elsewhere, Role.WARM_UP)
+
+
+def test_plays_help_a_camera_with_play_and_are_not_taken_for_one_without(thermal: ThermalModel):
+    loose = session(warm_up(24.0) + reference() + cycle(), plays=True)
+    model = fit_thermal(loose[0])
+    squares = {one.name: one.fold_squares.mean() for one in model.candidates}
+    assert squares["homography x (1, T, T^2), plays 3, 6, 10, 14 K"] < 0.5 * squares["homography x (1, T, T^2)"]
+    assert not any(term.kind is Kind.PLAY for term in thermal.terms)
+    assert left_mpx(fit_paper(loose[0], 4), loose, Role.VALIDATION) > 50.0
+    assert left_mpx(model, loose, Role.VALIDATION) <= 15.0
+
+
+def test_the_95_percent_interval_holds_95_percent_at_held_out_temperatures(night: Seen, thermal: ThermalModel):
+    for part in evaluate(thermal, night[0]).coverage_95:
+        assert 0.92 <= part <= 0.98
+
+
+def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(night: Seen, thermal: ThermalModel):
+    states = frame_states(night[0], thermal.memory)
+    usual = states.where(np.flatnonzero(night[0].of(Role.FIT))[:1])
+    hot = States.from_rows(usual.memory, usual.rows + np.where(np.arange(usual.rows.shape[1]) == 0, 60.0, 0.0))
+    points = np.array([[1200.0, 1000.0], [2200.0, 1600.0]])
+    near, far = thermal.covariance(points, usual), thermal.covariance(points, hot)
+    np.testing.assert_allclose(near, near.transpose(0, 2, 1), rtol=0, atol=1e-12)
+    assert (np.diagonal(near, axis1=1, axis2=2) >= thermal.discrepancy_px**2).all()
+    assert (np.trace(far, axis1=1, axis2=2) > 10 * np.trace(near, axis1=1, axis2=2)).all()
+
+
+def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
+    inside = night[0].of(Role.FIT, Role.VALIDATION, Role.WARM_UP)
+    states = frame_states(night[0], thermal.memory)
+    point = np.array([[1200.0, 1000.0]])
+    assert not any(thermal.flags(point, states.where(np.array([k])))[0] for k in np.flatnonzero(inside))
+    usual = states.where(np.flatnonzero(inside)[-1:])
+    assert thermal.flags(np.array([[20.0, 1000.0]]), usual)[0] == Outside.PLACE
+    for column, value, flag in ((0, 90.0, Outside.CAMERA), (1, 500.0, Outside.AMBIENT), (2, 0.0, Outside.SWITCHED_ON)):
+        rows = usual.rows.copy()
+        rows[0, column] = value
+        assert thermal.flags(point, States.from_rows(usual.memory, rows))[0] == flag
+    assert thermal.flags(point, 45.0)[0] & Outside.HISTORY
+    assert np.isnan(thermal.shift(point, 45.0)).all()
+
+
+def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, thermal: ThermalModel):
+    record = night[0].histories[0]
+    end = 2000
+    state = ThermalState(thermal.memory)
+    camera_degC = np.interp(record.ambient_ns, record.camera_ns, record.camera_degC)
+    off = ~np.isin(record.ambient_ns, record.camera_ns)
+    for index in range(1, end):
+        mean = (record.ambient_degC[index] + record.ambient_degC[index - 1]) / 2
+        told = np.nan if off[index] else camera_degC[index]
+        state.advance(10.0, mean, record.powered[index - 1], told)
+    at_ns = record.ambient_ns[end - 1 : end]
+    offline = states_at(record, thermal.memory, at_ns, camera_degC[end - 1 : end])
+    point = np.array([[1200.0, 1000.0]])
+    np.testing.assert_allclose(thermal.shift(point, state.states), thermal.shift(point, offline), atol=1e-6)
+
+
+def test_a_recorded_warm_up_of_its_own_teaches_too(thermal: ThermalModel):
+    alone = session(warm_up(24.0), seed=5, session_id="warm-up")
+    rest = session(reference() + cycle(), seed=6, session_id="cycle")
+    both = fit_thermal(concatenate([alone[0], rest[0]]))
+    assert both.has_warm_up
+    assert left_mpx(both, rest, Role.VALIDATION) <= 3.0
+    at_reference = rest[1][rest[0].of(Role.REFERENCE)].mean(axis=0)
+    assert left_mpx(both, alone, Role.WARM_UP, at_reference) <= 8.0
+
+
+def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, tmp_path: Path):
+    save_model(thermal, tmp_path / "model.json")
+    loaded = load_model(tmp_path / "model.json")
+    assert isinstance(loaded, ThermalModel)
+    for name in ThermalModel.__slots__:
+        if name != "valid":
+            np.testing.assert_equal(getattr(loaded, name), getattr(thermal, name), err_msg=name)
+    assert loaded.valid.__repr__() == thermal.valid.__repr__()
+    data = json.loads((tmp_path / "model.json").read_text())
+    assert (data["form"], data["schema_version"]) == ("thermal", 2)
+    (tmp_path / "model.json").write_text(json.dumps({**data, "reference_features": [0.0]}))
+    with pytest.raises(SessionError, match="reference_features: shape"):
+        load_model(tmp_path / "model.json")
+
+
+def test_what_the_thermal_form_needs_is_told(night: Seen):
+    with pytest.raises(SessionError, match="no history of the air"):
+        fit(without_histories(quadratic), form="thermal")
+    with pytest.raises(SessionError, match="has no degree"):
+        fit(night[0], degree=3, form="thermal")
+    silent = replace(night[0], air_degC=np.full(len(night[0].frame), np.nan))
+    with pytest.raises(SessionError, match="no air temperature"):
+        fit_thermal(silent)
