@@ -58,11 +58,12 @@ class Assembly:
         """The guard with the configured rules; on a fault it calls `stop`, or `hold` where waiting is enough."""
         limits, announced = self.config.guard, Announcements()
         self.hub.subscribe(announced.receive)
-        notifier = Notifier(limits.notify, limits.notify_limit_s, self.clock)
-        rules = watches(self.config, announced)
-        return Guard(
-            self.stand, rules, self.hub, self.clock, limits.period_s, limits.heater_renew_s, stop, hold, notifier
-        )
+        rules, renew_s = watches(self.config, announced), limits.heater_renew_s
+        return Guard(self.stand, rules, self.hub, self.clock, limits.period_s, renew_s, stop, hold, self.notifier())
+
+    def notifier(self) -> Notifier:
+        """Whoever is to be told when nobody is there."""
+        return Notifier(self.config.guard.notify, self.config.guard.notify_limit_s, self.clock)
 
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:

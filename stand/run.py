@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.clock import Clock, VirtualClock, WallClock, seconds_ns
-from drivers.interface import ConfigError, SessionError, StandError, Unreachable
+from drivers.interface import ConfigError, SessionError, StandError, StandTripped, Unreachable
 from stand.assembly import Assembly, assemble
-from stand.hub import Event, Hub
+from stand.hub import Event, Hub, Item
 from stand.performance import Performance, perform
 from stand.recording.recorder import Recorder
 from stand.recording.salvage import Salvaged, salvage_unfinished
@@ -157,13 +157,32 @@ async def _started(laboratory: Mapping[str, object], tries: int) -> Simulator:
             raise
 
 
-async def _run(job: _Job, clock: Clock, time: Callable[[], Coroutine[None, None, None]] | None, stop: Stop) -> Path:
-    hub = Hub()
+_Time = Callable[[], Coroutine[None, None, None]]
+
+
+async def _run(job: _Job, clock: Clock, time: _Time | None, stop: Stop) -> Path:
+    """The whole run; whoever is told of trips is told, too, of one that ends by itself before its plan is complete."""
+    hub, early = Hub(), _Early()
     job.watch(hub)
+    hub.subscribe(early)
     for segment in await job.salvaged():
         hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
     assembly = assemble(job.order.config, hub, clock)
     directory = job.directory(clock)
+    try:
+        recorder = await _performed(job, directory, assembly, time, stop, early)
+        _check_outcome(directory, recorder, assembly)
+    except Exception as error:
+        if stop.fault is None:  # else the guard has told, or the operator knows
+            await _tell_failure(assembly, directory.name, error)
+        raise
+    return directory
+
+
+async def _performed(
+    job: _Job, directory: Path, assembly: Assembly, time: _Time | None, stop: Stop, early: _Early
+) -> Recorder:
+    """From opening everything to closing it."""
     async with AsyncExitStack() as stack:
         background: list[asyncio.Task[None]] = []
         stack.push_async_callback(cancelled, background)
@@ -174,14 +193,44 @@ async def _run(job: _Job, clock: Clock, time: Callable[[], Coroutine[None, None,
         stack.push_async_callback(stop.settled)
         stop.watch(assembly.stand)
         await _opened(assembly, background, stop, camera_on=job.before is None or job.before.set_up.camera_on)
-        recorder = await _recording(job, directory, assembly, stop)
+        recorder = await _recording(job, directory, assembly, stop, early)
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording)
         tasks = (*background, recording)
         await perform(Performance(job.order, job.seed, job.before, job.begun, assembly, recorder, stop, tasks))
+    return recorder
+
+
+def _check_outcome(directory: Path, recorder: Recorder, assembly: Assembly) -> None:
+    """What is wrong with a run that has done its whole plan: nobody may take such a stand for safe, or such a session
+    for whole."""
+    if unsafe := assembly.stand.unconfirmed:
+        raise StandTripped(f"{directory}: complete, but NOT SAFE: {'; '.join(unsafe)}")
     if recorder.frames_lost:
         raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
-    return directory
+
+
+async def _tell_failure(assembly: Assembly, name: str, error: Exception) -> None:
+    unsafe = assembly.stand.unconfirmed
+    ending = f"; NOT SAFE: {'; '.join(unsafe)}" if unsafe and not isinstance(error, StandTripped) else ""
+    if failure := await assembly.notifier().tell(f"{name} has failed: {error or type(error).__name__}{ending}"):
+        assembly.hub.publish(Event(assembly.clock.now_ns(), "warning", "notify_failed", failure))
+
+
+class _Early:
+    """A subscriber that keeps the events from before there is a recorder."""
+
+    def __init__(self) -> None:
+        self._events: list[Event] | None = []
+
+    def __call__(self, item: Item) -> None:
+        if self._events is not None and isinstance(item, Event):
+            self._events.append(item)
+
+    def taken(self) -> tuple[Event, ...]:
+        """What there was; nothing is kept from now on."""
+        events, self._events = self._events or (), None
+        return tuple(events)
 
 
 async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop: Stop, *, camera_on: bool) -> None:
@@ -194,11 +243,11 @@ async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop
         raise
 
 
-async def _recording(job: _Job, directory: Path, assembly: Assembly, stop: Stop) -> Recorder:
+async def _recording(job: _Job, directory: Path, assembly: Assembly, stop: Stop, early: _Early) -> Recorder:
     """The recorder, started; a disk that refuses it leaves the stand safe, as everything after this does."""
     try:
         recorder = recorder_of(job.order, directory, job.info(directory, assembly), assembly)
-        recorder.start()
+        recorder.start(early.taken())
     except BaseException:
         stop.taking_down()
         await assembly.stand.make_safe()

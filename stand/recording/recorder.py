@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -95,8 +95,9 @@ class Recorder:
         """What has been acknowledged since `start`: it is on the disk and stays there."""
         return Saved(self._image_writer.saved, self._telemetry_writer.messages_saved, self._losses.total)
 
-    def start(self) -> None:
-        """Make the folders, begin the telemetry and listen to the hub; SessionError when the disk refuses."""
+    def start(self, earlier: Iterable[Item] = ()) -> None:
+        """Make the folders, begin the telemetry and listen to the hub; SessionError when the disk refuses. `earlier`:
+        what was published before, in its order, and belongs to the session."""
         try:
             for name in (FRAMES, TELEMETRY):
                 (self.directory / name).mkdir(parents=True, exist_ok=True)
@@ -108,6 +109,8 @@ class Recorder:
         self._frame_lane = Lane("record-frames", self._clock)
         self._telemetry_lane = Lane("record-telemetry", self._clock)
         self._taking = self._taking_frames = True
+        for item in earlier:
+            self._receive(item)
         self._hub.subscribe(self._receive)
 
     def _open_series(self) -> None:

@@ -1,0 +1,142 @@
+"""How runs end that nobody stopped: somebody is told, what was before the recording is in it, and nothing is left."""
+
+import asyncio
+import gc
+import json
+import os
+import signal
+import socket
+import threading
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from drivers.interface import DeviceFault, StandTripped
+from stand.config import StandConfig
+from stand.hub import Item, StepMark, StepState
+from stand.recording.session import Session
+from stand.run import Interrupted, run_real, run_virtual
+from stand.session_setup import Order
+from stand.simulator import Simulator
+from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.resume_process import Daemon
+from tests.system.test_guard_run import telling
+from tests.system.test_run import at_step, ignore
+
+SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+def break_now(order: Order, name: str, value: object) -> None:
+    """As `fault`, done when this returns."""
+    assert order.config.simulation is not None
+    host, port = order.config.simulation.control.removeprefix("tcp:").rsplit(":", 1)
+    with socket.create_connection((host, int(port))) as control, control.makefile("rwb") as lines:
+        lines.write(json.dumps({"do": "fault", "name": name, "value": value}).encode() + b"\n")
+        lines.flush()
+        assert b"error" not in lines.readline()
+
+
+async def test_somebody_is_told_of_a_step_that_fails(tmp_path: Path, order: Callable[..., Order]):
+    told, ordered = tmp_path / "told", order(SHORTER)
+    watch = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
+    with pytest.raises(DeviceFault) as caught:
+        await run_virtual(telling(ordered, told), tmp_path / "out", None, watch)
+    (directory,) = (tmp_path / "out").iterdir()
+    assert told.read_text() == f"{directory.name} has failed: {caught.value}\n"
+
+
+async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_complete_run(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    told, ordered = tmp_path / "told", order(SHORTER, bus={"timeout_s": 0.1})
+    last = list(ordered.recipe.plan())[-1].step_id
+
+    def follow(item: Item) -> None:
+        if isinstance(item, StepMark) and item.step_id == last and item.state is StepState.DONE:
+            break_now(ordered, "bus.silent", True)
+
+    with pytest.raises(StandTripped, match="complete, but NOT SAFE: regulator did not confirm its safe state"):
+        await run_virtual(telling(ordered, told), tmp_path / "out", None, lambda hub: hub.subscribe(follow))
+    (line,) = told.read_text().splitlines()
+    assert line.count("NOT SAFE") == 1
+
+
+async def test_nobody_is_told_of_a_run_that_the_operator_stopped(tmp_path: Path, order: Callable[..., Order]):
+    told = tmp_path / "told"
+    stop = at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):
+        await run_virtual(telling(order(SHORTER), told), tmp_path / "out", None, stop)
+    assert not told.exists()
+
+
+async def test_what_happened_before_the_recording_began_is_in_it(tmp_path: Path, order: Callable[..., Order]):
+    ordered, out = order(SHORTER), tmp_path / "out"
+    daemon = Daemon(ordered, out)
+    assert daemon.lives_for(1, "StepMark")
+    daemon.kill()
+    (killed,) = out.iterdir()
+    with pytest.raises(Interrupted):
+        await run_virtual(ordered, out, None, at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT)))
+    (directory,) = set(out.iterdir()) - {killed}
+    events = Session.open(directory).events()
+    assert [event.kind for event in events[:1]] == ["salvaged"]
+    assert killed.name in events[0].text
+    assert events[0].time_ns < next(event.time_ns for event in events if event.kind == "run.start")
+
+
+def held_now() -> dict[str, object]:
+    """What a run could leave behind: tasks, threads other than those of the loop's own pool, and open files."""
+    gc.collect()
+    files = Counter[str]()
+    for number in os.listdir("/proc/self/fd"):
+        with suppress(FileNotFoundError):  # of this listing itself
+            files[os.readlink(f"/proc/self/fd/{number}").split(":")[0]] += 1
+    return {
+        "tasks": {task.get_name() for task in asyncio.all_tasks()} - {asyncio.current_task().get_name()},
+        "threads": {thread.name for thread in threading.enumerate() if not thread.name.startswith("asyncio_")},
+        "files": files,
+        "signals": [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)],
+    }
+
+
+async def test_a_run_leaves_nothing_behind_however_it_ends(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order(SHORTER)
+    interrupt = at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):  # the first one loads what stays
+        await run_virtual(ordered, tmp_path / "first", None, interrupt)
+    before = held_now()
+    await run_virtual(ordered, tmp_path / "complete", None, ignore)
+    assert held_now() == before
+    stop = at_step("Capture", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):
+        await run_virtual(ordered, tmp_path / "stopped", None, stop)
+    assert held_now() == before
+    broken = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
+    with pytest.raises(DeviceFault):
+        await run_virtual(ordered, tmp_path / "failed", None, broken)
+    assert held_now() == before
+
+
+@pytest.mark.nightly
+async def test_a_run_in_real_time_leaves_no_thread_behind(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[[StandConfig, bool], Simulator]
+):
+    ordered = order(SHORTER, camera={"boot_s": 0.5})
+    await asyncio.to_thread(simulator, ordered.config, False)
+    stop = at_step("MoveTo", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):
+        await run_real(ordered, tmp_path / "first", stop)
+    before = held_now()
+    stop = at_step("MoveTo", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):
+        await run_real(ordered, tmp_path / "second", stop)
+    assert held_now() == before
+    assert not [name for name in before["threads"] if name != "MainThread"]
