@@ -11,7 +11,6 @@ from compensation.drift.displacements import Displacements, displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_fit import degrees_for, left_out, scaling_of
 from compensation.drift.paper_model import PaperModel
-from compensation.drift.states import States
 from compensation.drift.thermal_choice import left_out_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
@@ -41,7 +40,8 @@ class Evaluation:
     """Deviations of held-out centres from their reference positions, before and after compensation.
 
     method: what was held out, in words. frames: how many. before_px, after_px (M, 2): reference minus measured, and
-    reference minus corrected. outside (M,): beyond the model's valid range. coverage_95 (I, J): part of the deviations
+    reference minus corrected. rows: the M centres. claimed_px2 (M, 2): variance of the deviations after, as model and
+    markers claim it. outside (M,): beyond the model's valid range. coverage_95 (I, J): part of the deviations
     after that lie in the 95 % interval the model and the markers claim; 0.95 is right. temperatures: one per set-point.
     simulated: whether the frames are known to be of a simulated laboratory.
     """
@@ -49,8 +49,10 @@ class Evaluation:
     method: str
     held_out: bool
     frames: int
+    rows: Displacements
     before_px: Float
     after_px: Float
+    claimed_px2: Float
     outside: NDArray[np.bool_]
     coverage_95: tuple[float, float]
     temperatures: tuple[TemperatureRms, ...]
@@ -82,14 +84,17 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
         method = "no held-out frames: one temperature left out at a time"
     rows, after = _answered(rows, after)
     at_rows = states.where(rows.frame)
+    claimed = np.diagonal(model.covariance(rows.measured_px, at_rows), axis1=1, axis2=2) + rows.variance_px2
     return Evaluation(
         method=method,
         held_out=bool(frames.any()),
         frames=len(np.unique(rows.frame)),
+        rows=rows,
         before_px=rows.displacement_px,
         after_px=after,
+        claimed_px2=claimed,
         outside=~model.inside(rows.measured_px, at_rows),
-        coverage_95=_coverage(model, rows, at_rows, after),
+        coverage_95=_coverage(after, claimed),
         temperatures=_by_temperature(rows, after),
         simulated=observations.simulated,
     )
@@ -124,8 +129,7 @@ def _answered(rows: Displacements, after: Float) -> tuple[Displacements, Float]:
     return rows.where(known), after[known]
 
 
-def _coverage(model: DriftModel, rows: Displacements, states: States, after: Float) -> tuple[float, float]:
-    claimed = np.diagonal(model.covariance(rows.measured_px, states), axis1=1, axis2=2) + rows.variance_px2
+def _coverage(after: Float, claimed: Float) -> tuple[float, float]:
     inside = (np.abs(after) <= _SIGMA_95 * np.sqrt(claimed)).mean(axis=0)
     return float(inside[0]), float(inside[1])
 
