@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from compensation.drift.history import History, recorded_history
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
+from compensation.markers.noise import Noise, estimate_noise
 from compensation.target import Target
 from drivers.documents import parse_document
 from drivers.interface import Frame, SessionError
@@ -32,6 +34,7 @@ Mask = NDArray[np.bool_]
 Progress = Callable[[str, float], AbstractContextManager[Report]]
 """stand.progress.progress, or anything like it: (title, total) -> a context that yields report(done, text)."""
 
+_NOISE_FRAMES = 4
 _AIR_CHANNEL = "thermometers.air"
 _AIR_GAP_NS = 120_000_000_000
 """The air temperature is interpolated between readings this close together, and unknown elsewhere."""
@@ -123,6 +126,16 @@ def session_target(session: Session) -> Target:
     return parse_document(text, Target, f"{session.path}: target.yaml")
 
 
+def session_noise(session: Session) -> Noise | None:
+    """The camera's noise, from the first frames; None when they do not tell."""
+    try:
+        first = list(islice(session.frames(), _NOISE_FRAMES))
+    except SessionError:  # the search for the markers comes to the same frame, and tells where it is
+        return None
+    partial = [frame.windows for frame in first if frame.windows is not None]
+    return estimate_noise([frame.image for frame in first if frame.image.ndim == 2], partial[-1] if partial else None)
+
+
 def observe(
     session: Session, target: Target, finder: Finder | None = None, report: Report | None = None
 ) -> Observations:
@@ -131,7 +144,7 @@ def observe(
     A frame without the target, of another size or without a camera temperature stays, with its reason. SessionError
     when no frame can be used at all.
     """
-    pieces = pieces_of(session, target)
+    pieces = pieces_of(session, target, session_noise(session))
     total = sum(piece.frames for piece in pieces)
 
     def counted(done: int) -> None:

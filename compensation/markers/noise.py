@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """Grey image, shape (height, width), [row, column]."""
+Float = NDArray[np.float64]
+
+_DEPTHS_bit = (8, 10, 12, 14, 16)
+_BINS = 16
+_LEAST_PIXELS = 1000
+_EDGE_px = 7
+_FLAT_PART = 0.02
+_FLAT_SIGMA = 0.5
+_ROUNDING_DN2 = 1 / 12
+_TINY_DN = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +44,74 @@ class Noise:
 
 
 def full_scale_DN(image: Image) -> int:
-    """Largest value a pixel can have: 255, or for 16 bits the smallest 2^k - 1 (k >= 8) not below the maximum."""
+    """Largest value a pixel can have: 255, or of 16 bits 2^k - 1 for the smallest k of `_DEPTHS_bit` that holds the
+    brightest pixel, as cameras fill them from below (Mono10, Mono12)."""
     if image.dtype == np.uint8:
         return 255
-    return max(255, (1 << int(image.max()).bit_length()) - 1)
+    brightest = int(image.max())
+    return next((1 << depth) - 1 for depth in _DEPTHS_bit if brightest < 1 << depth)
+
+
+def estimate_noise(images: Sequence[Image], windows: NDArray[np.int32] | None = None) -> Noise | None:
+    """The photon-transfer curve of a camera from images of the same scene: the variance of pixels against their mean.
+
+    Half the variance of the difference between two images; of neighbours in a row, so that light which changed evenly
+    does not count. Pixels near edges, which drift, and saturated ones are left out. windows: x, y, width, height
+    (n, 4) of the parts that are images at all. None when there are fewer than two images of one shape and type, or
+    too few such pixels.
+    """
+    pairs = [
+        _pair(one, two, windows) for one, two in pairwise(images) if (one.shape, one.dtype) == (two.shape, two.dtype)
+    ]
+    if not pairs:
+        return None
+    signal, noise = (np.concatenate(values) for values in zip(*pairs, strict=True))
+    if len(signal) < _LEAST_PIXELS:
+        return None
+    bins = np.array_split(np.argsort(signal, kind="stable"), _BINS)
+    means = np.array([signal[part].mean() for part in bins])
+    variances = np.maximum([_clipped_variance(noise[part]) for part in bins], _ROUNDING_DN2)
+    return _line(means, variances)
+
+
+def _pair(one: Image, two: Image, windows: NDArray[np.int32] | None) -> tuple[Float, Float]:
+    """Signal, and a sample of the noise of one pixel, for pairs of neighbours on even ground."""
+    mean = cv2.blur(cv2.addWeighted(one, 0.5, two, 0.5, 0, dtype=cv2.CV_32F), (5, 5))
+    box = np.ones((_EDGE_px, _EDGE_px), np.uint8)
+    change = cv2.dilate(mean, box) - cv2.erode(mean, box)
+    flat = change < _FLAT_PART * float(mean.max() - mean.min()) + _FLAT_SIGMA * float(np.sqrt(np.median(mean) + 1))
+    flat &= np.maximum(one, two) < full_scale_DN(one) - 1
+    if windows is not None:
+        inside = np.zeros(one.shape, bool)
+        for x, y, width, height in windows:
+            inside[y : y + height, x : x + width] = True
+        flat &= inside
+    even = slice(0, one.shape[1] // 2 * 2, 2)
+    odd = slice(1, one.shape[1] // 2 * 2, 2)
+    chosen = flat[:, even] & flat[:, odd]
+    difference = one.astype(np.float32) - two
+    return (
+        mean[:, even][chosen].astype(np.float64),
+        0.5 * (difference[:, even][chosen] - difference[:, odd][chosen]).astype(np.float64),
+    )
+
+
+def _clipped_variance(values: Float) -> float:
+    """Variance without what is beyond five standard deviations: a hot pixel, a moving speck of dust."""
+    for _ in range(2):
+        values = values[np.abs(values) <= 5 * values.std() + _TINY_DN]
+    return float(np.mean(values**2))
+
+
+def _line(means: Float, variances: Float) -> Noise:
+    """The straight line through the variances, each as uncertain as it is large; neither part is below what it can
+    be."""
+    weight = 1 / variances
+    design = np.stack([np.ones_like(means), means], axis=1) * weight[:, None]
+    floor, slope = np.linalg.lstsq(design, variances * weight, rcond=None)[0]
+    if slope < 0:
+        return Noise(float(np.mean(variances)), 0.0)
+    if floor < _ROUNDING_DN2:
+        through = np.sum((variances - _ROUNDING_DN2) * means * weight**2) / max(np.sum((means * weight) ** 2), _TINY_DN)
+        return Noise(_ROUNDING_DN2, max(float(through), 0.0))
+    return Noise(float(floor), float(slope))

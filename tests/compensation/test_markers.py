@@ -115,6 +115,31 @@ def test_glare_on_an_outline_flags_that_marker_and_no_other():
     assert not np.delete(found.flags, 30).any()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_no_marker_that_glare_or_an_occluder_spoils_is_silently_wrong(seed: int):
+    """Four glare spots of 2..600 DN and four straight occluders at random places round random outlines: whatever is
+    more than 5 of its own sigmas off is flagged, and untouched markers are not."""
+    rng = np.random.default_rng(seed)
+    image, truth = half_frame().copy(), true_centres_px(HALF)
+    v, u = np.indices(image.shape)
+    hit = rng.choice(54, 8, replace=False)
+    for n in hit[:4]:
+        angle, away, width = rng.uniform(0, 2 * np.pi), rng.uniform(8, 32), rng.uniform(2, 14)
+        x, y = truth[n] + away * np.array([np.cos(angle), np.sin(angle)])
+        image += 10 ** rng.uniform(0.3, 2.8) * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * width**2))
+    for n in hit[4:]:
+        angle, x, y = rng.uniform(0, 2 * np.pi), *truth[n]
+        beyond = (u - x) * np.cos(angle) + (v - y) * np.sin(angle) > rng.uniform(5, 16)
+        image[beyond & (np.hypot(u - x, v - y) < 40)] = rng.uniform(50, 150)
+    found = detect(photograph(HALF, image, seed), PAPER, detect(photograph(HALF, half_frame(), 9), PAPER), CAMERA)
+    clean = np.flatnonzero(found.flags == 0)
+    error = (found.centres_px - truth)[clean]
+    sigmas = np.sqrt(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[clean]), error))
+    assert sigmas.max() < 5
+    assert not np.delete(found.flags, hit).any()
+    assert found.flags[hit].astype(bool).sum() >= 4
+
+
 def test_without_a_noise_model_the_covariance_comes_from_the_residuals():
     image = photograph(HALF, half_frame(), 3)
     told, untold = detect(image, PAPER, noise=CAMERA), detect(image, PAPER, noise=Noise(4 * (1 + 1 / 12), 4 / 40))
