@@ -28,13 +28,17 @@ def disc_centres_px(detection: Detection, target: Target) -> Float:
     Right for a lens without distortion; with one (k1 = -0.15) some mpx are left, and `ellipse_centre_offset_px` of the
     calibrated camera is the better way.
     """
-    target_mm, radii_mm = target.coordinates_mm(), target.diameters_mm() / 2
-    seen = np.isfinite(detection.centres_px[:, 0])
-    centres_px = detection.centres_px.copy()
+    return disc_centres_by_homography_px(detection.centres_px, target.coordinates_mm(), target.diameters_mm() / 2)
+
+
+def disc_centres_by_homography_px(ellipses_px: Float, target_mm: Float, radii_mm: Float) -> Float:
+    """The same from the ellipses' centres (N, 2), px, of discs at (N, 2) mm of the target's plane, radii (N,) mm."""
+    seen = np.isfinite(ellipses_px[:, 0])
+    centres_px = ellipses_px
     for _ in range(_ROUNDS):  # the homography is that of the centres that are being corrected with it
         homography = fit_homography(target_mm[seen], centres_px[seen])
         middle_px = project(homography, target_mm)
-        centres_px = detection.centres_px + middle_px - ellipse_centres_px(homography, target_mm, radii_mm)
+        centres_px = ellipses_px + middle_px - ellipse_centres_px(homography, target_mm, radii_mm)
     return centres_px
 
 
@@ -48,7 +52,7 @@ def ellipse_centres_px(homography: Float, centres_mm: Float, radii_mm: Float) ->
     circle[:, 2, 2] = x**2 + y**2 - radii_mm**2
     back = np.linalg.inv(homography)
     conic = back.T @ circle @ back
-    return np.asarray(-np.linalg.solve(conic[:, :2, :2], conic[:, :2, 2, None])[:, :, 0], dtype=np.float64)
+    return np.asarray(-np.linalg.solve(conic[:, :2, :2], conic[:, :2, 2, None])[:, :, 0], np.float64)
 
 
 def ellipse_centre_offset_px(to_image: Callable[[Float], Float], target: Target) -> Float:
@@ -61,8 +65,15 @@ def ellipse_centre_offset_px(to_image: Callable[[Float], Float], target: Target)
     outlines_mm = centres_mm[:, None] + target.diameters_mm()[:, None, None] / 2 * circle
     outlines_px = to_image(outlines_mm.reshape(-1, 2)).reshape(outlines_mm.shape)
     middles_px = to_image(centres_mm)
-    one = outlines_px - middles_px[:, None]
-    next_ = np.roll(one, -1, axis=1)
-    cross = one[:, :, 0] * next_[:, :, 1] - next_[:, :, 0] * one[:, :, 1]
-    centroids = ((one + next_) * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None]
+    return centroid_offsets_px(outlines_px, middles_px)
+
+
+def centroid_offsets_px(outlines_px: Float, middles_px: Float) -> Float:
+    """Centroids of polygons (..., K, 2) less the points (..., 2) in them, by Green's theorem:
+    (sum (p_i + p_i+1) c_i) / (3 sum c_i), c_i = x_i y_i+1 - x_i+1 y_i, about the point so that the products are small.
+    """
+    one = outlines_px - middles_px[..., None, :]
+    next_ = np.roll(one, -1, axis=-2)
+    cross = one[..., 0] * next_[..., 1] - next_[..., 0] * one[..., 1]
+    centroids = ((one + next_) * cross[..., None]).sum(axis=-2) / (3 * cross.sum(axis=-1))[..., None]
     return np.asarray(centroids, dtype=np.float64)
