@@ -18,8 +18,9 @@ from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 
-# Between the two cameras, px: the modified one stays below these RMS along I and J, the unmodified one above. Measured:
-# (0.227, 0.630) and (0.395, 1.128) before compensation, (0.005, 0.031) and (0.130, 0.218) after.
+# Between the two cameras, px: before compensation the modified one stays below these RMS along I and J, the unmodified
+# one above: (0.227, 0.630) and (0.395, 1.128). After it the modified one stays below AFTER_PX, the unmodified one below
+# its larger part.
 BEFORE_PX = (0.31, 0.88)
 AFTER_PX = (0.02, 0.1)
 
@@ -55,9 +56,9 @@ async def test_the_demo_is_the_same_twice_and_compensation_gains(tmp_path: Path,
         assert evaluation.rms_after_px[axis] <= AFTER_PX[axis]
 
 
-async def test_the_unmodified_camera_drifts_more_and_its_hysteresis_stays(tmp_path: Path, order: Callable[..., Order]):
+async def test_the_unmodified_camera_drifts_more_and_is_compensated_too(tmp_path: Path, order: Callable[..., Order]):
     ordered = order(packaged("recipes", "demo").read_text(), simulation={"camera": "unmodified"})
     evaluation = score(await night(ordered, tmp_path / "out"))
     for axis in (0, 1):
         assert evaluation.rms_before_px[axis] > BEFORE_PX[axis]
-    assert evaluation.rms_after_px[1] > AFTER_PX[1]
+        assert evaluation.rms_after_px[axis] <= AFTER_PX[1]
