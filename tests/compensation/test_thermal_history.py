@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from compensation.drift.history import History, refined, states_at
+from compensation.drift.lags import played
 from compensation.drift.states import Memory, States, ThermalState
 
 S = 1_000_000_000
@@ -110,3 +111,11 @@ def test_a_display_in_quarters_is_refined_between_its_steps():
     assert np.abs(record.camera_degC - told).max() <= 0.125 + 1e-9
     fine = History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, true)
     np.testing.assert_array_equal(refined(fine).camera_degC, true)
+
+
+def test_a_play_stays_until_it_is_pushed_from_either_side():
+    radii = np.array([1.0, 3.0])
+    places = [np.zeros(2)]
+    for driver in (0.5, 5.0, 3.5, -2.0):
+        places.append(played(places[-1], driver, radii))
+    assert [place.tolist() for place in places[1:]] == [[0, 0], [4, 2], [4, 2], [-1, 1]]
