@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from compensation.apply_cli import apply_model, export_model
 from compensation.budget_cli import budget_of_session
 from compensation.calibration_cli import calibrate_session
 from compensation.command_line import TargetOption, installed_target, named_target, one_line_errors
@@ -56,6 +57,8 @@ _DEFAULT_TARGET = "paper-9x6"
 
 app.command("budget")(budget_of_session)
 app.command("calibrate")(calibrate_session)
+app.command("apply")(apply_model)
+app.command("export")(export_model)
 
 
 @app.command("detect")

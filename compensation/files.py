@@ -19,6 +19,14 @@ def write_whole(path: Path, text: str) -> None:
         file.write(text)
 
 
+def write_whole_bytes(path: Path, data: bytes) -> None:
+    """As `write_whole`, for what is no text."""
+    with _placed(path) as temporary, temporary.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 @contextmanager
 def whole_file(path: Path) -> Generator[TextIO]:
     """A text file (UTF-8, line ends as written) that takes its place when the block ends well.
@@ -26,13 +34,19 @@ def whole_file(path: Path) -> Generator[TextIO]:
     Until then, and for good when the block raises, an older file stays as it was and nothing else is left behind.
     SessionError when the place refuses.
     """
+    with _placed(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def _placed(path: Path) -> Generator[Path]:
+    """A temporary file beside `path` that replaces it when the block ends well."""
     _check_place(path)
     temporary = _temporary(path)
     try:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield temporary
         temporary.chmod(0o644)
         _check_place(path)
         temporary.replace(path)

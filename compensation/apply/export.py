@@ -1,0 +1,74 @@
+"""A drift model for other people's programs: a small JSON file and a module that needs numpy and nothing else."""
+
+from __future__ import annotations
+
+import importlib.resources
+import json
+import math
+from pathlib import Path
+
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.paper_model import PaperModel
+from compensation.drift.polynomial import exponents
+from compensation.drift.thermal_model import ThermalModel
+from compensation.files import write_whole
+from drivers.interface import SessionError
+
+MODEL_NAME, MODULE_NAME = "drift.json", "drift_runtime.py"
+
+
+def export(model: DriftModel, folder: Path) -> tuple[Path, Path]:
+    """Write drift.json and drift_runtime.py into `folder`, made when it is missing; each whole or not at all.
+
+    SessionError when the place refuses.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SessionError(f"{folder}: cannot be made ({error.strerror})") from error
+    written = folder / MODEL_NAME, folder / MODULE_NAME
+    module = importlib.resources.files("compensation.apply") / MODULE_NAME
+    write_whole(written[0], json.dumps(runtime_model(model), indent=1, allow_nan=False) + "\n")
+    write_whole(written[1], module.read_text(encoding="utf-8"))
+    return written
+
+
+def runtime_model(model: DriftModel) -> dict[str, object]:
+    """What drift_runtime.Drift takes, as JSON values: no covariance; discrepancy_px is one standard deviation of the
+    correction inside the calibrated range."""
+    common: dict[str, object] = {
+        "format": "thermostand drift runtime",
+        "version": 1,
+        "form": model.form,
+        "camera_serial": model.camera_serial,
+        "software_version": model.software_version,
+        "image_size_px": model.image_size,
+        "camera_range_degC": model.camera_range_degC,
+        "reference_degC": model.reference_degC,
+        "discrepancy_px": model.discrepancy_px.tolist(),
+        "hull_px": model.hull_px.tolist(),
+    }
+    match model:
+        case PaperModel():
+            of_form = {"terms_abc": exponents(model.degree), "coefficients_px": model.coefficients.tolist()}
+        case ThermalModel():
+            of_form = _thermal(model)
+        case _:
+            raise TypeError(f"no runtime for a model of form {model.form}")
+    return {**common, **of_form}
+
+
+def _thermal(model: ThermalModel) -> dict[str, object]:
+    memory, valid = model.memory, model.valid
+    return {
+        "terms": [[str(term.kind), term.parameter] for term in model.terms],
+        "taus_s": memory.taus_s,
+        "plays_K": memory.plays_K,
+        "self_heating_K": memory.self_heating_K,
+        "reference_ambient_degC": model.origin.ambient_degC,
+        "reference_features": model.reference_features.tolist(),
+        "coefficients_px": model.coefficients.tolist(),
+        "ambient_range_degC": valid.ambient_degC,
+        "rate_range_K_per_h": valid.rate_K_per_h,
+        "least_on_s": None if math.isinf(valid.least_on_s) else valid.least_on_s,
+    }

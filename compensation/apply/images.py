@@ -1,0 +1,58 @@
+"""Images, of files or of a session's frames, as they would have been at the reference temperature."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.apply.spline import Image
+from compensation.apply.warp import warp
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.lags import Float
+from compensation.drift.states import States
+from compensation.files import write_whole_bytes
+from drivers.interface import SessionError
+
+Form = Literal["tiff", "png"]
+
+
+def corrected_image(image: Image, model: DriftModel, states: States) -> NDArray[np.float32]:
+    """The grey image (height, width) at the reference, float32, for one thermal state; SessionError when it is not of
+    the model's size, or when the state does not tell the drift."""
+    height, width = image.shape
+    if (width, height) != model.image_size:
+        raise SessionError(
+            f"the image has {width} x {height} pixels, the model is of {model.image_size[0]} x {model.image_size[1]}"
+        )
+
+    def shift(xy_px: Float) -> Float:
+        return model.shift(xy_px, states)
+
+    try:
+        return warp(image, shift)
+    except ValueError as error:
+        raise SessionError(
+            f"the camera's thermal state is not known well enough for a model of the form {model.form}: {error}"
+        ) from error
+
+
+def middle_flags(model: DriftModel, states: States) -> int:
+    """Why the correction at the middle of the image is an extrapolation (Outside), 0 when it is not."""
+    width, height = model.image_size
+    return int(model.flags(np.array([[(width - 1) / 2, (height - 1) / 2]]), states)[0])
+
+
+def write_image(path: Path, image: NDArray[np.float32], form: Form, dtype: np.dtype[np.generic]) -> None:
+    """tiff: float32 as it is. png: rounded to `dtype`, the original's. The file appears when it is complete;
+    SessionError when the place refuses."""
+    pixels: NDArray[np.generic] = image
+    if form == "png":
+        pixels = np.clip(np.round(image), 0, np.iinfo(dtype.name).max).astype(dtype)
+    done, data = cv2.imencode(f".{form}", pixels)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    if not done:
+        raise SessionError(f"{path}: the image cannot be written as {form}")
+    write_whole_bytes(path, data.tobytes())

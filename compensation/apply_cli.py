@@ -1,0 +1,168 @@
+"""`compensate apply` and `compensate export`: a drift model put to use."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from compensation.apply.export import export
+from compensation.apply.images import Form, corrected_image, middle_flags, write_image
+from compensation.apply.points import CAMERA, X, Y, numbers, outside_text, read_points, times, write_corrected
+from compensation.command_line import one_line_errors
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.history import recorded_history, states_at
+from compensation.drift.model_file import load_model
+from compensation.drift.states import States
+from compensation.files import check_writable, whole_file
+from compensation.markers.detection import read_image
+from drivers.interface import ConfigError, SessionError
+from stand.progress import progress
+from stand.recording.session import Session
+
+ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")]
+CameraOption = Annotated[
+    float | None, typer.Option("--camera-degC", help="The camera's own temperature, where nothing recorded tells it.")
+]
+INDEX_COLUMNS = ("image", "frame", "time_ns", "camera_degC", "outside")
+
+
+def apply_model(
+    model: ModelArgument,
+    source: Annotated[Path, typer.Argument(metavar="POINTS.csv|IMAGE|SESSION", help="What is to be corrected.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write; of a session a new folder.")],
+    session: Annotated[
+        Path | None, typer.Option(help="Of points with time_ns: the session that recorded the camera then.")
+    ] = None,
+    camera_degC: CameraOption = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="FIRST:END", help="Of a session: these frames, counted from 0, without END.")
+    ] = None,
+    form: Annotated[
+        Form, typer.Option("--format", help="Of images: tiff is float32, png rounded to the original's bits.")
+    ] = "tiff",
+) -> None:
+    """Put points or images where they would have been at the reference temperature.
+
+    A table gets columns: corrected place, covariance of the correction, and why it is an extrapolation, if it is. For
+    measurement correct points; images are for software that wants pixels.
+
+    Example: compensate apply model.json markers.csv --session sessions/20260101T180000Z-thermal-cycle -o corrected.csv
+    """
+    with one_line_errors():
+        used = load_model(model)
+        if source.is_dir():
+            _refuse(("--session", session), ("--camera-degC", camera_degC), why="a session tells its own temperatures")
+            _correct_session(used, Session.open(source), out, frames, form)
+        elif source.suffix.lower() == ".csv":
+            _refuse(("--frames", frames), why="it selects frames of a session")
+            check_writable(out)
+            _correct_points(used, source, out, session, camera_degC)
+        else:
+            _refuse(("--session", session), ("--frames", frames), why="one image has --camera-degC only")
+            if camera_degC is None:
+                raise ConfigError(f"{source}: give the camera's temperature with --camera-degC")
+            check_writable(out)
+            image = read_image(source)
+            states = States.at_degC(camera_degC, 1, used.memory)
+            write_image(out, corrected_image(image, used, states), form, image.dtype)
+            _warn(middle_flags(used, states))
+
+
+def export_model(
+    model: ModelArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder for drift.json and drift_runtime.py.")],
+) -> None:
+    """Write the model for other programs: a small JSON file, and a Python module that needs numpy only.
+
+    Example: compensate export model.json -o runtime
+    """
+    with one_line_errors():
+        for path in export(load_model(model), out):
+            typer.echo(path)
+
+
+def _refuse(*options: tuple[str, object], why: str) -> None:
+    given = [name for name, value in options if value is not None]
+    if given:
+        raise ConfigError(f"{given[0]} does not belong here: {why}")
+
+
+def _correct_points(
+    model: DriftModel, source: Path, out: Path, session: Path | None, camera_degC: float | None
+) -> None:
+    rows = read_points(source)
+    xy_px = np.column_stack([numbers(source, rows, X), numbers(source, rows, Y)])
+    if session is not None:
+        _refuse(("--camera-degC", camera_degC), why="the session tells it")
+        states = _recorded_states(model, Session.open(session), times(source, rows))
+    elif camera_degC is not None:
+        states = States.at_degC(camera_degC, len(rows), model.memory)
+    elif rows and CAMERA in rows[0]:
+        states = States.at_degC(numbers(source, rows, CAMERA), len(rows), model.memory)
+    else:
+        raise ConfigError(f"{source}: has no column {CAMERA}; give --session, or --camera-degC")
+    _check_known(model, xy_px, states)
+    write_corrected(out, rows, xy_px, model, states)
+    outside = int((model.flags(xy_px, states) != 0).sum())
+    if outside:
+        typer.echo(f"warning: {outside} of {len(rows)} points are outside the model's valid range", err=True)
+
+
+def _recorded_states(model: DriftModel, session: Session, time_ns: Sequence[int]) -> States:
+    """The thermal state at each instant, of which the same may come many times and in any order."""
+    told = {frame_ns: meta.camera_degC for frame_ns, meta in session.frame_metas}
+    instants, where = np.unique(np.array(time_ns, np.int64), return_inverse=True)
+    camera_degC = np.array([told.get(instant, math.nan) for instant in instants.tolist()])
+    return states_at(recorded_history(session), model.memory, instants, camera_degC).where(where)
+
+
+def _check_known(model: DriftModel, xy_px: np.ndarray[tuple[int, ...], np.dtype[np.float64]], states: States) -> None:
+    known = np.isfinite(xy_px).all(axis=1)
+    if known.any() and np.isnan(model.shift(xy_px, states)[known]).all():
+        raise ConfigError(
+            f"a model of the form {model.form} needs the thermal state, which nothing here tells; give --session"
+        )
+
+
+def _correct_session(model: DriftModel, session: Session, out: Path, frames: str | None, form: Form) -> None:
+    selected = _selected(frames, session.frame_count)
+    states = _recorded_states(model, session, session.frame_times_ns[selected.start : selected.stop].tolist())
+    try:
+        out.mkdir()
+    except OSError as error:
+        raise SessionError(f"{out}: cannot be made ({error.strerror}); images go into a new folder") from error
+    with progress("correct images", len(selected)) as report, whole_file(out / "images.csv") as index:
+        writer = csv.writer(index, lineterminator="\n")
+        writer.writerow(INDEX_COLUMNS)
+        for done, number in enumerate(selected):
+            frame, state = session.frame(number), states.where(np.array([done]))
+            name = f"{number:06d}.{form}"
+            write_image(out / name, corrected_image(frame.image, model, state), form, frame.image.dtype)
+            outside = outside_text(middle_flags(model, state))
+            writer.writerow((name, number, frame.time_ns, f"{frame.camera_degC:.3f}", outside))
+            report(done + 1, name)
+
+
+def _selected(frames: str | None, count: int) -> range:
+    """ConfigError when the text is no FIRST:END within the session."""
+    if frames is None:
+        return range(count)
+    first, colon, end = frames.partition(":")
+    numbers_given = all(text.isdecimal() or not text for text in (first, end))
+    if not colon or not numbers_given:
+        raise ConfigError(f"--frames {frames}: give FIRST:END, such as 0:10")
+    selected = range(int(first or 0), int(end or count))
+    if not selected or selected.stop > count:
+        raise ConfigError(f"--frames {frames}: the session has {count} frames, counted from 0")
+    return selected
+
+
+def _warn(flags: int) -> None:
+    if flags:
+        typer.echo(f"warning: outside the model's valid range ({outside_text(flags)})", err=True)
