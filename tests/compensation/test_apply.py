@@ -1,0 +1,279 @@
+"""A drift model put to use: tables, images, and a module for other people's programs, all as the model itself says."""
+
+import ast
+import csv
+import itertools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from compensation.apply.drift_runtime import Drift
+from compensation.apply.export import export, runtime_model
+from compensation.cli import app
+from compensation.drift.drift_model import DriftModel, Outside
+from compensation.drift.history import recorded_history, states_at
+from compensation.drift.model_file import save_model
+from compensation.drift.paper_model import DegreeScore, PaperModel
+from compensation.drift.polynomial import Scaling, exponents
+from compensation.drift.states import States, ThermalState
+from compensation.drift.terms import Kind, Origin, Term
+from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from compensation.markers.detection import detect
+from compensation.observations import session_target
+from stand.recording.session import Session
+
+from .conftest import Recorded
+
+SIZE = (640, 480)
+HULL = np.array([[50.0, 40.0], [600.0, 40.0], [600.0, 440.0], [50.0, 440.0]])
+COMMON = {
+    "hull_px": HULL,
+    "reference_chamber_degC": 24.0,
+    "reference_centres_px": np.array([[100.0, 90.0], [np.nan, np.nan]]),
+    "candidates": (),
+    "target_name": "small",
+    "camera_serial": "TS-0001",
+    "session_ids": ("night",),
+    "software_version": "0",
+}
+
+
+def paper(degree: int = 3) -> PaperModel:
+    rng, count = np.random.default_rng(degree), len(exponents(degree))
+    score = DegreeScore(
+        degree=degree, terms=count, condition=9.0, rms_px=(0.1, 0.1), fold_chamber_degC=(), fold_rms_px=()
+    )
+    return PaperModel(
+        degree=degree,
+        scaling=Scaling(SIZE, (30.0, 72.0)),
+        coefficients=rng.normal(0, 0.2, (2, count)),
+        coefficient_covariance=np.array([1e-6 * np.eye(count)] * 2),
+        discrepancy_px=np.array([0.02, 0.03]),
+        reference_degC=44.0,
+        scores=(score,),
+        **COMMON,
+    )
+
+
+def thermal(*, warmed: bool = True) -> ThermalModel:
+    """With a term of every kind."""
+    terms = (
+        *(Term(kind) for kind in (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE)),
+        *(Term(Kind.AMBIENT_LAG, tau_s) for tau_s in (600.0, 3600.0)),
+        *(Term(kind, 600.0) for kind in (Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE)),
+        Term(Kind.PLAY, 6.0),
+        Term(Kind.PLAY, 3.0),
+    )
+    rng = np.random.default_rng(7)
+    return ThermalModel(
+        terms=terms,
+        origin=Origin(44.0, 24.0),
+        self_heating_K=17.0,
+        reference_features=rng.normal(0, 0.1, len(terms)),
+        coefficients=rng.normal(0, 0.2, (8, len(terms))),
+        coefficient_covariance=1e-6 * np.eye(8 * len(terms)),
+        discrepancy_px=np.array([0.003, 0.004]),
+        valid=ThermalRange((25.0, 72.0), (10.0, 52.0), (-9.0, 9.0), 120.0 if warmed else np.inf),
+        has_warm_up=True,
+        image_size=SIZE,
+        **COMMON,
+    )
+
+
+MODELS = [pytest.param(paper(1), id="P1"), pytest.param(paper(4), id="P4"), pytest.param(thermal(), id="thermal"),
+          pytest.param(thermal(warmed=False), id="never switched on")]  # fmt: skip
+POINTS = np.random.default_rng(3).uniform((0, 0), SIZE, (40, 2))
+# dt_s, air, power, camera: a cold start, a ramp, a minute without power, a silent camera, a gap, a warm start.
+LIFE = [
+    *((10.0, 15.0, 1.0, 15.0 + 17 * (1 - np.exp(-k / 60))) for k in range(200)),
+    *((10.0, 15.0 + 0.1 * k, 1.0, 32.0 + 0.09 * k) for k in range(300)),
+    *((10.0, 45.0, 0.0, np.nan) for _ in range(6)),
+    (7.0, 45.0, 0.5, 50.0),
+    *((10.0, 40.0, 1.0, 55.0) for _ in range(30)),
+    (5.0, np.nan, 1.0, 50.0),
+    *((10.0, 24.0, 1.0, 44.0) for _ in range(1200)),
+]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(model: DriftModel, tmp_path: Path):
+    export(model, tmp_path / "new")
+    live, state = Drift.load(tmp_path / "new" / "drift.json"), ThermalState(model.memory)
+    assert np.isnan(live.correct(POINTS)).all()
+    seen = set()
+    for number, sample in enumerate(LIFE):
+        live.advance(*sample)
+        state.advance(*sample)
+        if number % 7 and not np.isnan(sample).any():
+            continue
+        states = state.states if model.form == "thermal" else States.at_degC(live._camera_degC, 1)
+        np.testing.assert_allclose(live.correct(POINTS), model.correct(POINTS, states), atol=1e-12)
+        np.testing.assert_array_equal(live.flags(POINTS), model.flags(POINTS, states))
+        seen |= set(live.flags(POINTS).tolist())
+    flags = Outside(0)
+    for found in seen:
+        flags |= Outside(found)
+    assert 0 in seen or (model.form == "thermal" and np.isinf(model.valid.least_on_s))
+    assert flags == (~Outside(0) if model.form == "thermal" else Outside.PLACE | Outside.CAMERA)
+
+
+def test_the_module_needs_numpy_only_and_runs_where_nothing_else_is(tmp_path: Path):
+    _, module = export(thermal(), tmp_path)
+    tree = ast.parse(module.read_text())
+    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    assert imported == {"json", "math", "numpy"}
+    assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
+    program = (
+        "import sys; sys.path[:0] = ['.']; from drift_runtime import Drift; d = Drift.load('drift.json');"
+        "[d.advance(10, 24.0, 1, 44.0) for _ in range(2000)]; print(d.correct([[320.5, 200.25]]).tolist());"
+        "assert not {'compensation', 'stand', 'scipy', 'cv2'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-I", "-c", program], cwd=tmp_path, capture_output=True, check=True)
+    state = ThermalState(thermal().memory)
+    for _ in range(2000):
+        state.advance(10, 24.0, 1, 44.0)
+    expected = thermal().correct(np.array([[320.5, 200.25]]), state.states)
+    np.testing.assert_allclose(json.loads(done.stdout), expected, atol=1e-9)
+
+
+def test_the_exported_file_is_small():
+    assert len(json.dumps(runtime_model(thermal()))) < 5000
+    assert len(json.dumps(runtime_model(paper(4)))) < 5000
+
+
+def test_a_file_that_is_no_runtime_model_is_refused():
+    with pytest.raises(ValueError, match="not a drift runtime model"):
+        Drift({"format": "thermostand drift model"})
+
+
+def run(*arguments: object, status: int = 0) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == status, result.output
+    return result.output
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    names = {"paper": paper(), "thermal": thermal()}
+    for name, model in names.items():
+        save_model(model, tmp_path / f"{name}.json")
+    return {name: tmp_path / f"{name}.json" for name in names}
+
+
+def test_a_table_gets_its_corrections_at_the_temperature_of_each_row(files: dict[str, Path], tmp_path: Path):
+    points, out = tmp_path / "points.csv", tmp_path / "out.csv"
+    points.write_text("name,x_px,y_px,camera_degC\na,100,200,40\nb,nan,200,40\nc,620.5,100,40\nd,100,200,\n")
+    printed = run("apply", files["paper"], points, "-o", out)
+    assert printed == "warning: 3 of 4 points are outside the model's valid range\n"
+    rows = table(out)
+    model, place = paper(), np.array([[100.0, 200.0]])
+    assert [rows[0][name] for name in ("name", "x_px", "camera_degC", "outside")] == ["a", "100", "40", ""]
+    expected = model.correct(place, 40.0)[0]
+    assert [float(rows[0][f"{axis}_reference_px"]) for axis in "xy"] == pytest.approx(expected, abs=1e-6)
+    variance = model.covariance(place, 40.0)[0, 0, 0]
+    assert float(rows[0]["var_x_correction_px2"]) == pytest.approx(variance, rel=1e-6)
+    assert [rows[index]["outside"] for index in (1, 2, 3)] == ["PLACE", "PLACE", "CAMERA"]
+    assert (rows[1]["x_reference_px"], rows[3]["y_reference_px"]) == ("nan", "nan")
+
+
+def test_the_markers_of_a_session_are_corrected_with_its_recorded_states(
+    recorded: Recorded, files: dict[str, Path], tmp_path: Path
+):
+    found, out = tmp_path / "found.csv", tmp_path / "out.csv"
+    run("detect", recorded.path, "-o", found)
+    for name, model in (("paper", paper()), ("thermal", thermal())):
+        run("apply", files[name], found, "--session", recorded.path, "-o", out)
+        rows, session = table(out), Session.open(recorded.path)
+        assert len(rows) == 54 * session.frame_count
+        frames = list(session.frames())
+        times_ns = np.array([frame.time_ns for frame in frames])
+        camera_degC = np.array([frame.camera_degC for frame in frames])
+        states = states_at(recorded_history(session), model.memory, times_ns, camera_degC)
+        for index in (4, 8, 15):
+            row = rows[54 * index + 7]
+            place = np.array([[float(row["x_px"]), float(row["y_px"])]])
+            expected = model.correct(place, states.where(np.array([index])))[0]
+            assert [float(row[f"{axis}_reference_px"]) for axis in "xy"] == pytest.approx(expected, abs=2e-6)
+
+
+def test_images_of_a_session_show_the_target_where_the_model_puts_it(
+    recorded: Recorded, files: dict[str, Path], tmp_path: Path
+):
+    out, session = tmp_path / "images", Session.open(recorded.path)
+    run("apply", files["paper"], recorded.path, "-o", out, "--frames", "6:8")
+    index = table(out / "images.csv")
+    assert [(row["image"], row["frame"]) for row in index] == [("000006.tiff", "6"), ("000007.tiff", "7")]
+    target = session_target(session)
+    for number in (6, 7):
+        frame = session.frame(number)
+        image = cv2.imread(str(out / f"{number:06d}.tiff"), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == np.float32
+        before = detect(frame.image, target).centres_px
+        after = detect(np.clip(np.round(256 * image), 0, 65535).astype(np.uint16), target).centres_px
+        assert np.abs(after - paper().correct(before, frame.camera_degC)).max() < 0.02
+    run("apply", files["paper"], recorded.path, "-o", tmp_path / "png", "--frames", ":1", "--format", "png")
+    assert cv2.imread(str(tmp_path / "png" / "000000.png"), cv2.IMREAD_UNCHANGED).dtype == np.uint8
+
+
+def test_one_image_is_corrected_at_a_given_temperature(recorded: Recorded, files: dict[str, Path], tmp_path: Path):
+    image = Session.open(recorded.path).frame(4).image
+    cv2.imwrite(str(tmp_path / "photo.png"), image)
+    run("apply", files["paper"], tmp_path / "photo.png", "--camera-degC", 44, "-o", tmp_path / "out.tiff")
+    moved = cv2.imread(str(tmp_path / "out.tiff"), cv2.IMREAD_UNCHANGED)
+    assert moved.shape == image.shape
+    assert not np.allclose(moved, image, atol=1)
+
+
+def test_what_cannot_be_corrected_is_refused_with_a_sentence(
+    recorded: Recorded, files: dict[str, Path], tmp_path: Path
+):
+    out, numbers = tmp_path / "out", itertools.count()
+
+    def refused(*arguments: object, text: str = "x_px,y_px,camera_degC\n100,200,40\n", says: str) -> None:
+        points = tmp_path / f"points-{next(numbers)}.csv"
+        points.write_text(text)
+        given = [points if argument == "POINTS" else argument for argument in arguments]
+        printed = run("apply", *given, "-o", out, status=2)
+        assert says in printed
+        assert printed.count("\n") == 1
+        assert not out.exists()
+
+    refused(files["paper"], "POINTS", text="x,y\n1,2\n", says="has no column x_px")
+    refused(files["paper"], "POINTS", text="x_px,y_px\n1,2\n", says="has no column camera_degC; give --session")
+    refused(files["paper"], "POINTS", text="x_px,y_px,camera_degC\n1,2,warm\n", says="line 2: camera_degC is 'warm'")
+    refused(files["paper"], "POINTS", text="x_px,y_px,camera_degC\n1,2\n", says="line 2 has not as many cells")
+    refused(files["paper"], "POINTS", text="x_px,y_px,outside\n1,2,3\n", says="have been corrected")
+    refused(files["paper"], "POINTS", "--session", recorded.path, says="needs the instant of every point")
+    refused(files["thermal"], "POINTS", says="a model of the form thermal needs the thermal state")
+    refused(files["paper"], "POINTS", "--frames", "0:1", says="--frames does not belong here")
+    refused(files["paper"], recorded.path, "--frames", "0:99", says="the session has 17 frames")
+    refused(files["paper"], recorded.path, "--frames", "3", says="give FIRST:END")
+    refused(files["paper"], recorded.path, "--camera-degC", "3", says="a session tells its own temperatures")
+    refused(files["paper"], tmp_path / "photo.png", says="give the camera's temperature with --camera-degC")
+    refused(tmp_path / "none.json", "POINTS", says="none.json: cannot be read")
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((40, 50), np.uint8))
+    refused(files["paper"], tmp_path / "small.png", "--camera-degC", "40", says="50 x 40 pixels, the model is of 640")
+
+
+def test_a_folder_that_is_there_is_not_written_into(recorded: Recorded, files: dict[str, Path], tmp_path: Path):
+    (tmp_path / "there").mkdir()
+    assert "images go into a new folder" in run(
+        "apply", files["paper"], recorded.path, "-o", tmp_path / "there", status=2
+    )
+    assert not list((tmp_path / "there").iterdir())
+
+
+def test_export_says_what_it_has_written(files: dict[str, Path], tmp_path: Path):
+    printed = run("export", files["thermal"], "-o", tmp_path / "a" / "b")
+    assert printed.split() == [str(tmp_path / "a" / "b" / name) for name in ("drift.json", "drift_runtime.py")]
