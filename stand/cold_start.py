@@ -1,4 +1,5 @@
-"""A warm-up that was interrupted cannot be gone on with: its camera is warm. Which steps are done again, from cold."""
+"""A warm-up that was killed, or held by an interlock, cannot be gone on with: its camera is warm. Which steps are done
+again, from cold."""
 
 from __future__ import annotations
 

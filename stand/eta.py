@@ -78,6 +78,11 @@ class Eta:
         return max(0.0, left_s)
 
     def _begin(self, step: PricedStep, time_ns: int) -> None:
+        for index in range(step.planned.index + 1, self._first):  # of a warm-up that begins anew
+            self._waiting[index] = again = self._steps[index]
+            self._stated_s += again.stated_s
+            self._count[again.work] += 1
+        self._first = min(self._first, step.planned.index)
         for index in range(self._first, step.planned.index + 1):
             waiting = self._waiting.pop(index, None)
             if waiting is not None:

@@ -2,7 +2,8 @@
 
 Before each action, and within dwells and captures, the run waits at the stand's gate. What an interlock or the death of
 an earlier daemon has undone is brought about again: the set-up the steps so far have left, and the soaks since the last
-set-point, unless the chamber is still (or back) in its band. A step is done when all it has recorded is on the disk.
+set-point, unless the chamber is still (or back) in its band. A warm-up cannot be gone on with after an interlock: it
+begins anew, from a cold camera. A step is done when all it has recorded is on the disk.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from experiments.steps import (
     PlannedStep,
     PowerCamera,
     Prompt,
+    Role,
     SetTemperature,
     Soak,
     SoakUntilSettled,
@@ -34,9 +36,11 @@ from experiments.steps import (
     longest_s,
     parameters_of,
 )
+from stand.cold_start import cold_start
 from stand.gate import INTERLOCK
 from stand.hub import Event, Hub, StepMark, StepState
-from stand.journal import Dwell, Journal, Step
+from stand.journal import Again, Dwell, Journal, Step
+from stand.recording.superseded import restarted
 from stand.set_up import SetUp
 from stand.settling_watch import SettlingWatch
 from stand.stand import Interlocked, Stand
@@ -55,6 +59,14 @@ class Progress:
     done: frozenset[str] = frozenset()
     earned_s: Mapping[str, float] = field(default_factory=dict[str, float])
     frames: Mapping[str, int] = field(default_factory=dict[str, int])
+
+
+class _ColdStart(Exception):
+    """No error, but a way out of wherever the run is: these steps, a warm-up's, have to be done again."""
+
+    def __init__(self, again: tuple[PlannedStep, ...]) -> None:
+        super().__init__("an interlock held the warm-up; it begins anew")
+        self.again = again
 
 
 class Scheduler:
@@ -85,12 +97,24 @@ class Scheduler:
         self._done = set(progress.done)
         self._earned_ns = {step_id: seconds_ns(earned_s) for step_id, earned_s in progress.earned_s.items()}
         self._frames = dict(progress.frames)
+        self._plan: tuple[PlannedStep, ...] = ()
+        self._begun: set[str] = set()
+        self._warming_ns = 0  # when the warm-up's camera was switched on, or gave its last frame
+        self._was_held = False  # since then
         stand.gate.subscribe(self._on_hold)
 
     async def run(self, plan: Iterable[PlannedStep]) -> None:
         """What is not done of the plan."""
+        self._plan = tuple(plan)
+        while True:
+            try:
+                return await self._walk()
+            except _ColdStart as needed:
+                await self._begin_anew(needed.again)
+
+    async def _walk(self) -> None:
         set_up = SetUp()
-        for planned in plan:
+        for planned in self._plan:
             if planned.step_id not in self._done:
                 # A soak depends on what it has earned itself as on those before it.
                 needed = set_up.after(planned) if isinstance(planned.step, AnySoak) else set_up
@@ -98,7 +122,18 @@ class Scheduler:
                 await self._run_step(planned, needed)
             set_up = set_up.after(planned)
 
+    async def _begin_anew(self, again: tuple[PlannedStep, ...]) -> None:
+        """These steps count as neither begun nor done, and no frame of theirs so far: told before it is journaled, so
+        that no frame is ever left out that nobody was told of."""
+        now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]
+        self._hub.publish(restarted(now_ns, step_ids[-1], self._frames.pop(step_ids[-1], 0)))
+        await self._flushed()
+        await self._journal.write(Again(now_ns, step_ids))
+        self._done.difference_update(step_ids)
+        self._begun.difference_update(step_ids)
+
     async def _run_step(self, planned: PlannedStep, set_up: SetUp) -> None:
+        self._begun.add(planned.step_id)
         await self._journal.write(Step(self._clock.now_ns(), planned.step_id, "started"))
         self._mark(planned, StepState.STARTED)
         try:
@@ -148,6 +183,7 @@ class Scheduler:
             case MoveTo(axis, position):
                 await stand.move_to(axis, position)
             case PowerCamera(on):
+                self._warming_ns, self._was_held = self._clock.now_ns(), False
                 await stand.power_camera(on=on)
             case CoolDown(band_K, time_constant_s, max_s):
                 await stand.cool_down(band_K, time_constant_s, max_s)
@@ -170,10 +206,20 @@ class Scheduler:
                 await self._stand.approach_again()
                 due_ns += max(0, math.ceil((self._clock.now_ns() - due_ns) / interval_ns)) * interval_ns
                 continue
+            self._tell_missing(capture)
             await self._stand.take_frame(capture.exposure_s, step_id, due_ns)
+            self._warming_ns = self._clock.now_ns()
             self._frames[step_id] = self._frames.get(step_id, 0) + 1
             # To the latest deadline that has passed: a free-running camera gives its frame up to a period late.
             due_ns += max(1, (self._clock.now_ns() - due_ns) // interval_ns) * interval_ns
+
+    def _tell_missing(self, capture: Capture) -> None:
+        """A camera goes on warming up while the run is held: what was not seen of it is told."""
+        was_held, self._was_held = self._was_held, False
+        if was_held and capture.role is Role.WARM_UP:
+            missing_s = (self._clock.now_ns() - self._warming_ns) / NS_PER_S
+            text = f"the run was held: the camera has warmed up for {missing_s:.1f} s without a frame"
+            self._tell("warning", "warm_up_gap", text)
 
     async def _soak(self, planned: PlannedStep, set_up: SetUp) -> None:
         """All of a soak, with everything that has to be restored on the way."""
@@ -220,6 +266,8 @@ class Scheduler:
         restored = False
         while True:
             await self._stand.gate.passed()
+            if self._disturbed and (again := cold_start(self._plan, self._done, self._begun)):
+                raise _ColdStart(again)
             try:
                 if self._disturbed:
                     self._disturbed, restored = False, True
@@ -287,6 +335,7 @@ class Scheduler:
     def _on_hold(self, reason: str, held: bool) -> None:
         """An interlock makes the stand safe: nothing is as it was."""
         self._disturbed = self._disturbed or (held and reason == INTERLOCK)
+        self._was_held = self._was_held or held
 
     def _tell(self, level: str, kind: str, text: str) -> None:
         self._hub.publish(Event(self._clock.now_ns(), level, kind, text))

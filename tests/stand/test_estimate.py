@@ -250,6 +250,26 @@ def test_what_an_earlier_part_of_the_run_has_done_is_not_waited_for(config: Stan
     assert eta.left_s(again[1].time_ns) == pytest.approx(60.0)
 
 
+def test_steps_that_are_begun_again_are_waited_for_again(config: StandConfig):
+    plan = planned(PowerCamera(False), CoolDown(0.5, 1200.0, 7200.0), PowerCamera(True), Soak(600), Soak(60))
+    eta = Eta(price(plan, config))
+    first, second, third, fourth = (
+        StepMark(0, step.step_id, step.index, "Any", StepState.STARTED) for step in plan[:4]
+    )
+    eta.mark(first)
+    all_s = eta.left_s(0)
+    for mark in (second, third, fourth):
+        eta.mark(mark)
+    assert eta.left_s(0) == pytest.approx(660)
+    eta.mark(first)
+    assert eta.left_s(0) == pytest.approx(all_s)
+    eta.mark(second)
+    assert eta.left_s(0) == pytest.approx(all_s)
+    eta.mark(third)
+    eta.mark(fourth)
+    assert eta.left_s(0) == pytest.approx(660)
+
+
 def test_steps_before_the_running_one_are_not_waited_for(config: StandConfig):
     plan = planned(Soak(600.0), Soak(300.0), Soak(60.0))
     eta = Eta(price(plan, config))

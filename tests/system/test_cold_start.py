@@ -1,13 +1,16 @@
 """Warm-ups that are interrupted begin anew from a cold camera; prompts that somebody attends to are waited for."""
 
 import asyncio
+import itertools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from drivers.clock import NS_PER_S
+from drivers.interface import Frame
 from experiments.steps import Capture, PowerCamera, Prompt
 from stand.cold_start import cold_start
 from stand.control_client import ask
@@ -19,7 +22,9 @@ from stand.run import run_virtual
 from stand.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
+from tests.system.test_guard_run import Watcher
 from tests.system.test_resume import end_laboratory
+from tests.system.test_run import fault
 
 WARM_UP = """
 name: warm
@@ -130,3 +135,81 @@ def test_nothing_is_superseded_in_a_run_that_was_not_interrupted(tmp_path: Path,
     before.release()
     assert begins_of(Session.open(directory)) == {}
     asyncio.run(end_laboratory(ordered))
+
+
+def acting(actions: dict[int, Callable[[], Awaitable[object]]], answer: Callable[[str], Awaitable[object]]):
+    """A watch: after so many frames an action is done, and `answer(reason)` when something holds the run; all that is
+    still to end is in the second of the pair, and what the run said in the third."""
+    tasks, items, frames = list[asyncio.Task[object]](), list[Event | StepMark](), list[int]()
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Frame):
+            frames.append(item.time_ns)
+            if len(frames) in actions:
+                tasks.append(asyncio.ensure_future(actions[len(frames)]()))
+        if isinstance(item, Event | StepMark):
+            items.append(item)
+        if isinstance(item, Event) and item.kind == "held":
+            tasks.append(asyncio.ensure_future(answer(item.text)))
+
+    return (lambda hub: hub.subscribe(follow)), tasks, items
+
+
+async def test_a_warm_up_that_an_interlock_has_held_begins_anew_from_a_cold_camera(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    ordered, out = order(WARM_UP), tmp_path / "out"
+
+    async def operator(reason: str) -> None:
+        await fault(ordered, "axis.alarm", None)
+        (directory,) = out.iterdir()
+        await asyncio.to_thread(ask, directory, {"do": "clear"})
+
+    act, tasks, items = acting({3: lambda: fault(ordered, "axis.alarm", "rotary")}, operator)
+
+    directory = await run_virtual(ordered, out, None, act)
+    await asyncio.gather(*tasks)
+    session = Session.open(directory)
+    (capture,) = (planned for planned in ordered.recipe.plan() if isinstance(planned.step, Capture))
+    begins_ns = begins_of(session)
+    (restart,) = [event for event in session.events() if event.kind == "capture_restarted"]
+    assert begins_ns == {capture.step_id: restart.time_ns}
+    counted = [meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]
+    superseded = len(session.frame_metas) - 8
+    assert superseded >= 3
+    assert f"its {superseded} frames so far do not count" in restart.text
+    assert len(counted) == 8
+    assert counted[0].camera_degC < 27.0
+    assert counted[-1].camera_degC > counted[0].camera_degC + 1.0
+    marks = [item for item in items if isinstance(item, StepMark) and item.kind in ("PowerCamera", "CoolDown")]
+    done = [mark.kind for mark in marks if mark.state is StepState.DONE]
+    assert done == ["PowerCamera", "CoolDown", "PowerCamera"] * 2
+
+
+async def test_a_warm_up_that_is_paused_goes_on_and_says_what_was_not_seen(tmp_path: Path, order: Callable[..., Order]):
+    ordered, out = (
+        order(WARM_UP.replace("band_K: 2", "cool_down_max_s: 10").replace("frames: 8", "frames: 40")),
+        tmp_path / "out",
+    )
+    watcher = Watcher()
+
+    async def operator(reason: str) -> None:
+        (directory,) = out.iterdir()
+        await watcher.wait(200)
+        await asyncio.to_thread(ask, directory, {"do": "continue"})
+
+    async def pause() -> None:
+        (directory,) = out.iterdir()
+        await asyncio.to_thread(ask, directory, {"do": "pause"})
+
+    act, tasks, _ = acting({3: pause}, operator)
+    session = Session.open(await run_virtual(ordered, out, None, lambda hub: (hub.subscribe(watcher), act(hub))))
+    await asyncio.gather(*tasks)
+    assert len(session.frame_metas) == 40
+    (gap,) = [event for event in session.events() if event.kind == "warm_up_gap"]
+    missing_s = float(gap.text.split(" for ")[1].split()[0])
+    times_ns = [time_ns for time_ns, _ in session.frame_metas]
+    gaps_s = [(later - time_ns) / NS_PER_S for time_ns, later in itertools.pairwise(times_ns)]
+    assert missing_s == pytest.approx(max(gaps_s), abs=1.0)
+    assert missing_s > 200.0
+    assert not [event for event in session.events() if event.kind == "capture_restarted"]
