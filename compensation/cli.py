@@ -12,7 +12,15 @@ import typer
 from compensation.apply_cli import apply_model, export_model
 from compensation.budget_cli import budget_of_session
 from compensation.calibration_cli import calibrate_session
-from compensation.command_line import TargetOption, installed_target, named_target, one_line_errors
+from compensation.command_line import (
+    Cache,
+    Cluster,
+    TargetOption,
+    Workers,
+    installed_target,
+    named_target,
+    one_line_errors,
+)
 from compensation.drift.choosing import Form, check_request
 from compensation.drift.choosing import fit as fit_model
 from compensation.drift.model_file import load_model, save_model
@@ -25,6 +33,7 @@ from compensation.markers.table import DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
 from compensation.report.report import write_report
 from compensation.target import Target
+from compensation.validate_cli import validate_session
 from drivers.interface import ConfigError
 from stand.progress import progress
 from stand.recording.session import Session
@@ -47,18 +56,13 @@ FormOption = Annotated[
     Form | None, typer.Option(help="The paper's polynomial or the thermal form; else chosen by cross-validation.")
 ]
 
-Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
-Cluster = Annotated[
-    str | None, typer.Option("--cluster", help="A Dask scheduler, host:port, whose workers see the same files.")
-]
-Cache = Annotated[bool, typer.Option("--cache/--no-cache", help="Keep what was found, and take what is kept.")]
-
 _DEFAULT_TARGET = "paper-9x6"
 
 app.command("budget")(budget_of_session)
 app.command("calibrate")(calibrate_session)
 app.command("apply")(apply_model)
 app.command("export")(export_model)
+app.command("validate")(validate_session)
 
 
 @app.command("detect")

@@ -17,6 +17,11 @@ from stand.usage import tell
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
 ]
+Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
+Cluster = Annotated[
+    str | None, typer.Option("--cluster", help="A Dask scheduler, host:port, whose workers see the same files.")
+]
+Cache = Annotated[bool, typer.Option("--cache/--no-cache", help="Keep what was found, and take what is kept.")]
 
 
 def installed_target(name: str) -> Target:

@@ -1,0 +1,72 @@
+"""`compensate validate`: the paper's validation in three dimensions, from a recorded session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.budget.geometry import load_geometry
+from compensation.calibration.camera_file import CameraFile
+from compensation.command_line import Cache, Cluster, TargetOption, Workers, named_target, one_line_errors
+from compensation.drift.model_file import load_model
+from compensation.files import check_writable, write_whole
+from compensation.finding.found import finder
+from compensation.observations import Float, observe_sessions
+from compensation.report.validation_report import validation_page
+from compensation.validation3d.document import as_json
+from compensation.validation3d.positions import validation_frames
+from compensation.validation3d.stand_part import StandPart, stand_part
+from compensation.validation3d.table import summary
+from compensation.validation3d.validation import LensModel, camera_of, check_same, validate
+from drivers.interface import ConfigError
+from stand.progress import progress
+from stand.recording.session import Session
+
+
+def validate_session(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a session of the validation recipe.")],
+    camera: Annotated[Path, typer.Option(help="The camera file of `compensate calibrate`.")],
+    model: Annotated[Path, typer.Option(help="The drift model of `compensate fit`.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write; a JSON file is written beside it.")],
+    budget: Annotated[
+        str | None, typer.Option(help="Tell the stand's part, too: its geometry, a file or the installed `paper`.")
+    ] = None,
+    lens: Annotated[
+        LensModel, typer.Option(help="Which model of the camera file gives the poses.")
+    ] = LensModel.PINHOLE,
+    target: TargetOption = None,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    cache: Cache = True,
+) -> None:
+    """How far the target at V0..V3 seems to move with temperature, before and after compensation, beside the paper's.
+
+    Example: compensate validate sessions/20260101T180000Z-validation --camera camera.json --model model.json
+    -o validation.html
+    """
+    with one_line_errors():
+        beside = out.with_suffix(".json")
+        if beside == out:
+            raise ConfigError(f"{out}: the page is HTML, and a JSON file is written beside it; name it .html")
+        for path in (out, beside):
+            check_writable(path)
+        file, drift = CameraFile.load(camera), load_model(model)
+        geometry = None if budget is None else load_geometry(budget)
+        observations = observe_sessions(
+            [session], progress, named_target(target), finder(workers, cluster, use_cache=cache)
+        )
+        check_same(observations, file, drift)
+        opened = Session.open(session)
+        frames = validation_frames(opened, observations)
+
+        def stand_at(distances_mm: Float) -> StandPart | None:
+            if geometry is None:
+                return None
+            return stand_part(opened, observations, frames, geometry, distances_mm)
+
+        found = validate(observations, frames, camera_of(file, lens), drift, stand_at)
+        write_whole(out, validation_page(found))
+        write_whole(beside, as_json(found))
+        typer.echo(summary(found))

@@ -1,0 +1,179 @@
+"""How far the target at V0, V1, ... seems to have moved since the reference temperature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
+from compensation.calibration.board import Board
+from compensation.calibration.errors import CalibrationError
+from compensation.calibration.pose import Lens
+from compensation.observations import Float, Observations
+from compensation.validation3d.poses import Found, find, middle_mm, rotation_mrad
+from compensation.validation3d.positions import FrameIndices, ValidationFrames
+
+_LEAST_MARKERS = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """The calibrated camera and target, and what the lens model is called."""
+
+    lens: Lens
+    lens_name: str
+    board: Board
+
+    @property
+    def middle_mm(self) -> Float:
+        """The middle (3,) of the target."""
+        return middle_mm(self.board)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deviations:
+    """T temperatures, the first is the reference, P positions; NaN where there is no pose.
+
+    translation_um, rotation_mrad (T, P, 3): since the reference, along and about X, Y, Z. noise_um, model_um (T, P, 3):
+    standard uncertainty of the translation by the markers' noise and by the drift model; table_um (3,): by the table,
+    which repeat_um (T, 3), V0 at the end of each temperature minus V0 at its begin, tells. u_mrad (T, P, 3): of the
+    rotation, by noise and model. chi (T, P): misfit of the pose, 1 when noise explains it.
+    """
+
+    name: str
+    translation_um: Float
+    rotation_mrad: Float
+    noise_um: Float
+    model_um: Float
+    u_mrad: Float
+    repeat_um: Float
+    table_um: Float
+    chi: Float
+
+    @property
+    def u_um(self) -> Float:
+        """(T, P, 3): standard uncertainty of the translation; a deviation has the table's share twice."""
+        return np.sqrt(self.noise_um**2 + self.model_um**2 + 2 * self.table_um**2)
+
+    @property
+    def per_temperature_um(self) -> Float:
+        """(T, 3): mean absolute deviation over the positions."""
+        return _mean(np.abs(self.translation_um), axis=1)
+
+    @property
+    def u_per_temperature_um(self) -> Float:
+        """(T, 3): its standard uncertainty, the positions' taken as fully correlated: an upper limit."""
+        return _mean(self.u_um, axis=1)
+
+    @property
+    def mean_um(self) -> Float:
+        """(3,): mean over the temperatures but the reference; what the paper reports."""
+        return _mean(self.per_temperature_um[1:], axis=0)
+
+    @property
+    def u_mean_um(self) -> Float:
+        """(3,): its standard uncertainty, an upper limit as above."""
+        return _mean(self.u_per_temperature_um[1:], axis=0)
+
+    @property
+    def mean_rotation_mrad(self) -> Float:
+        """(3,): mean absolute rotation over the positions, then over the temperatures but the reference."""
+        return _mean(_mean(np.abs(self.rotation_mrad), axis=1)[1:], axis=0)
+
+
+def deviations(
+    name: str,
+    camera: Camera,
+    observations: Observations,
+    frames: ValidationFrames,
+    centres_px: Float,
+    model_px2: Float | None = None,
+) -> Deviations:
+    """Of centres (F, N, 2), which may be corrected; model_px2 (F, N, 2, 2): covariance of the correction.
+
+    The frames of a position at a temperature are averaged first. CalibrationError when V0, V1, ... at the reference
+    have no pose.
+    """
+    means = [[_averaged(observations, centres_px, indices) for indices in row] for row in frames.frames]
+    chi = scatter_chi([mean for row in means for mean in row if mean is not None])
+    growth = 1.0 if np.isnan(chi) else max(1.0, chi) ** 2
+    width = observations.image_size[0]
+    grid: list[list[Found | None]] = []
+    for row, indices in zip(means, frames.frames, strict=True):
+        grid.append([])
+        for mean, chosen in zip(row, indices, strict=True):
+            uncertain = None if mean is None or model_px2 is None else model_px2[chosen].mean(axis=0)
+            grid[-1].append(None if mean is None else find(camera.lens, camera.board, mean, growth, uncertain, width))
+    return _compared(name, frames.names, grid)
+
+
+def _averaged(observations: Observations, centres_px: Float, indices: FrameIndices) -> MeanCentres | None:
+    """None when too few markers are left for a pose that can be judged."""
+    mean = mean_centres(centres_px[indices], observations.covariance_px2[indices]) if len(indices) else None
+    if mean is None or np.count_nonzero(np.isfinite(mean.centres_px[:, 0])) < _LEAST_MARKERS:
+        return None
+    return mean
+
+
+def _compared(name: str, names: tuple[str, ...], grid: list[list[Found | None]]) -> Deviations:
+    count = len(names)
+    reference = [found for found in grid[0][:count] if found is not None]
+    if len(reference) < count:
+        missing = next(name for name, found in zip(names, grid[0], strict=False) if found is None)
+        raise CalibrationError(
+            f"{missing} at the reference temperature, from which all deviations are, has fewer than {_LEAST_MARKERS} "
+            f"markers ({name})"
+        )
+    apart = [[_apart(found, first) for found, first in zip(row, reference, strict=False)] for row in grid]
+    repeats = [_apart(row[count], row[0]) for row in grid]
+    return Deviations(
+        name=name,
+        translation_um=np.array([[one.translation_um for one in row] for row in apart]),
+        rotation_mrad=np.array([[one.rotation_mrad for one in row] for row in apart]),
+        noise_um=np.array([[one.noise_um for one in row] for row in apart]),
+        model_um=np.array([[one.model_um for one in row] for row in apart]),
+        u_mrad=np.array([[one.u_mrad for one in row] for row in apart]),
+        repeat_um=np.array([one.translation_um for one in repeats]),
+        table_um=_table_um(repeats),
+        chi=np.array([[np.nan if found is None else found.chi for found in row[:count]] for row in grid]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Apart:
+    """One pose against another, each (3,)."""
+
+    translation_um: Float
+    rotation_mrad: Float
+    noise_um: Float
+    model_um: Float
+    u_mrad: Float
+
+
+def _apart(found: Found | None, other: Found | None) -> _Apart:
+    """The drift model counts once: at the reference its correction is near nothing, and so is its error."""
+    if found is None or other is None:
+        return _Apart(*np.full((5, 3), np.nan))
+    noise, model = np.diagonal(found.noise) + np.diagonal(other.noise), np.diagonal(found.model)
+    return _Apart(
+        translation_um=1e3 * (found.place_mm - other.place_mm),
+        rotation_mrad=rotation_mrad(found, other),
+        noise_um=1e3 * np.sqrt(noise[3:]),
+        model_um=1e3 * np.sqrt(model[3:]),
+        u_mrad=1e3 * np.sqrt((noise + model)[:3]),
+    )
+
+
+def _table_um(repeats: list[_Apart]) -> Float:
+    """(3,): standard uncertainty of one visit, from the scatter of returns without the markers' share; what the camera
+    drifts in these minutes is in it. 0 when the table never came back."""
+    squares = np.array([one.translation_um**2 - one.noise_um**2 for one in repeats])
+    return np.sqrt(np.maximum(np.nan_to_num(_mean(squares, axis=0)), 0) / 2)
+
+
+def _mean(values: Float, axis: int) -> Float:
+    """Mean of what is known; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    return np.where(count > 0, np.where(known, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)

@@ -1,0 +1,178 @@
+"""The whole validation of a session: what the target's deviations are before and after compensation.
+
+Axes are the calibrated camera's, as in the paper: X to the right in the image, Y down, Z along the optical axis away
+from the camera. The place that deviates is the target's middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.calibration.camera_file import CameraFile
+from compensation.calibration.pose import find_pose
+from compensation.drift.drift_model import DriftModel
+from compensation.observations import Float, Observations
+from compensation.validation3d.correction import Corrected, corrected
+from compensation.validation3d.deviations import Camera, Deviations, deviations
+from compensation.validation3d.positions import ValidationFrames
+from compensation.validation3d.stand_part import StandPart
+from drivers.interface import SessionError
+
+StandAt = Callable[[Float], StandPart | None]
+"""(distances of the positions (P,), mm) -> the stand's part in their frames, None when nobody asked for it."""
+
+
+class LensModel(StrEnum):
+    """Which of the camera file's models gives the poses. RAYS is the paper's kind."""
+
+    PINHOLE = "pinhole"
+    RAYS = "rays"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """T temperatures, the first is the reference, P positions.
+
+    names, linear_mm, rotary_deg, distance_mm (P,): V0, V1, ... at the reference. chamber_degC, camera_degC (T,).
+    frame_count (T, P): frames averaged. outside (T, P): part of the corrections beyond the model's valid range, flags
+    (T, P) why, of drift_model.Outside. before, after: compensation. camera_alone: before, the stand's part taken out;
+    with_stand: after, and the stand's part taken at each position's own distance; None when it was not asked for.
+    """
+
+    names: tuple[str, ...]
+    linear_mm: Float
+    rotary_deg: Float
+    distance_mm: Float
+    chamber_degC: Float
+    camera_degC: Float
+    frame_count: NDArray[np.int64]
+    outside: Float
+    flags: NDArray[np.uint8]
+    before: Deviations
+    after: Deviations
+    camera_alone: Deviations | None
+    with_stand: Deviations | None
+    lens: str
+    model: str
+    session_id: str
+    simulated: bool
+
+    @property
+    def variants(self) -> tuple[Deviations, ...]:
+        """Those that there are, in order."""
+        return tuple(one for one in (self.before, self.after, self.camera_alone, self.with_stand) if one is not None)
+
+
+def camera_of(file: CameraFile, lens: LensModel) -> Camera:
+    """The calibrated camera and target of a camera file."""
+    name = file.model if lens is LensModel.PINHOLE else f"rays, degree {file.rays.degree}"
+    return Camera(file.lens if lens is LensModel.PINHOLE else file.ray_lens, name, file.adjusted_board)
+
+
+def check_same(observations: Observations, file: CameraFile, model: DriftModel) -> None:
+    """SessionError when camera file, model and session are not of the same camera and target."""
+    facts = observations.sessions[0]
+    here = (facts.camera_serial, observations.target.name, observations.image_size)
+    others = {
+        "camera file": (file.camera_serial, file.target_name, file.image_size_px),
+        "drift model": (model.camera_serial, model.target_name, model.image_size),
+    }
+    for name, other in others.items():
+        if other != here:
+            raise SessionError(f"the {name} is of {_named(other)}, the session of {_named(here)}")
+
+
+def validate(
+    observations: Observations,
+    frames: ValidationFrames,
+    camera: Camera,
+    model: DriftModel,
+    stand_at: StandAt = lambda _: None,
+) -> Validation:
+    """SessionError when the model has no answer for any frame. CalibrationError when the reference has no pose."""
+    compensated = corrected(observations, frames, model)
+    if not np.isfinite(compensated.centres_px).any():
+        raise SessionError("the drift model has no answer for any frame: the session does not tell what it needs")
+    before = deviations("before compensation", camera, observations, frames, observations.centres_px)
+    after = deviations(
+        "after compensation", camera, observations, frames, compensated.centres_px, compensated.model_px2
+    )
+    distance_mm = _distances_mm(observations, frames, camera)
+    alone, with_stand = _stand_variants(observations, frames, camera, compensated, stand_at(distance_mm))
+    outside, flags = _outside(frames, compensated, len(frames.names))
+    return Validation(
+        names=frames.names,
+        linear_mm=frames.linear_mm,
+        rotary_deg=frames.rotary_deg,
+        distance_mm=distance_mm,
+        chamber_degC=frames.chamber_degC,
+        camera_degC=_camera_degC(observations, frames),
+        frame_count=np.array([[len(indices) for indices in row[:-1]] for row in frames.frames]),
+        outside=outside,
+        flags=flags,
+        before=before,
+        after=after,
+        camera_alone=alone,
+        with_stand=with_stand,
+        lens=camera.lens_name,
+        model=f"{model.form}: {model.title}",
+        session_id=observations.sessions[0].session_id,
+        simulated=observations.simulated,
+    )
+
+
+def _named(what: tuple[str, str, tuple[int, int]]) -> str:
+    serial, target, (width, height) = what
+    return f"camera {serial}, target {target}, {width} x {height} px"
+
+
+def _distances_mm(observations: Observations, frames: ValidationFrames, camera: Camera) -> Float:
+    """(P,): of the target's middle along Z, in the first frame of each position."""
+    middle = camera.middle_mm
+    first = [indices[0] for indices in frames.frames[0][:-1]]
+    poses = (
+        find_pose(camera.lens, camera.board, observations.centres_px[index], observations.covariance_px2[index])
+        for index in first
+    )
+    return np.array([pose.place_mm(middle)[2] for pose in poses])
+
+
+def _stand_variants(
+    observations: Observations,
+    frames: ValidationFrames,
+    camera: Camera,
+    compensated: Corrected,
+    stand: StandPart | None,
+) -> tuple[Deviations | None, Deviations | None]:
+    """The drift model was fitted with the stand's part at the fit's distance in it: only the difference is left."""
+    if stand is None:
+        return None, None
+    alone = observations.centres_px - stand.here
+    nearer = compensated.centres_px - (stand.here - stand.at_fit)
+    return (
+        deviations("before, without the stand's part", camera, observations, frames, alone),
+        deviations(
+            "after, the stand's part at each distance", camera, observations, frames, nearer, compensated.model_px2
+        ),
+    )
+
+
+def _outside(frames: ValidationFrames, compensated: Corrected, positions: int) -> tuple[Float, NDArray[np.uint8]]:
+    shares = np.full((len(frames.frames), positions), np.nan)
+    flags = np.zeros(shares.shape, np.uint8)
+    for row, steps in enumerate(frames.frames):
+        for column, indices in enumerate(steps[:positions]):
+            if len(indices):
+                shares[row, column] = (compensated.flags[indices] != 0).mean()
+                flags[row, column] = np.bitwise_or.reduce(compensated.flags[indices], axis=None)
+    return shares, flags
+
+
+def _camera_degC(observations: Observations, frames: ValidationFrames) -> Float:
+    """(T,): mean of the camera's own temperature over a temperature's frames."""
+    return np.array([observations.camera_degC[np.concatenate(row)].mean() for row in frames.frames])
