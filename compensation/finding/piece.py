@@ -13,14 +13,19 @@ from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from compensation.finding.png_rows import decode_rows
 from compensation.markers.detection import Detection, DetectionError, Noise, detect, nothing_found
 from compensation.target import Target
-from drivers.interface import Frame, SessionError
+from drivers.interface import SessionError
+from stand.recording.damage import naming
+from stand.recording.images import decode_image
 from stand.recording.instants import utc_text
-from stand.recording.items import RecordedImage, frame_of
-from stand.recording.records import FramePlace, frame_places, read_frame
+from stand.recording.png import ImageArray
+from stand.recording.records import FramePlace, Message, frame_places, read_frame
 from stand.recording.session import Session
 
 Float = NDArray[np.float64]
@@ -78,16 +83,16 @@ def find_markers(piece: Piece) -> FoundMarkers:
     rows: list[tuple[int, int, tuple[int, int], Detection, str]] = []
     previous: Detection | None = None
     size_px = (0, 0)
-    for frame in _frames(piece):
-        height, width = frame.image.shape[:2]
+    for message, image in _images(piece):
+        height, width = image.shape
         if (width, height) != size_px:
             previous, size_px = None, (width, height)
         detection, reason = None, ""
         try:
-            detection = previous = detect(frame.image, piece.target, previous, piece.noise)
+            detection = previous = detect(image, piece.target, previous, piece.noise)
         except DetectionError as error:
             reason = str(error)
-        rows.append((frame.time_ns, frame.block_id & 0xFFFFFFFF, size_px, detection or nothing, reason))
+        rows.append((message.time_ns, message.sequence, size_px, detection or nothing, reason))
     found = [row[3] for row in rows]
     return FoundMarkers(
         time_ns=np.array([row[0] for row in rows], np.int64),
@@ -109,16 +114,25 @@ def joined(parts: list[FoundMarkers]) -> FoundMarkers:
     return FoundMarkers(**{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names})
 
 
-def _frames(piece: Piece) -> Iterator[Frame]:
+def _images(piece: Piece) -> Iterator[tuple[Message, ImageArray]]:
     for place in _in_order(piece.segment):
         if piece.begin_ns <= place.time_ns <= piece.end_ns:
             try:
                 message = read_frame(place)
-                yield frame_of(
-                    RecordedImage(place.schema, message.data, message.sequence, message.time_ns, None, place.path)
-                )
+                with naming(place.path):
+                    image = _decoded(place.schema, message.data)
             except SessionError as error:
                 raise SessionError(f"{error}; this was the frame of {utc_text(place.time_ns)}") from error
+            yield message, image
+
+
+def _decoded(schema: str, data: bytes) -> ImageArray:
+    if schema != CompressedImage.DESCRIPTOR.full_name:
+        return decode_image(schema, data).pixels
+    try:
+        return decode_rows(CompressedImage.FromString(data).data)
+    except DecodeError as error:
+        raise SessionError(f"an image message cannot be read ({error})") from error
 
 
 def _in_order(segment: Path) -> list[FramePlace]:

@@ -96,7 +96,7 @@ def decode_png(data: bytes) -> tuple[ImageArray, Windows | None]:
     SessionError when it is not a whole, undamaged grey PNG of 8 or 16 bit; a size that the data cannot fill is refused
     before any memory is asked for.
     """
-    header, windows, plain = _taken_apart(data)
+    header, windows, plain, _ = _taken_apart(data)
     try:
         image = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError) as error:
@@ -106,30 +106,36 @@ def decode_png(data: bytes) -> tuple[ImageArray, Windows | None]:
     return cast(ImageArray, image), windows
 
 
-def _taken_apart(data: bytes) -> tuple[Header, Windows | None, bytes]:
-    """Header, windows, and the PNG without any chunk that could change the pixels or ask for memory (gamma,
-    transparency, animation, profiles)."""
+def pixel_data(data: bytes) -> tuple[Header, bytes]:
+    """Header and compressed pixels, checked as `decode_png` checks them, for whoever decodes them by himself."""
+    header, _, _, pixels = _taken_apart(data)
+    return header, b"".join(pixels)
+
+
+def _taken_apart(data: bytes) -> tuple[Header, Windows | None, bytes, list[memoryview]]:
+    """Header, windows, the PNG without any chunk that could change the pixels or ask for memory (gamma, transparency,
+    animation, profiles), and the parts of its compressed pixels."""
     header: Header | None = None
     windows: Windows | None = None
     kept: list[memoryview] = []
-    pixel_bytes = 0
+    pixels: list[memoryview] = []
     for kind, body, whole in _chunks(data):
         if (kind == b"IHDR") == (header is not None):
             raise SessionError("a recorded image is not a PNG: its header is not the first chunk, or there are two")
         if header is None:
             header = _header(body)
         elif kind == b"IDAT":
-            pixel_bytes += len(body)
+            pixels.append(body)
         elif kind == b"tEXt" and bytes(body[:8]) == WINDOWS_KEYWORD + b"\0":
             if windows is not None:
                 raise SessionError("a recorded image says twice which windows of it are real")
             windows = _windows(bytes(body[8:]), header)
         if kind in (b"IHDR", b"IDAT", b"IEND"):
             kept.append(whole)
-    if header is None or header.inflated_bytes > GREATEST_DEFLATION * pixel_bytes:
+    if header is None or header.inflated_bytes > GREATEST_DEFLATION * sum(map(len, pixels)):
         raise SessionError("a recorded image cannot be decoded: it has too little data for its size")
     is_plain = len(SIGNATURE) + sum(map(len, kept)) == len(data)
-    return header, windows, data if is_plain else SIGNATURE + b"".join(kept)
+    return header, windows, data if is_plain else SIGNATURE + b"".join(kept), pixels
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, memoryview]]:

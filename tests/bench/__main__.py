@@ -22,6 +22,7 @@ from tests.bench import (
     markers,
     modbus,
     night,
+    pipeline,
     reading,
     recorder,
     simulator,
@@ -47,6 +48,7 @@ BENCHMARKS = {
     "markers": markers.figures,
     "drift": drift.figures,
     "warp": warp.figures,
+    "pipeline": pipeline.figures,
     "identification": identification.figures,
     "simulator": simulator.figures,
 }

@@ -1,0 +1,170 @@
+"""From a recorded session to its report: 3600 frames of 5 MP in PNG, with two workers.
+
+The session is written by the recorder's own series from a dozen rendered photographs, one for each temperature. The
+peer looks for the same frames' circles with cv2.findCirclesGrid and its defaults: with as many workers over a part of
+the frames, nothing else done, so that its rate is an upper limit of the same pipeline's.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from mcap.writer import CompressionType
+
+from drivers.clock import NS_PER_S
+from drivers.interface import Frame, Reading
+from stand.config import packaged
+from stand.hub import Batch, Item, StepMark, StepState
+from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.messages import timestamp
+from stand.recording.png import encode_png
+from stand.recording.segment import Record, SeriesForm, Topic
+from stand.recording.series import Series
+from stand.recording.session import Session
+from stand.recording.telemetry import TelemetryEncoder
+from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
+from tests.compensation.rendered import Scene, photograph, render
+
+COUNT = 3600
+FEW = 450  # an eighth
+PEER_FRAMES = 120
+WORKERS = 2
+PERIOD_NS = NS_PER_S // 2
+START_NS = 1_767_290_400 * NS_PER_S
+SEQUENCE = (
+    ("reference", 24.0),
+    *(("fit", degC) for degC in (31.0, 45.0, 52.0, 38.0, 10.0, 17.0)),
+    *(("validation", degC) for degC in (27.0, 41.0, 48.0, 13.0, 20.0)),
+)
+DEVICES = {"thermometers": "thermometers", "camera": "camera"}
+PEER = "cv2.findCirclesGrid, 2 workers, nothing else"
+
+
+def figures(directory: Path) -> list[Figure]:
+    """Seconds for the whole, frames per second beside the peer, and the memory for 450 and for 3600 frames."""
+    sessions = {count: directory / f"pipeline-{count}" for count in (FEW, COUNT)}
+    try:
+        progress("pipeline, rendering and writing 8 GB")
+        photographs = [_photograph(index) for index in range(len(SEQUENCE))]
+        for count, session in sessions.items():
+            _write(session, photographs, count)
+        progress("pipeline, 450 frames to a report")
+        few = _reported(sessions[FEW])
+        progress("pipeline, 3600 frames to a report")
+        many = _reported(sessions[COUNT])
+        progress("pipeline, the peer")
+        peer = _peer_frames_per_s(sessions[COUNT])
+    finally:
+        for session in sessions.values():
+            shutil.rmtree(session, ignore_errors=True)
+    own = COUNT / many.wall_s
+    return [
+        at_most(90, absolute("3600 frames of 5 MP to a report", "s", [many.wall_s])),
+        ratio_at_least(10, side_by_side("the same, detection, fit and report", "frames/s", PEER, [own], [peer])),
+        absolute("memory of its largest process", "MB", [many.peak_MB]),
+        at_most(1.1, absolute("the same over that for 450 frames", "", [many.peak_MB / few.peak_MB])),
+        at_least(1, absolute("report written", "", [float(many.written)])),
+    ]
+
+
+@dataclass(frozen=True)
+class Reported:
+    wall_s: float
+    peak_MB: float
+    written: bool
+
+
+def _reported(session: Path) -> Reported:
+    """The command, as a user calls it; its memory is that of the largest process below a fresh one."""
+    out = session.with_suffix(".html")
+    program = (
+        "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL);"
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    )
+    command = [sys.executable, "-m", "compensation.cli", "report", str(session), "-o", str(out)]
+    begin_s = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", program, *command, "--workers", str(WORKERS), "--no-cache"],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    return Reported(time.perf_counter() - begin_s, int(done.stdout) * 1024 / 1e6, out.stat().st_size > 0)
+
+
+def _peer_frames_per_s(session: Path) -> float:
+    """Its first frames, in equal parts; processes are started and warm before the time runs."""
+    part = PEER_FRAMES // WORKERS
+    with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
+        list(pool.map(_peer, [session] * WORKERS, range(WORKERS), range(1, WORKERS + 1)))
+        begin_s = time.perf_counter()
+        found = sum(
+            pool.map(_peer, [session] * WORKERS, range(0, PEER_FRAMES, part), range(part, PEER_FRAMES + 1, part))
+        )
+        wall_s = time.perf_counter() - begin_s
+    if found != PEER_FRAMES:
+        raise RuntimeError(f"the peer found the target in {found} of {PEER_FRAMES} frames")
+    return PEER_FRAMES / wall_s
+
+
+def _peer(session: Path, first: int, end: int) -> int:
+    cv2.setNumThreads(1)
+    opened = Session.open(session)
+    return sum(cv2.findCirclesGrid(opened.frame(number).image, (9, 6))[0] for number in range(first, end))
+
+
+def _photograph(index: int) -> bytes:
+    """A PNG of the target, drifted by 0.009 and 0.026 px/K."""
+    above_K = SEQUENCE[index][1] - 24
+    scene = Scene(tilt_y_deg=3, roll_deg=1, shift_mm=(0.001 * above_K, 0.003 * above_K))
+    return encode_png(photograph(scene, render(scene), index))
+
+
+def _write(session: Path, photographs: list[bytes], count: int) -> None:
+    metadata = {"session_id": session.name, "recipe": "pipeline", "camera_serial": "TS-0001", "simulated": "true"}
+    attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text(encoding="utf-8")}
+    encoder = TelemetryEncoder(DEVICES)
+    image_topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),)
+    forms = [
+        (FRAMES, image_topics, CompressionType.NONE, 1_000_000_000),
+        (TELEMETRY, encoder.topics(), CompressionType.ZSTD, 1_000_000_000),
+    ]
+    series: list[Series] = []
+    for folder, topics, compression, size in forms:
+        (session / folder).mkdir(parents=True)
+        form = SeriesForm(folder, topics, compression, metadata, attachments, size, 600 * NS_PER_S)
+        series.append(Series(session / folder, form))
+    frames, telemetry = series
+    for number in range(count):
+        time_ns = START_NS + number * PERIOD_NS
+        index = number * len(SEQUENCE) // count
+        message = CompressedImage(
+            timestamp=timestamp(time_ns), frame_id="camera.image", data=photographs[index], format="png"
+        ).SerializeToString()
+        frames.commit([Record(CAMERA_IMAGE, time_ns, message, number)], time_ns)
+        begins = number == 0 or index != (number - 1) * len(SEQUENCE) // count
+        records = [record for item in _items(number, index, time_ns, begins) for record in encoder.encode(item)]
+        telemetry.commit(records, time_ns)
+    frames.finish()
+    telemetry.finish()
+
+
+def _items(number: int, index: int, time_ns: int, begins: bool) -> Iterator[Item]:
+    role, chamber_degC = SEQUENCE[index]
+    if begins:
+        parameters: dict[str, object] = {"role": role, "chamber_degC": chamber_degC}
+        yield StepMark(time_ns, f"step-{index}", index, "Capture", StepState.STARTED, parameters)
+    yield Batch("thermometers", time_ns, (Reading("thermometers.air", chamber_degC, "degC", time_ns),))
+    blank = np.zeros((1, 1), np.uint8)
+    frame = Frame("camera.image", blank, time_ns, 0.1, 0.0, chamber_degC + 20, number, time_ns)
+    yield replace(frame, step_id=f"step-{index}")
