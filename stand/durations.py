@@ -14,10 +14,13 @@ from types import MappingProxyType
 from drivers.interface import ConfigError
 from drivers.stage import PROFILES
 from experiments.steps import (
+    Capture,
     CheckHome,
     CloseFlap,
+    CoolDown,
     MoveTo,
     OpenFlap,
+    PowerCamera,
     SetTemperature,
     SoakUntilSettled,
     StartChamber,
@@ -34,6 +37,7 @@ _FLAP_AT_REST_S = 0.2
 _HOMING_S = 15.0
 _MOVE_CONFIRMED_S = 0.1
 
+COOL_DOWN_AS_FOUND = "cool down as found"  # of a camera that the run finds as warm as it happens to be
 
 LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
 
@@ -61,10 +65,12 @@ _PACES = {"8MT160-300": Pace(1000.0, 2000.0, 4000.0, 500.0), "8MR151": Pace(2000
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a step finds: the flap, where each axis stands (mm or deg; one that is missing is not homed), and the last
-    two set-points: a soak is taken to begin when the chamber sets off from the one to the other."""
+    """What a step finds: the flap, whether the plan has had the camera on (before that nobody knows how warm it is),
+    where each axis stands (mm or deg; one that is missing is not homed), and the last two set-points: a soak is taken
+    to begin when the chamber sets off from the one to the other."""
 
     flap_open: bool = False
+    camera_was_on: bool = False
     positions: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     from_degC: float = LABORATORY_degC
     to_degC: float = LABORATORY_degC
@@ -76,6 +82,8 @@ class Situation:
                 return replace(self, flap_open=True)
             case CloseFlap():
                 return replace(self, flap_open=False)
+            case PowerCamera(on=True) | Capture():
+                return replace(self, camera_was_on=True)
             case StartChamber(chamber_degC) | SetTemperature(chamber_degC):
                 return replace(self, from_degC=self.to_degC, to_degC=chamber_degC)
             case MoveTo(axis, position):
@@ -144,6 +152,9 @@ def _usual(step: Step, found: Situation, config: StandConfig, chamber: ChamberMo
             return Expectation(
                 f"check home {axis}", _to_home_s(stage, position) + _move_s(stage, 0.0, position), _HOMING_S
             )
+        case CoolDown():
+            work = kind_of(step) if found.camera_was_on else COOL_DOWN_AS_FOUND
+            return Expectation(work, estimate_s(step, config.camera.boot_s), 0.0)
         case SoakUntilSettled():
             return Expectation(kind_of(step), settling_s(step, found, chamber), 0.0)
         case _:

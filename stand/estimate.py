@@ -26,7 +26,7 @@ from experiments.steps import (
     parameters_of,
 )
 from stand.config import StandConfig
-from stand.durations import LABORATORY_degC, Situation, axis_of, expect
+from stand.durations import COOL_DOWN_AS_FOUND, LABORATORY_degC, Situation, axis_of, expect
 from stand.learned import Learned
 from stand.thermal_model import ChamberModel
 
@@ -45,7 +45,8 @@ class PricedStep:
 
     work, stated_s: what of the duration follows from the step, the rest being usual for this kind of work.
     in_band_after_s: of a soak, when the chamber is expected at its set-point, s after the soak begins; None when it is
-    there already. warning: why the dwell before a first capture, or a cool-down, is too short, "" when it is not.
+    there already. warning: why the dwell before a first capture, or a cool-down, is too short, or why the duration of a
+    cool-down is not known; "" when there is none.
     """
 
     planned: PlannedStep
@@ -115,7 +116,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
                 expected.work,
                 expected.stated_s,
                 in_band_after_s,
-                _warning(step, approach, learned.chamber),
+                _warning(step, approach, learned.chamber) or _unknown(expected.work, learned),
             )
         )
         found, approach = found.after(step), approach.after(step, duration_s)
@@ -155,6 +156,12 @@ def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:
         f"{'before' if spare_s < 0.0 else 'after'} the chamber arrives; "
         f"the camera needs {_minutes(settled_s - arrives_s)} to follow"
     )
+
+
+def _unknown(work: str, learned: Learned) -> str:
+    if work != COOL_DOWN_AS_FOUND or work in learned.overheads_s:
+        return ""
+    return "as of a camera that was on; one that is cold already takes no time"
 
 
 def _minutes(duration_s: float) -> str:

@@ -138,8 +138,22 @@ def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: Sta
 )
 def test_a_cool_down_too_short_for_the_camera_is_warned_of(config: StandConfig, max_s: float, warning: str):
     """20 K of excess down to 1 K takes ln 20 = 3.0 time constants."""
-    (step,) = price(planned(CoolDown(1.0, 1480.0, max_s)), config)
+    *_, step = price(planned(PowerCamera(True), CoolDown(1.0, 1480.0, max_s)), config)
     assert step.warning == warning
+
+
+@pytest.mark.parametrize("before", [PowerCamera(True), CAPTURE])
+def test_how_warm_the_run_finds_the_camera_nobody_knows_before_a_run_has_shown_it(config: StandConfig, before: Step):
+    plan = planned(CoolDown(1.0, 1480.0, 7200.0), before, CoolDown(1.0, 1480.0, 7200.0))
+    first, _, second = price(plan, config)
+    assert first.duration_s == second.duration_s == pytest.approx(1480.0 * math.log(20.0))
+    assert first.warning == "as of a camera that was on; one that is cold already takes no time"
+    assert second.warning == ""
+    learned = Learned(overheads_s={first.work: -4423.6}, nights=("last",))
+    cold, _, warm = price(plan, config, learned)
+    assert cold.duration_s == pytest.approx(10.0, abs=1.0)
+    assert cold.warning == ""
+    assert warm.duration_s == second.duration_s
 
 
 @pytest.mark.parametrize(
