@@ -1,5 +1,7 @@
 """The time left that a run shows, against the truth, over the wire in virtual time; and what a run teaches the next."""
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +13,10 @@ from stand.config import packaged
 from stand.estimate import price
 from stand.follow import Follow
 from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
-from stand.learned import learn
+from stand.learned import learn, load_learned
 from stand.recording.session import Session
-from stand.run import run_virtual
+from stand.resume import interruption
+from stand.run import Interrupted, resume, run_virtual
 from stand.session_setup import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
@@ -25,17 +28,16 @@ def _aravis() -> None:
     require_aravis()
 
 
-async def followed(order: Order, out: Path) -> tuple[Path, list[tuple[int, float]]]:
-    """The session, and (instant, time left in s as it was shown then) each time something was published after the
-    first set-point was reached, that is after the first dwell at the reference."""
-    follow = Follow(price(order.recipe.plan(), order.config), lambda done, text: None, lambda line: None)
+def following(follow: Follow) -> tuple[Callable[[Hub], None], list[tuple[int, float]]]:
+    """A watch, and (instant, time left in s as it was shown then) each time something was published after a set-point
+    was reached, that is after a dwell."""
     left: list[tuple[int, float]] = []
 
     def watch(hub: Hub) -> None:
         reached: list[Item] = []
 
         def look(item: Item) -> None:
-            if isinstance(item, StepMark) and item.kind == "Soak" and item.state is StepState.DONE:
+            if isinstance(item, StepMark) and item.kind.startswith("Soak") and item.state is StepState.DONE:
                 reached.append(item)
             if reached and isinstance(item, Batch | StepMark):
                 left.append((item.time_ns, follow.eta.left_s(item.time_ns)))
@@ -43,7 +45,14 @@ async def followed(order: Order, out: Path) -> tuple[Path, list[tuple[int, float
         hub.subscribe(follow)
         hub.subscribe(look)
 
-    return await run_virtual(order, out, None, watch), left
+    return watch, left
+
+
+async def followed(order: Order, out: Path, seed: int | None = None) -> tuple[Path, list[tuple[int, float]]]:
+    """The session, and the time left as `following` has it, by what earlier runs in that folder have taught."""
+    steps = price(order.recipe.plan(), order.config, load_learned(out))
+    watch, left = following(Follow(steps, lambda done, text: None, lambda line: None))
+    return await run_virtual(order, out, seed, watch), left
 
 
 def worst_share(left: list[tuple[int, float]], session: Path) -> float:
@@ -51,6 +60,13 @@ def worst_share(left: list[tuple[int, float]], session: Path) -> float:
     end_ns = Session.open(session).steps()[-1].time_ns
     truth = [(left_s, (end_ns - time_ns) / NS_PER_S) for time_ns, left_s in left if time_ns < end_ns]
     return max(abs(left_s - true_s) / true_s for left_s, true_s in truth)
+
+
+def is_true(left: list[tuple[int, float]], session: Path, within_s: float) -> bool:
+    """Whether the time left was at any time true within 5 %, or at the end `within_s`."""
+    end_ns = Session.open(session).steps()[-1].time_ns
+    truth = [(left_s, (end_ns - time_ns) / NS_PER_S) for time_ns, left_s in left]
+    return all(abs(left_s - true_s) <= max(0.05 * true_s, within_s) for left_s, true_s in truth)
 
 
 async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path, order: Callable[..., Order]):
@@ -68,6 +84,41 @@ async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path,
     arrivals_s = [step.in_band_after_s for step in plan if step.planned.index > 6 and step.in_band_after_s is not None]
     assert all(100 < arrival_s < 1500 for arrival_s in arrivals_s)
     assert len(arrivals_s) == 3
+
+
+async def test_the_time_left_of_a_run_that_goes_on_is_true(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order(SHORT_RECIPE.replace("dwell_s: 600", "dwell_s: 1500"))
+    third = [planned.step_id for planned in ordered.recipe.plan() if isinstance(planned.step, Soak)][2]
+
+    def stop(item: Item) -> None:
+        if isinstance(item, StepMark) and item.step_id == third:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        await run_virtual(ordered, tmp_path / "out", None, lambda hub: hub.subscribe(stop))
+    (directory,) = (tmp_path / "out").iterdir()
+    before = interruption(directory)
+    steps = price(ordered.recipe.plan(), ordered.config)
+    done, earned_s = before.progress.done, before.progress.earned_s
+    watch, left = following(Follow(steps, lambda done, text: None, lambda line: None, done, earned_s))
+    await resume(before, watch)
+    assert len(left) > 100
+    assert is_true(left, directory, 5.0)
+
+
+@pytest.mark.nightly
+async def test_the_time_left_of_dwells_that_end_when_settled_is_true_once_a_run_has_taught_it(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    recipe = SHORT_RECIPE.replace("[30, 20, 24]", "[28, 24]").replace("held_out_degC: [20]", "held_out_degC: []")
+    settled = "dwell_s: 3600\n      until: {settled: {drift_px_per_min: 0.004}}"
+    ordered = order(recipe.replace("dwell_s: 600", settled))
+    await followed(ordered, tmp_path, 3)
+    learn(tmp_path, ordered.config)
+    session, left = await followed(ordered, tmp_path, 4)
+    assert len(left) > 100
+    # Whether a camera has settled shows at a look only: the last minutes are as uncertain as the time between looks.
+    assert is_true(left, session, 60.0)
 
 
 @pytest.mark.nightly
