@@ -78,6 +78,7 @@ async def perform(work: Performance) -> None:
         raise
     finally:
         stop.taking_down()
+        assembly.stand.gate.let_go()  # what an operator presses now holds nothing
         try:
             log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
         finally:  # also when somebody who listens fails

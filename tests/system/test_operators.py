@@ -1,0 +1,108 @@
+"""Operators who press everything at any time, several at once, over the control socket of a real run."""
+
+import asyncio
+import os
+import random
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers.interface import SessionError, StandError
+from stand.control_client import ask
+from stand.hub import Event, Hub, Item, StepMark, StepState
+from stand.journal import JOURNAL_NAME, Held, read_lines
+from stand.recording.session import Session
+from stand.run import Interrupted, run_virtual
+from stand.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_attended import PROMPTED
+from tests.system.test_guard_run import check_safe
+from tests.system.test_resume import NIGHT, check, check_soaks
+
+pytestmark = pytest.mark.usefixtures("_aravis")
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+async def press(out: Path, run: asyncio.Task[Path], seed: int) -> list[object]:
+    """Any request, from before the run is there on; what came back. Nobody leaves a pause behind."""
+    rng, answers = random.Random(seed), list[object]()
+    while not run.done() and len(answers) < 150:
+        for directory in out.glob("*/"):
+            for do in (rng.choice(["pause", "pause", "clear", "status"]), "status", "continue"):
+                try:
+                    answers.append(await asyncio.to_thread(ask, directory, {"do": do}))
+                except SessionError as error:
+                    answers.append(str(error))
+        await asyncio.to_thread(os.getpid)  # virtual time stands still as long as somebody has something to do
+    return answers
+
+
+async def test_a_night_with_two_restless_operators_is_whole(tmp_path: Path, order: Callable[..., Order]):
+    ordered, out = order(NIGHT), tmp_path / "out"
+    run = asyncio.create_task(run_virtual(ordered, out, None, lambda hub: None))
+    answers = await asyncio.gather(press(out, run, 1), press(out, run, 2))
+    directory = await run
+    check(directory, ordered, [])
+    check_soaks(directory, ordered)
+    held = [entry for entry in read_lines((directory / JOURNAL_NAME).read_bytes())[0] if isinstance(entry, Held)]
+    assert len(held) > 10
+    assert [entry.held for entry in held] == [True, False] * (len(held) // 2)
+    assert all(entry.reason == "operator" for entry in held)
+    refused = {answer for answers_ in answers for answer in answers_ if isinstance(answer, str)}
+    assert any("there is nothing to clear" in text for text in refused)
+    assert all(text.count("\n") == 0 for text in refused)
+
+
+PHASES = ("opening", "Prompt", "CoolDown", "Capture", "held", "run.end")
+
+
+@pytest.mark.parametrize("phase", PHASES)
+async def test_stop_pressed_twice_in_any_phase_leaves_the_stand_safe(
+    tmp_path: Path, order: Callable[..., Order], phase: str
+):
+    """While the stand is opened there is no run yet to be asked; when it ends, there is nothing left to stop."""
+    ordered, out = replace(order(PROMPTED), attended=phase == "Prompt"), tmp_path / "out"
+    pressed, answers = list[asyncio.Task[None]](), list[object]()
+
+    async def press_stop(directory: Path) -> None:
+        for do in ("stop", "pause", "stop", "continue"):
+            try:
+                answers.append(await asyncio.to_thread(ask, directory, {"do": do}))
+            except StandError as error:
+                answers.append(str(error))
+
+    async def pause(directory: Path) -> None:
+        await asyncio.to_thread(ask, directory, {"do": "pause"})
+
+    def follow(item: Item) -> None:
+        begins = isinstance(item, StepMark) and item.state is StepState.STARTED and item.kind == phase
+        if phase == "held" and isinstance(item, StepMark) and item.kind == "CoolDown":
+            pressed.append(asyncio.create_task(pause(next(out.iterdir()))))
+        if begins or (isinstance(item, Event) and item.kind == phase):
+            pressed.append(asyncio.create_task(press_stop(next(out.iterdir()))))
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(follow)
+        if phase == "opening":
+            pressed.append(asyncio.create_task(press_stop(out)))
+
+    with suppress(Interrupted):
+        await run_virtual(ordered, out, None, watch)
+    await asyncio.gather(*pressed)
+    (directory,) = out.iterdir()
+    session = Session.open(directory)
+    check_safe(session)
+    (end,) = [event.text for event in session.events() if event.kind == "run.end"]
+    stopped = phase not in ("opening", "run.end")
+    assert end == ("aborted: stopped by the operator" if stopped else "complete")
+    kinds = [event.kind for event in session.events()]
+    assert "held" not in kinds[kinds.index("run.end") :]  # a run that has ended cannot be held
+    assert answers
+    assert session.incomplete == ()
