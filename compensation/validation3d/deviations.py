@@ -11,7 +11,7 @@ from compensation.calibration.board import Board
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.pose import Lens
 from compensation.observations import Float, Observations
-from compensation.validation3d.poses import Found, find, middle_mm, rotation_mrad
+from compensation.validation3d.poses import Doubts, Found, find, middle_mm, rotation_mrad
 from compensation.validation3d.positions import FrameIndices, ValidationFrames
 
 _LEAST_MARKERS = 12
@@ -35,10 +35,11 @@ class Camera:
 class Deviations:
     """T temperatures, the first is the reference, P positions; NaN where there is no pose.
 
-    translation_um, rotation_mrad (T, P, 3): since the reference, along and about X, Y, Z. noise_um, model_um (T, P, 3):
-    standard uncertainty of the translation by the markers' noise and by the drift model; table_um (3,): by the table,
-    which repeat_um (T, 3), V0 at the end of each temperature minus V0 at its begin, tells. u_mrad (T, P, 3): of the
-    rotation, by noise and model. chi (T, P): misfit of the pose, 1 when noise explains it.
+    translation_um, rotation_mrad (T, P, 3): since the reference, along and about X, Y, Z. noise_um, model_um, stand_um
+    (T, P, 3): standard uncertainty of the translation by the markers' noise, the drift model and the stand's
+    correction; table_um (3,): by the table, which repeat_um (T, 3), V0 at the end of each temperature minus V0 at its
+    begin, tells. u_mrad (T, P, 3): of the rotation, by all but the table. chi (T, P): misfit of the pose, 1 when noise
+    explains it.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Deviations:
     rotation_mrad: Float
     noise_um: Float
     model_um: Float
+    stand_um: Float
     u_mrad: Float
     repeat_um: Float
     table_um: Float
@@ -54,7 +56,7 @@ class Deviations:
     @property
     def u_um(self) -> Float:
         """(T, P, 3): standard uncertainty of the translation; a deviation has the table's share twice."""
-        return np.sqrt(self.noise_um**2 + self.model_um**2 + 2 * self.table_um**2)
+        return np.sqrt(self.noise_um**2 + self.model_um**2 + self.stand_um**2 + 2 * self.table_um**2)
 
     @property
     def per_temperature_um(self) -> Float:
@@ -89,8 +91,10 @@ def deviations(
     frames: ValidationFrames,
     centres_px: Float,
     model_px2: Float | None = None,
+    errors_px: Float | None = None,
 ) -> Deviations:
-    """Of centres (F, N, 2), which may be corrected; model_px2 (F, N, 2, 2): covariance of the correction.
+    """Of centres (F, N, 2), which may be corrected. model_px2 (F, N, 2, 2), errors_px (V, F, N, 2): of the corrections,
+    as poses.Doubts has them.
 
     The frames of a position at a temperature are averaged first. CalibrationError when V0, V1, ... at the reference
     have no pose.
@@ -103,9 +107,17 @@ def deviations(
     for row, indices in zip(means, frames.frames, strict=True):
         grid.append([])
         for mean, chosen in zip(row, indices, strict=True):
-            uncertain = None if mean is None or model_px2 is None else model_px2[chosen].mean(axis=0)
-            grid[-1].append(None if mean is None else find(camera.lens, camera.board, mean, growth, uncertain, width))
+            doubts = _doubts(chosen, model_px2, errors_px)
+            grid[-1].append(None if mean is None else find(camera.lens, camera.board, mean, growth, doubts, width))
     return _compared(name, frames.names, grid)
+
+
+def _doubts(indices: FrameIndices, model_px2: Float | None, errors_px: Float | None) -> Doubts:
+    """Means over the frames: what is wrong with a correction is common to them. Of the frames that have the marker."""
+    return Doubts(
+        None if model_px2 is None or not len(indices) else _mean(model_px2[indices], axis=0),
+        None if errors_px is None or not len(indices) else _mean(errors_px[:, indices], axis=1),
+    )
 
 
 def _averaged(observations: Observations, centres_px: Float, indices: FrameIndices) -> MeanCentres | None:
@@ -133,6 +145,7 @@ def _compared(name: str, names: tuple[str, ...], grid: list[list[Found | None]])
         rotation_mrad=np.array([[one.rotation_mrad for one in row] for row in apart]),
         noise_um=np.array([[one.noise_um for one in row] for row in apart]),
         model_um=np.array([[one.model_um for one in row] for row in apart]),
+        stand_um=np.array([[one.stand_um for one in row] for row in apart]),
         u_mrad=np.array([[one.u_mrad for one in row] for row in apart]),
         repeat_um=np.array([one.translation_um for one in repeats]),
         table_um=_table_um(repeats),
@@ -148,20 +161,23 @@ class _Apart:
     rotation_mrad: Float
     noise_um: Float
     model_um: Float
+    stand_um: Float
     u_mrad: Float
 
 
 def _apart(found: Found | None, other: Found | None) -> _Apart:
-    """The drift model counts once: at the reference its correction is near nothing, and so is its error."""
+    """Corrections count once: at the reference they are near nothing, and so are their errors."""
     if found is None or other is None:
-        return _Apart(*np.full((5, 3), np.nan))
-    noise, model = np.diagonal(found.noise) + np.diagonal(other.noise), np.diagonal(found.model)
+        return _Apart(*np.full((6, 3), np.nan))
+    noise = np.diagonal(found.noise) + np.diagonal(other.noise)
+    model, stand = np.diagonal(found.model), np.diagonal(found.stand)
     return _Apart(
         translation_um=1e3 * (found.place_mm - other.place_mm),
         rotation_mrad=rotation_mrad(found, other),
         noise_um=1e3 * np.sqrt(noise[3:]),
         model_um=1e3 * np.sqrt(model[3:]),
-        u_mrad=1e3 * np.sqrt((noise + model)[:3]),
+        stand_um=1e3 * np.sqrt(stand[3:]),
+        u_mrad=1e3 * np.sqrt((noise + model + stand)[:3]),
     )
 
 

@@ -56,6 +56,7 @@ def _result(one: Deviations) -> dict[str, Any]:
         "u_um": one.u_um,
         "noise_um": one.noise_um,
         "model_um": one.model_um,
+        "stand_um": one.stand_um,
         "table_um": one.table_um,
         "rotation_mrad": one.rotation_mrad,
         "u_mrad": one.u_mrad,

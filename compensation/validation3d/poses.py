@@ -17,34 +17,47 @@ _CORRELATED = 1 / 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Doubts:
+    """What is uncertain of centres besides their noise; None without a correction.
+
+    model_px2 (N, 2, 2): covariance of the drift model's. errors_px (V, N, 2): of the stand's, V fields of one standard
+    uncertainty each.
+    """
+
+    model_px2: Float | None = None
+    errors_px: Float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """place_mm (3,): of the target's middle. rotation (3, 3). noise (6, 6): covariance of a small rotation (rad) and of
-    the place (mm) by the markers' noise; model: by the drift model's uncertainty, 0 without one. chi: of Pose."""
+    """place_mm (3,): of the target's middle. rotation (3, 3). noise, model, stand (6, 6): covariances of a small
+    rotation (rad) and of the place (mm) by the markers' noise, the drift model, the stand's correction. chi: of Pose.
+    """
 
     place_mm: Float
     rotation: Float
     noise: Float
     model: Float
+    stand: Float
     chi: float
 
 
-def find(
-    lens: Lens, board: Board, mean: MeanCentres, growth: float, model_px2: Float | None, image_width_px: int
-) -> Found:
-    """Pose from mean centres, their covariances times `growth`. model_px2 (N, 2, 2): of the drift model's correction.
-
-    CalibrationError when the markers give no pose.
-    """
+def find(lens: Lens, board: Board, mean: MeanCentres, growth: float, doubts: Doubts, image_width_px: int) -> Found:
+    """Pose from mean centres, their covariances times `growth`. CalibrationError when the markers give no pose."""
     covariance_px2 = mean.covariance_px2 * growth
     pose = find_pose(lens, board, mean.centres_px, covariance_px2)
+    seen = np.isfinite(mean.centres_px[:, 0])
+    pixels = mean.centres_px[seen]
     about_middle = _about(pose, middle_mm(board))
-    model = np.zeros((6, 6))
-    if model_px2 is not None:
-        seen = np.isfinite(mean.centres_px[:, 0])
-        gain = about_middle @ _gain(lens, board.points_mm[seen], pose, mean.centres_px[seen], covariance_px2[seen])
-        model = gain @ _field(mean.centres_px[seen], model_px2[seen], _CORRELATED * image_width_px) @ gain.T
+    gain = about_middle @ _gain(lens, board.points_mm[seen], pose, pixels, covariance_px2[seen])
+    model, stand = np.zeros((6, 6)), np.zeros((6, 6))
+    if doubts.model_px2 is not None:
+        model = gain @ _field(pixels, doubts.model_px2[seen], _CORRELATED * image_width_px) @ gain.T
+    if doubts.errors_px is not None:
+        moved = doubts.errors_px[:, seen].reshape(len(doubts.errors_px), -1) @ gain.T
+        stand = moved.T @ moved
     noise = about_middle @ pose.covariance @ about_middle.T
-    return Found(pose.place_mm(middle_mm(board)), pose.rotation, noise, model, pose.chi)
+    return Found(pose.place_mm(middle_mm(board)), pose.rotation, noise, model, stand, pose.chi)
 
 
 def middle_mm(board: Board) -> Float:

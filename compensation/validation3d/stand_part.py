@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.budget.correction import stand_correction
+from compensation.budget.correction import displacement_px, varied
 from compensation.budget.geometry import Geometry, Quantity, StandState
-from compensation.budget.states import mean_state, states_at
+from compensation.budget.states import is_known, mean_state, states_at
 from compensation.observations import Float, Observations
 from compensation.validation3d.positions import ValidationFrames
 from drivers.interface import SessionError
@@ -21,13 +21,17 @@ from stand.recording.session import Session
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandPart:
-    """What the stand has done to each centre since the reference temperature, px; (F, N, 2), NaN in other frames.
+    """What the stand has done to each centre since the reference temperature, px; NaN in frames that are not used.
 
-    here: with the target where it is. at_fit: with it at geometry.distance_mm, where the drift was measured.
+    here (F, N, 2): with the target where it is. excess (F, N, 2): that minus what it does to a target at
+    geometry.distance_mm, where the drift was measured. here_errors, excess_errors (V, F, N, 2): how much they change
+    when one of V uncertain inputs is larger by its standard uncertainty.
     """
 
     here: Float
-    at_fit: Float
+    excess: Float
+    here_errors: Float
+    excess_errors: Float
 
 
 def stand_part(
@@ -40,25 +44,27 @@ def stand_part(
     used = frames.used
     states = dict(zip(used.tolist(), states_at(session, observations.time_ns[used]), strict=True))
     reference = mean_state([states[index] for row in frames.frames[0] for index in row.tolist()])
-    here, at_fit = (np.full(observations.centres_px.shape, np.nan) for _ in range(2))
-    there = [geometry.model_copy(update={"distance_mm": _moved(geometry, z_mm)}) for z_mm in distances_mm.tolist()]
+    unknown = [state for state in (reference, *states.values()) if not is_known(state)]
+    if unknown:
+        raise SessionError(f"{session.path}: a thermometer was silent: the stand's part cannot be told ({unknown[0]})")
+    at = [geometry.model_copy(update={"distance_mm": _moved(geometry, z_mm)}) for z_mm in distances_mm.tolist()]
+    inputs = 1 + sum(1 for _ in varied(reference, geometry))
+    here, at_fit = (np.full((inputs, *observations.centres_px.shape), np.nan) for _ in range(2))
     for row in frames.frames:
-        for stand, indices in zip([*there, there[0]], row, strict=True):
+        for stand, indices in zip([*at, at[0]], row, strict=True):
             for index in indices.tolist():
                 centres = observations.centres_px[index]
-                here[index] = _displacement_px(session, states[index], reference, stand, centres)
-                at_fit[index] = _displacement_px(session, states[index], reference, geometry, centres)
-    return StandPart(here, at_fit)
+                here[:, index] = _displacements_px(states[index], reference, stand, centres)
+                at_fit[:, index] = _displacements_px(states[index], reference, geometry, centres)
+    excess = here - at_fit
+    return StandPart(here[0], excess[0], here[1:] - here[0], excess[1:] - excess[0])
 
 
 def _moved(geometry: Geometry, distance_mm: float) -> Quantity:
     return Quantity(value=distance_mm, u=geometry.distance_mm.u)
 
 
-def _displacement_px(
-    session: Session, state: StandState, reference: StandState, geometry: Geometry, centres_px: Float
-) -> Float:
-    try:
-        return stand_correction(state, reference, geometry).displacement_px(centres_px)
-    except ValueError as error:
-        raise SessionError(f"{session.path}: {error}") from error
+def _displacements_px(state: StandState, reference: StandState, geometry: Geometry, centres_px: Float) -> Float:
+    """(1 + V, N, 2): nominal, and with each uncertain input larger in turn."""
+    inputs = [(state, geometry), *varied(state, geometry)]
+    return np.array([displacement_px(each, reference, stand, centres_px) for each, stand in inputs])

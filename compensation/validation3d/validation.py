@@ -153,11 +153,19 @@ def _stand_variants(
     if stand is None:
         return None, None
     alone = observations.centres_px - stand.here
-    nearer = compensated.centres_px - (stand.here - stand.at_fit)
+    nearer, model_px2 = compensated.centres_px - stand.excess, compensated.model_px2
     return (
-        deviations("before, without the stand's part", camera, observations, frames, alone),
         deviations(
-            "after, the stand's part at each distance", camera, observations, frames, nearer, compensated.model_px2
+            "before, without the stand's part", camera, observations, frames, alone, errors_px=stand.here_errors
+        ),
+        deviations(
+            "after, the stand's part at each distance",
+            camera,
+            observations,
+            frames,
+            nearer,
+            model_px2,
+            stand.excess_errors,
         ),
     )
 

@@ -23,7 +23,7 @@ from compensation.report.validation_report import validation_page
 from compensation.validation3d.deviations import Camera, Deviations, deviations
 from compensation.validation3d.document import as_json
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from compensation.validation3d.poses import find
+from compensation.validation3d.poses import Doubts, find
 from compensation.validation3d.table import summary
 from compensation.validation3d.validation import LensModel, Validation, camera_of, check_same, validate
 from drivers.interface import SessionError
@@ -137,11 +137,11 @@ def test_the_drift_models_uncertainty_reaches_the_pose(laboratory: Laboratory, c
 
     def place_um(shift_px: Float) -> Float:
         mean = mean_centres((centres + shift_px)[None], covariance[None])
-        return 1e3 * find(camera.lens, camera.board, mean, 1.0, None, SIZE[0]).place_mm
+        return 1e3 * find(camera.lens, camera.board, mean, 1.0, Doubts(), SIZE[0]).place_mm
 
     places = np.array([place_um(0.003 * root @ random.standard_normal((54, 2))) for _ in range(200)])
     mean = mean_centres(centres[None], covariance[None])
-    claimed = find(camera.lens, camera.board, mean, 1.0, model_px2, SIZE[0]).model
+    claimed = find(camera.lens, camera.board, mean, 1.0, Doubts(model_px2), SIZE[0]).model
     assert places.std(axis=0) == pytest.approx(1e3 * np.sqrt(np.diagonal(claimed)[3:]), rel=0.15)
 
 

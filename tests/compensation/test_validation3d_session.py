@@ -159,6 +159,11 @@ def test_validate_writes_the_page_and_the_numbers_beside_it(folder: Path, tmp_pa
         assert np.subtract(alone[position], before[position])[2] == pytest.approx(-granite_um, rel=0.05)
         extra_um = granite_um * (z_mm / 826 - 1)  # what a drift fitted at 826 mm has taken out too much
         assert np.subtract(with_stand[position], after[position])[2] == pytest.approx(extra_um, rel=0.05)
+        (own_um, z_um) = (one["stand_um"][1][position][2] for one in document["results"][2:])
+        # 10 % of the expansion, 20 mm of the length, 1 K of gradient in either part, 0.1 K of the target
+        parts_um = [0.1 * granite_um, 1e3 * 5e-6 * 20 * GRANITE_K, 2.065, 2.065, 1e3 * 8.5e-6 * 0.1 * z_mm]
+        assert own_um == pytest.approx(np.linalg.norm(parts_um), rel=0.02)
+        assert 0.05 * extra_um < z_um < 0.25 * extra_um
 
 
 def test_rays_give_the_same_without_the_stand(folder: Path, tmp_path: Path):
