@@ -235,6 +235,7 @@ class Recorder:
         while True:
             due_ns = await self._next_tick(due_ns)
             await self._save_telemetry()
+            self._report()  # a disk that is nearly full: each frame until somebody knows of it is lost
 
     async def _close_old_frames_on_ticks(self) -> None:
         """A soak is long: its last frames are not left unfinished, nor their reserve taken, until the next ones."""
