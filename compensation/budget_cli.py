@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from compensation.budget.budget import budget, table
+from compensation.budget.budget import Budget, budget, table
 from compensation.budget.geometry import load_geometry
 from compensation.command_line import TargetOption, named_target, one_line_errors
 from compensation.observations import session_target
+from compensation.target import Target
 from stand.recording.session import Session
 
 
@@ -27,3 +29,13 @@ def budget_of_session(
         stand = load_geometry(geometry)
         recorded = Session.open(session)
         typer.echo(table(budget(recorded, named_target(target) or session_target(recorded), stand)))
+
+
+def budgets_of_sessions(paths: Sequence[Path], geometry: str, target: Target | None) -> dict[str, Budget]:
+    """The budget of each session, by its name. SessionError or ConfigError with a sentence."""
+    stand = load_geometry(geometry)
+    opened = [Session.open(path) for path in paths]
+    return {
+        session.metadata.get("session_id", ""): budget(session, target or session_target(session), stand)
+        for session in opened
+    }

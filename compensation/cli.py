@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from compensation.apply_cli import apply_model, export_model
-from compensation.budget_cli import budget_of_session
+from compensation.budget_cli import budget_of_session, budgets_of_sessions
 from compensation.calibration_cli import calibrate_session
 from compensation.command_line import (
     Cache,
@@ -31,7 +31,7 @@ from compensation.finding.found import finder
 from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found, read_image
 from compensation.markers.table import DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
-from compensation.report.report import write_report
+from compensation.report.report import Extras, can_be_fitted, check_report_writable, write_report
 from compensation.target import Target
 from compensation.validate_cli import validate_session
 from drivers.interface import ConfigError
@@ -124,6 +124,9 @@ def report(
     sessions: Sessions,
     out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write.")],
     model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="With the stand's budget, by its geometry: a file, or the installed `paper`.")
+    ] = None,
     target: TargetOption = None,
     workers: Workers = 1,
     cluster: Cluster = None,
@@ -131,17 +134,22 @@ def report(
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
+    Its numbers are in a JSON file of the same name beside it. Sessions without a thermal cycle have their drift alone.
+
     Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
     """
     with one_line_errors():
-        check_writable(out)
+        check_report_writable(out, model)
         found_by = finder(workers, cluster, use_cache=cache)
         given = None if model is None else load_model(model)
-        observations = observe_sessions(sessions, progress, named_target(target), found_by)
-        used = given or fit_model(observations)
-        evaluation = evaluate(used, observations)
-        write_report(out, observations, used, evaluation)
-        typer.echo(table(evaluation))
+        wanted = named_target(target)
+        budgets = {} if budget is None else budgets_of_sessions(sessions, budget, wanted)
+        observations = observe_sessions(sessions, progress, wanted, found_by)
+        has_cycle = can_be_fitted(observations)
+        used = fit_model(observations) if given is None and has_cycle else given
+        evaluation = None if used is None or not has_cycle else evaluate(used, observations)
+        write_report(out, observations, used, evaluation, Extras(budgets))
+        typer.echo("no thermal cycle: no model, drift alone" if evaluation is None else table(evaluation))
 
 
 def _open(path: Path) -> Session | Path:

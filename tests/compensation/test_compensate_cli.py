@@ -97,14 +97,17 @@ def test_fit_then_report_then_analyse_agree(recorded: Recorded, tmp_path: Path, 
     evaluation = analyse([recorded.path], tmp_path / "model2.json", tmp_path / "report2.html", progress)
     assert table(evaluation) == reported.stdout.rstrip("\n")
     assert (tmp_path / "model2.json").read_bytes() == (tmp_path / "model.json").read_bytes()
-    assert (tmp_path / "report2.html").read_bytes() == (tmp_path / "report.html").read_bytes()
+    for suffix in ("html", "json"):
+        assert (tmp_path / f"report2.{suffix}").read_bytes() == (tmp_path / f"report.{suffix}").read_bytes()
     assert evaluation.rms_before_px[1] > 0.4
     assert max(evaluation.rms_after_px) < 0.012  # discs of 10 px in radius: about 6 mpx of noise
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "model.json",
         "model2.json",
         "report.html",
+        "report.json",
         "report2.html",
+        "report2.json",
     ]
     assert "find markers: 100%" in capsys.readouterr().err
 

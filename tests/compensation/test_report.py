@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,17 +11,41 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from compensation.budget.budget import Budget, Contribution
+from compensation.budget.geometry import StandState
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import Evaluation, evaluate
-from compensation.observations import Observations, Role, concatenate
-from compensation.report import figures
-from compensation.report.report import report_page, write_report
+from compensation.observations import Observations
+from compensation.report.compensation_section import uncertainty_section
+from compensation.report.gather import numbers_of
+from compensation.report.numbers import Numbers, as_json
+from compensation.report.report import Extras, can_be_fitted, check_report_writable, report_page, write_report
+from compensation.report.result_section import result_section
 from drivers.interface import SessionError
 
-from .synthetic import facts, observations, quadratic
+from .synthetic import facts, observations, places_px, quadratic
 
 Analysed = tuple[Observations, PaperModel, Evaluation]
+BUDGET = Budget(
+    reference=StandState(24.01, 24.02, 24.03, 24.04, 24.05),
+    air_degC=(10.5, 51.5),
+    contributions=(
+        Contribution("granite along the axis", 25.17, 4.05, -0.04861, 0.00782, "the frame's corner", True),
+        Contribution("linear table, resolution", 0.31, float("nan"), 0.00047, float("nan"), "outermost", False),
+    ),
+)
+HEADINGS = (
+    "Result",
+    "Warm-up",
+    "Drift over temperature",
+    "Before and after compensation",
+    "Model",
+    "Uncertainty",
+    "The stand's budget",
+    "Recorded data",
+    "Frames left out",
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +56,41 @@ def analysed() -> Analysed:
     reasons = ("",) * 33 + ("found 3 of 54 markers <of> paper-9x6",)
     flags = night.flags.copy()
     flags[5, 7] = 2
-    night = replace(night, role=role, reasons=reasons, flags=flags)
+    step_id = ("warm-up",) * 4 + night.step_id[4:]
+    night = replace(night, role=role, reasons=reasons, flags=flags, step_id=step_id)
     model = fit_paper(night)
     return night, model, evaluate(model, night)
 
 
 @pytest.fixture(scope="module")
-def page(analysed: Analysed) -> str:
-    return report_page(*analysed)
+def written(analysed: Analysed, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("written") / "report.html"
+    write_report(path, *analysed, Extras(budgets={"night-1": BUDGET}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(written: Path) -> str:
+    return written.read_text()
+
+
+@pytest.fixture(scope="module")
+def numbers(analysed: Analysed) -> Numbers:
+    return numbers_of(*analysed, {})
+
+
+def warm_up_only(frames: int = 12, roles: tuple[str, ...] = ("warm_up",)) -> Observations:
+    """A session in one view; frames take the roles in turn."""
+    rising = tuple(np.linspace(24.0, 40.0, frames // 2))
+    cold = observations(quadratic, 0.003, fit_degC=rising, held_out_degC=(), session=facts("cold"))
+    count = len(cold.role)
+    role = np.resize(np.array(roles, "U16"), count)
+    time_ns = cold.time_ns[0] + np.arange(count) * 500_000_000
+    return replace(cold, role=role, step_id=("warm-up",) * count, time_ns=time_ns)
+
+
+def headings(page: str) -> list[str]:
+    return [text.replace("&#x27;", "'") for text in re.findall("<h2>(.*?)</h2>", page)]
 
 
 def test_it_needs_no_other_file(page: str):
@@ -53,7 +105,7 @@ def test_it_needs_no_other_file(page: str):
 
 def test_its_figures_are_sound_svg_with_ids_of_their_own(page: str):
     drawings = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
-    assert len(drawings) == 5
+    assert len(drawings) == 10
     for drawing in drawings:
         ET.fromstring(drawing)
     ids = re.findall(r'\bid="([^"]+)"', page)
@@ -62,78 +114,137 @@ def test_its_figures_are_sound_svg_with_ids_of_their_own(page: str):
     assert used <= set(ids)
 
 
-def test_the_same_data_give_the_same_bytes(analysed: Analysed, page: str):
-    assert report_page(*analysed) == page
+def test_the_same_data_give_the_same_bytes(analysed: Analysed, written: Path, tmp_path: Path):
+    write_report(tmp_path / "again.html", *analysed, Extras(budgets={"night-1": BUDGET}))
+    assert (tmp_path / "again.html").read_bytes() == written.read_bytes()
+    assert (tmp_path / "again.json").read_bytes() == written.with_suffix(".json").read_bytes()
 
 
 def test_it_says_what_was_found_and_what_was_left_out(page: str, analysed: Analysed):
+    assert headings(page) == list(HEADINGS)
     for text in (
         "Thermal compensation of camera TS-0001",
         "0.191", "0.576", "0.100", "0.090",
         f"{analysed[2].rms_before_px[1]:.3f}",
-        f"{analysed[2].rms_after_px[1]:.3f}",
         "night-1", "thermal-cycle",
         "34 (4 reference, 14 fit, 12 validation, 4 warm-up); 1 of them cannot be used",
         "1 set aside (1 saturated)",
-        "night-1, frame 33", "found 3 of 54 markers &lt;of&gt; paper-9x6",
+        "<td>night-1</td><td>found 3 of 54 markers &lt;of&gt; paper-9x6</td><td>1</td><td>33</td>",
         "camera 25.00 to 67.00 °C",
+        "<td>granite along the axis</td><td>25.17</td><td>4.05</td><td>-48.61</td><td>7.82</td>",
+        "<td>linear table, resolution</td><td>0.31</td><td></td><td>0.47</td><td></td>",
         "numpy",
     ):  # fmt: skip
         assert text in page, text
     assert "simulated" not in page
-    rows = re.findall(r"<tr( class=chosen)?><td>(\d)</td><td>(\d+)</td>", page)
+
+
+def test_the_table_of_choice_has_every_degree_and_the_one_in_use_is_bold(page: str, analysed: Analysed):
+    rows = re.findall(r"<tr( class=chosen)?><td>paper: P\^(\d)</td><td>(\d+)</td>", page)
     assert [(degree, terms) for _, degree, terms in rows] == [
-        ("1", "4"),
-        ("2", "10"),
-        ("3", "20"),
-        ("4", "35"),
-        ("5", "56"),
+        ("1", "8"),
+        ("2", "20"),
+        ("3", "40"),
+        ("4", "70"),
+        ("5", "112"),
     ]
     assert [degree for chosen, degree, _ in rows if chosen] == [str(analysed[1].degree)]
 
 
-def test_an_interval_that_claims_too_much_is_told(analysed: Analysed, page: str):
-    night, model, evaluation = analysed
-    assert "thermal lag, hysteresis" not in page
-    assert "thermal lag, hysteresis" in report_page(night, model, replace(evaluation, coverage_95=(0.96, 0.34)))
+def test_page_and_file_have_the_numbers_of_the_evaluation(page: str, written: Path, analysed: Analysed):
+    _, model, evaluation = analysed
+    found = json.loads(written.with_suffix(".json").read_text())
+    score = found["score"]
+    assert tuple(score["before_px"]) == evaluation.rms_before_px
+    assert tuple(score["after_px"]) == evaluation.rms_after_px
+    assert tuple(score["coverage_95"]) == evaluation.coverage_95
+    assert score["centres"] == len(evaluation.after_px)
+    assert [row["chamber_degC"] for row in score["temperatures"]] == [14.0, 20.0, 27.0, 34.0, 41.0, 48.0]
+    assert found["model"]["discrepancy_px"] == model.discrepancy_px.tolist()
+    for row in score["temperatures"]:
+        cells = (f"{row['before_px'][0]:.3f}", f"{1e3 * row['after_px'][0]:.1f}", f"{row['before_px'][1]:.3f}")
+        assert "".join(f"<td>{cell}</td>" for cell in cells) in page
+    i, j = found["warm_ups"][0]["drift_px"]
+    assert f"<td>{i:.3f}</td><td>{j:.3f}</td>" in page
+    gap = found["hysteresis_before"][0]["largest_px"]
+    assert gap == [None, None] or f"{1e3 * gap[1]:z.1f}" in page
+    assert found["budgets"]["night-1"]["contributions"][1]["u_um"] is None
+    assert found["unusable"] == [
+        {"session_id": "night-1", "reason": "found 3 of 54 markers <of> paper-9x6", "frames": [33]}
+    ]
 
 
-def test_a_simulated_session_is_called_so(analysed: Analysed):
-    night, model, _ = analysed
-    for simulated, tells in ((True, True), (False, False)):
-        own = replace(night, sessions=(replace(night.sessions[0], simulated=simulated),))
-        page = report_page(own, model, evaluate(model, own))
-        assert ("Recorded in a simulated laboratory." in page) is tells
-        assert ("<td>this report (simulated)</td>" in page) is tells
+def test_the_uncertainty_is_what_noise_and_model_make(numbers: Numbers):
+    score = numbers.score
+    assert score is not None
+    np.testing.assert_allclose(score.marker_sigma_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=1e-6)
+    assert (np.array(score.claimed_sigma_px) >= score.marker_sigma_px).all()
+    assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in "".join(uncertainty_section(numbers))
 
 
-def test_a_report_that_cannot_be_written_leaves_nothing(analysed: Analysed, tmp_path: Path):
+def test_an_interval_that_claims_too_much_is_told(numbers: Numbers):
+    assert numbers.score is not None
+    too_few = replace(numbers, score=replace(numbers.score, coverage_95=(0.96, 0.34)))
+    assert "thermal lag, hysteresis" not in "".join(result_section(numbers))
+    assert "thermal lag, hysteresis" in "".join(result_section(too_few))
+
+
+def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
+    cold = warm_up_only()
+    assert not can_be_fitted(cold)
+    for simulated in (True, False):
+        own = replace(cold, sessions=(replace(cold.sessions[0], simulated=simulated),))
+        write_report(tmp_path / "report.html", own, None, None)
+        text = (tmp_path / "report.html").read_text()
+        assert headings(text) == ["Result", "Warm-up", "Drift over time", "Recorded data"]
+        assert ("Recorded in a simulated laboratory." in text) is simulated
+        assert ("<td>this report (simulated)</td>" in text) is simulated
+    found = json.loads((tmp_path / "report.json").read_text())
+    assert found["model"] is None
+    assert found["score"] is None
+    i, j = found["warm_ups"][0]["drift_px"]
+    expected = quadratic(places_px(), 16.0) - places_px()
+    np.testing.assert_allclose([i, j], expected.mean(axis=0), atol=0.003)
+
+
+def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving_out():
+    night = observations(quadratic, 0.005, held_out_degC=())
+    model = fit_paper(night, 2)
+    text = report_page(night, model, evaluate(model, night))
+    assert headings(text) == [
+        name for name in HEADINGS if name not in ("Warm-up", "The stand's budget", "Frames left out")
+    ]
+    assert "one temperature left out at a time" in text
+
+
+def test_a_long_warm_up_does_not_make_a_large_page():
+    text = report_page(warm_up_only(3600), None, None)
+    assert len(text.encode()) < 1_000_000
+    assert "only so many are drawn" in text
+
+
+def test_what_a_session_says_of_itself_cannot_change_the_page():
+    evil = '"><script>alert(1)</script><b id="x'
+    cold = warm_up_only()
+    named = replace(facts(evil, evil), recipe=evil, operator=evil, software_version=evil)
+    reasons = ("",) * (len(cold.role) - 1) + (evil,)
+    target = cold.target.model_copy(update={"name": evil})
+    own = replace(cold, sessions=(named,), reasons=reasons, target=target)
+    text = report_page(own, None, None)
+    assert "<script" not in text
+    assert '<b id="x' not in text
+    assert text.count("&lt;script&gt;") >= 6
+    assert json.loads(as_json(numbers_of(own, None, None, {})))["sessions"][0]["operator"] == evil
+
+
+def test_a_report_that_cannot_be_written_leaves_nothing(tmp_path: Path):
     with pytest.raises(SessionError, match="cannot be written"):
-        write_report(tmp_path / "none" / "report.html", *analysed)
-    write_report(tmp_path / "report.html", *analysed)
-    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+        write_report(tmp_path / "none" / "report.html", warm_up_only(), None, None)
+    assert not list(tmp_path.iterdir())
 
 
-def test_the_drift_is_measured_from_the_reference_or_else_from_the_first_frame():
-    night = observations(quadratic)
-    cold = replace(
-        observations(quadratic, fit_degC=(10.0, 24.0), held_out_degC=(), session=facts("cold")),
-        role=np.array(["warm_up"] * 12),
-    )
-    moved = figures.drift(concatenate([night, cold]))
-    np.testing.assert_allclose(moved[:8], 0, rtol=0, atol=1e-9)
-    assert np.abs(moved[-1]).max() < 1e-9  # 24 degC, as in its first frame
-    expected = quadratic(night.centres_px[0], -14.0) - night.centres_px[0]
-    np.testing.assert_allclose(moved[-3], expected, rtol=0, atol=1e-9)
-
-
-def test_figures_bear_missing_frames_and_temperatures():
-    night = observations(quadratic, 0.005)
-    centres, air = night.centres_px.copy(), night.air_degC.copy()
-    centres[3] = np.nan
-    centres[:, 5] = np.nan
-    air[:] = np.nan
-    holes = replace(night, centres_px=centres, air_degC=air)
-    assert np.isnan(figures.drift(holes)[3]).all()
-    for figure in (figures.trajectories(holes, holes.of(*Role)), figures.against_time(holes)):
-        assert figures.as_svg(figure, "holes").startswith("<svg")
+def test_its_numbers_do_not_take_the_place_of_another_file(tmp_path: Path):
+    check_report_writable(tmp_path / "report.html", tmp_path / "model.json", None)
+    for page_path, model in (("report.json", None), ("model.html", tmp_path / "model.json")):
+        with pytest.raises(SessionError, match="would overwrite"):
+            check_report_writable(tmp_path / page_path, model)

@@ -1,0 +1,150 @@
+"""The compensation: fit, what is left, which form was chosen and why, and how uncertain it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from matplotlib.figure import Figure
+
+from compensation.drift.candidates import Candidate
+from compensation.drift.validation import Evaluation
+from compensation.observations import Observations
+from compensation.report import fit_figures as figures
+from compensation.report.figures import as_svg
+from compensation.report.numbers import ModelNumbers, Numbers, ScoreNumbers
+from compensation.report.page import facts, figure, heading, paragraph, table
+from compensation.report.path_figures import EXAGGERATION
+
+_FORMS = {
+    "paper": "displacement to the reference = P(I, J, T), one polynomial per coordinate; T is the camera's temperature",
+    "thermal": "displacement to the reference = the motions of a homography, each linear in the camera's thermal state",
+}
+_MOST_THERMAL = 10
+
+
+def compensation_section(observations: Observations, evaluation: Evaluation, score: ScoreNumbers) -> Iterator[str]:
+    """Before and after."""
+    method = score.method
+    yield heading("Before and after compensation")
+    yield figure(
+        as_svg(figures.compensated_paths(observations, evaluation), "compensated"),
+        f"Drift of each marker, enlarged {EXAGGERATION} times, before and after compensation; {method}.",
+    )
+    of_evaluation: tuple[tuple[str, Callable[[Evaluation], Figure], str], ...] = (
+        (
+            "fit",
+            figures.measured_against_model,
+            "Measured drift of each marker centre against the drift the model says; on the line both are the same",
+        ),
+        (
+            "residuals",
+            figures.residuals,
+            "What the model leaves of each centre; grey is the 95 % interval that model and markers claim together",
+        ),
+        (
+            "histogram",
+            figures.histogram,
+            "Deviations of marker centres from their reference, before compensation and, on a scale of its own, after",
+        ),
+        ("temperature", figures.against_temperature, "RMS deviation at each chamber temperature"),
+    )
+    for name, draw, caption in of_evaluation:
+        yield figure(as_svg(draw(evaluation), name), f"{caption}; {method}.")
+    yield table(
+        ("chamber, °C", "camera, °C", "frames", "I before, px", "I after, mpx", "J before, px", "J after, mpx"),
+        [
+            (
+                f"{row.chamber_degC:g}",
+                f"{row.camera_degC:.2f}",
+                str(row.frames),
+                f"{row.before_px[0]:.3f}",
+                f"{1e3 * row.after_px[0]:.1f}",
+                f"{row.before_px[1]:.3f}",
+                f"{1e3 * row.after_px[1]:.1f}",
+            )
+            for row in score.temperatures
+        ],
+    )
+
+
+def model_section(model: ModelNumbers) -> Iterator[str]:
+    """The form in use, where it holds, and what else was tried."""
+    low, high = model.camera_range_degC
+    columns, rows = zip(*model.hull_px, strict=True)
+    yield heading("Model")
+    yield facts(
+        [
+            ("Form", f"{model.form}: {_FORMS[model.form]}"),
+            ("In use", model.title),
+            ("Reference", f"camera {model.reference_degC:.2f} °C, chamber {model.reference_chamber_degC:g} °C"),
+            (
+                "Valid for",
+                f"camera {low:.2f} to {high:.2f} °C; I {min(columns):.0f} to {max(columns):.0f} px, "
+                f"J {min(rows):.0f} to {max(rows):.0f} px",
+            ),
+            ("Fitted to", ", ".join(model.session_ids)),
+            ("Fitted by", f"thermostand {model.software_version}"),
+        ]
+    )
+    yield paragraph(
+        "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is "
+        "the simplest of each form within one standard error of the best, or the one asked for; the thermal form takes "
+        "the paper's place when it is better by more than one standard error.",
+        aside=True,
+    )
+    yield from _candidates(model)
+    yield paragraph(_why(model))
+
+
+def _candidates(model: ModelNumbers) -> Iterator[str]:
+    """All of the paper's form, and the best of the others; the one in use is bold."""
+    paper = [one for one in model.candidates if one.form == "paper"]
+    others = [one for one in model.candidates if one.form != "paper"]
+    others.sort(key=lambda one: (not one.chosen, float(one.fold_squares.mean())))
+    rows = [*paper, *others[:_MOST_THERMAL]]
+    chosen = next((index for index, one in enumerate(rows) if one.chosen), None)
+    heads = ("candidate", "coefficients", "held-out RMS I, mpx", "J", "BIC")
+    yield table(heads, [_candidate(one) for one in rows], chosen=chosen)
+    if len(others) > _MOST_THERMAL:
+        yield paragraph(f"{len(others) - _MOST_THERMAL} more are in the file beside this page.", aside=True)
+
+
+def _why(model: ModelNumbers) -> str:
+    """The best of each form that was tried, one beside the other."""
+    best = [
+        min(tried, key=lambda one: float(one.fold_squares.mean()))
+        for form in _FORMS
+        if (tried := [one for one in model.candidates if one.form == form])
+    ]
+    listed = " and ".join(
+        f"{one.rms_px[0] * 1e3:.1f} / {one.rms_px[1] * 1e3:.1f} mpx (I / J) for the {one.form} form" for one in best
+    )
+    return f"At temperatures left out, the best leave {listed}. In use is the {model.form} form."
+
+
+def _candidate(one: Candidate) -> tuple[str, ...]:
+    name = one.name if one.name.startswith(one.form) else f"{one.form}: {one.name}"
+    rms = (f"{1e3 * value:.1f}" for value in one.rms_px)
+    return (name, str(one.terms), *rms, "" if one.bic is None else f"{one.bic:.0f}")
+
+
+def uncertainty_section(numbers: Numbers) -> Iterator[str]:
+    """Of a compensated centre, and whether the claim held."""
+    model, score = numbers.model, numbers.score
+    if model is None or score is None:
+        return
+    yield heading("Uncertainty")
+    yield table(
+        ("standard uncertainty, mpx", "I", "J"),
+        [
+            ("measured deviation of a centre (markers)", *_mpx(score.marker_sigma_px)),
+            ("unexplained by the form at temperatures left out", *_mpx(model.discrepancy_px)),
+            ("compensated centre, as claimed", *_mpx(score.claimed_sigma_px)),
+            ("compensated centre, as found (RMS)", *_mpx(score.after_px)),
+            ("part within the claimed 95 % interval", *(f"{100 * part:.1f} %" for part in score.coverage_95)),
+        ],
+    )
+
+
+def _mpx(values_px: tuple[float, float]) -> Iterator[str]:
+    return (f"{1e3 * value:.2f}" for value in values_px)

@@ -1,0 +1,173 @@
+"""The numbers of a report, from what was recorded, fitted and scored."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from datetime import UTC, datetime
+
+import numpy as np
+
+from compensation.budget.budget import Budget
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.hysteresis import Hysteresis, hysteresis
+from compensation.drift.validation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
+from compensation.markers.detection import Flag
+from compensation.observations import Float, Mask, Observations, Role
+from compensation.report.numbers import (
+    FORMAT,
+    HysteresisNumbers,
+    ModelNumbers,
+    Numbers,
+    Pair,
+    ScoreNumbers,
+    SessionNumbers,
+    UnusableFrames,
+    WarmUpNumbers,
+)
+from compensation.report.tracks import WarmUp, warm_ups
+
+PAPER_WARM_UP_PX = (0.3, 1.1)
+"""Mean drift of the paper's camera, not modified, while it warmed itself by 20 K at 24 degC (section 3.1)."""
+
+_LIBRARIES = ("thermostand", "numpy", "scipy", "opencv-python-headless", "matplotlib")
+
+
+def numbers_of(
+    observations: Observations,
+    model: DriftModel | None,
+    evaluation: Evaluation | None,
+    budgets: Mapping[str, Budget],
+) -> Numbers:
+    """Everything that the report says."""
+    return Numbers(
+        format=FORMAT,
+        versions={name: importlib.metadata.version(name) for name in _LIBRARIES},
+        camera=observations.sessions[0].camera_serial,
+        target=observations.target.name,
+        simulated=observations.simulated,
+        image_px=observations.image_size,
+        sessions=tuple(_session(observations, index) for index in range(len(observations.sessions))),
+        unusable=tuple(_unusable(observations)),
+        warm_ups=tuple(_warm_up(observations, one) for one in warm_ups(observations)),
+        score=None if evaluation is None else _score(evaluation),
+        hysteresis_before=_hysteresis(hysteresis(observations)),
+        hysteresis_after=() if model is None else _hysteresis(hysteresis(observations, model)),
+        model=None if model is None else _model(model),
+        budgets=dict(budgets),
+        paper={"before_px": PAPER_BEFORE_PX, "after_px": PAPER_AFTER_PX, "warm_up_px": PAPER_WARM_UP_PX},
+    )
+
+
+def _session(observations: Observations, index: int) -> SessionNumbers:
+    facts, own = observations.sessions[index], observations.session == index
+    used = own & observations.usable
+    flags = observations.flags[used]
+    by_flag = {_words(flag.name or ""): int(((flags & flag) != 0).sum()) for flag in Flag}
+    by_role = {str(role): int((own & (observations.role == str(role))).sum()) for role in Role}
+    return SessionNumbers(
+        session_id=facts.session_id,
+        recipe=facts.recipe,
+        operator=facts.operator,
+        software_version=facts.software_version,
+        simulated=facts.simulated,
+        incomplete_segments=facts.incomplete,
+        begin=_instant(observations.time_ns[own][0]),
+        end=_instant(observations.time_ns[own][-1]),
+        frames=int(own.sum()),
+        frames_by_role={role: count for role, count in by_role.items() if count},
+        unusable=int((own & ~observations.usable).sum()),
+        chamber_degC=_set_points(observations, own),
+        camera_degC=_extent(observations.camera_degC[used]),
+        centres=flags.size,
+        set_aside=int(np.count_nonzero(flags)),
+        flags={flag: count for flag, count in by_flag.items() if count},
+    )
+
+
+def _words(name: str) -> str:
+    return name.lower().replace("_", " ")
+
+
+def _instant(time_ns: int) -> str:
+    return datetime.fromtimestamp(int(time_ns) // 1_000_000_000, UTC).isoformat()
+
+
+def _set_points(observations: Observations, own: Mask) -> tuple[float, ...]:
+    found = observations.chamber_degC[own]
+    return tuple(np.unique(found[np.isfinite(found)]).tolist())
+
+
+def _extent(values: Float) -> Pair:
+    return (float(values.min()), float(values.max())) if len(values) else (math.nan, math.nan)
+
+
+def _unusable(observations: Observations) -> Iterator[UnusableFrames]:
+    for index, facts in enumerate(observations.sessions):
+        found: dict[str, list[int]] = {}
+        for row in np.flatnonzero((observations.session == index) & ~observations.usable).tolist():
+            found.setdefault(observations.reasons[row], []).append(int(observations.frame[row]))
+        for reason, frames in sorted(found.items(), key=lambda item: (-len(item[1]), item[1][0])):
+            yield UnusableFrames(facts.session_id, reason, tuple(frames))
+
+
+def _warm_up(observations: Observations, one: WarmUp) -> WarmUpNumbers:
+    track = one.track
+    camera_degC = observations.camera_degC[track.frames]
+    mean = track.mean_px[np.isfinite(track.mean_px).all(axis=1)]
+    i, j = (mean[-1] - mean[0]).tolist() if len(mean) else (math.nan, math.nan)
+    return WarmUpNumbers(
+        session_id=observations.sessions[track.session].session_id,
+        frames=len(track.frames),
+        roll_deg=track.roll_deg,
+        power_on_known=one.power_on_known,
+        begin_s=float(one.since_on_s[0]),
+        end_s=float(one.since_on_s[-1]),
+        camera_degC=(float(camera_degC[0]), float(camera_degC[-1])),
+        drift_px=(i, j),
+    )
+
+
+def _score(evaluation: Evaluation) -> ScoreNumbers:
+    before, after = evaluation.rms_before_px, evaluation.rms_after_px
+    return ScoreNumbers(
+        method=evaluation.method,
+        frames=evaluation.frames,
+        centres=len(evaluation.after_px),
+        before_px=before,
+        after_px=after,
+        gain_percent=(improvement_percent(before[0], after[0]), improvement_percent(before[1], after[1])),
+        marker_sigma_px=_root_mean(evaluation.rows.variance_px2),
+        claimed_sigma_px=_root_mean(evaluation.claimed_px2),
+        coverage_95=evaluation.coverage_95,
+        outside=float(evaluation.outside.mean()),
+        temperatures=evaluation.temperatures,
+    )
+
+
+def _root_mean(variance: Float) -> Pair:
+    i, j = np.sqrt(variance.mean(axis=0)).tolist()
+    return i, j
+
+
+def _hysteresis(found: tuple[Hysteresis, ...]) -> tuple[HysteresisNumbers, ...]:
+    names = [field.name for field in fields(HysteresisNumbers)]
+    return tuple(HysteresisNumbers(**{name: getattr(one, name) for name in names}) for one in found)
+
+
+def _model(model: DriftModel) -> ModelNumbers:
+    i, j = model.discrepancy_px.tolist()
+    return ModelNumbers(
+        form=model.form,
+        title=model.title,
+        reference_degC=model.reference_degC,
+        reference_chamber_degC=model.reference_chamber_degC,
+        camera_range_degC=model.camera_range_degC,
+        hull_px=tuple((x, y) for x, y in model.hull_px.tolist()),
+        discrepancy_px=(i, j),
+        session_ids=model.session_ids,
+        software_version=model.software_version,
+        candidates=model.candidates,
+    )

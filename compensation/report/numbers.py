@@ -1,0 +1,161 @@
+"""Every number of the report, as report.json has them: the page is written from these, so that both say the same.
+
+Pairs are along I and J. What is not known is NaN here and null there. compensation/report/gather.py fills them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields, is_dataclass
+
+import numpy as np
+from pydantic import BaseModel
+
+from compensation.budget.budget import Budget
+from compensation.drift.candidates import Candidate
+from compensation.drift.hysteresis import Gap
+from compensation.drift.validation import TemperatureRms
+from compensation.observations import Float
+
+FORMAT = "thermostand report 1"
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SessionNumbers:
+    """frames_by_role, flags: how many of each. centres: in usable frames; set_aside: of them, with a flag."""
+
+    session_id: str
+    recipe: str
+    operator: str
+    software_version: str
+    simulated: bool | None
+    incomplete_segments: int
+    begin: str
+    end: str
+    frames: int
+    frames_by_role: dict[str, int]
+    unusable: int
+    chamber_degC: tuple[float, ...]
+    camera_degC: Pair
+    centres: int
+    set_aside: int
+    flags: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class UnusableFrames:
+    """Frames of a session, numbered from 0, that were left out for the same reason."""
+
+    session_id: str
+    reason: str
+    frames: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class WarmUpNumbers:
+    """roll_deg: relative to the first frame of all. begin_s, end_s: of first and last frame, since the camera was
+    switched on (or, when that is not known, since the first frame). drift_px: mean over the markers, last minus first.
+    """
+
+    session_id: str
+    frames: int
+    roll_deg: float
+    power_on_known: bool
+    begin_s: float
+    end_s: float
+    camera_degC: Pair
+    drift_px: Pair
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreNumbers:
+    """RMS deviations before and after. marker_sigma_px: RMS standard uncertainty of a measured deviation without a
+    model. claimed_sigma_px: of a compensated one, as model and markers claim it. coverage_95: part of the deviations in
+    the 95 % interval. outside: part of the centres beyond the model's valid range."""
+
+    method: str
+    frames: int
+    centres: int
+    before_px: Pair
+    after_px: Pair
+    gain_percent: Pair
+    marker_sigma_px: Pair
+    claimed_sigma_px: Pair
+    coverage_95: Pair
+    outside: float
+    temperatures: tuple[TemperatureRms, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HysteresisNumbers:
+    """The figures of compensation/drift/hysteresis.py, with the ones it derives."""
+
+    session_id: str
+    range_px: Float
+    largest_px: Float
+    rms_px: Float
+    area_px_K: Float
+    closure_px: Float
+    repeatability_px: Float
+    gaps: tuple[Gap, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelNumbers:
+    """candidates: every form tried, with its errors at temperatures left out."""
+
+    form: str
+    title: str
+    reference_degC: float
+    reference_chamber_degC: float
+    camera_range_degC: Pair
+    hull_px: tuple[Pair, ...]
+    discrepancy_px: Pair
+    session_ids: tuple[str, ...]
+    software_version: str
+    candidates: tuple[Candidate, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """The whole of it; model, score: None without one. hysteresis: before compensation and, with a model, after.
+    budgets: the stand's, by session id. paper: its figures, px."""
+
+    format: str
+    versions: dict[str, str]
+    camera: str
+    target: str
+    simulated: bool
+    image_px: tuple[int, int]
+    sessions: tuple[SessionNumbers, ...]
+    unusable: tuple[UnusableFrames, ...]
+    warm_ups: tuple[WarmUpNumbers, ...]
+    score: ScoreNumbers | None
+    hysteresis_before: tuple[HysteresisNumbers, ...]
+    hysteresis_after: tuple[HysteresisNumbers, ...]
+    model: ModelNumbers | None
+    budgets: dict[str, Budget]
+    paper: dict[str, Pair]
+
+
+def as_json(numbers: Numbers) -> str:
+    """The text of report.json: keys are the names of the fields."""
+    return json.dumps(_plain(numbers), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, BaseModel):
+        return _plain(value.model_dump())
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, dict):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

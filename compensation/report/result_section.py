@@ -1,0 +1,63 @@
+"""The result first: what compensation gained, beside the paper's figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from compensation.drift.validation import improvement_percent
+from compensation.report.numbers import Numbers, Pair, ScoreNumbers
+from compensation.report.page import heading, paragraph, table
+
+PAPER = (
+    "Paper: Adamczyk et al., Temperature Compensation Method for Digital Cameras in 2D and 3D Measurement "
+    "Applications, Sensors 2018, 18, 3685: section 3.1 (warm-up), 6.2 (polynomial of degree 4), 7 (in space)."
+)
+_LEAST_COVERAGE = 0.9
+
+
+def result_section(numbers: Numbers) -> Iterator[str]:
+    """The table and what to know of it; without a model, that there is none."""
+    yield heading("Result")
+    if numbers.score is None:
+        yield paragraph(
+            "These sessions have no frames over a thermal cycle that a model could be fitted to: this report shows the "
+            "drift alone."
+        )
+    else:
+        yield from _gain(numbers, numbers.score)
+    yield paragraph(PAPER, aside=True)
+
+
+def ours(numbers: Numbers) -> str:
+    """What this report's row is called in a table beside the paper's."""
+    return "this report (simulated)" if numbers.simulated else "this report"
+
+
+def _gain(numbers: Numbers, score: ScoreNumbers) -> Iterator[str]:
+    heads = ("RMS deviation, px", "I before", "I after", "gain", "J before", "J after", "gain")
+    paper = (numbers.paper["before_px"], numbers.paper["after_px"])
+    rows = [
+        ("paper (measured)", *_gains(*paper)),
+        (ours(numbers), *_gains(score.before_px, score.after_px)),
+    ]
+    yield table(heads, rows, chosen=1)
+    i, j = score.coverage_95
+    note = (
+        f"{score.frames} frames; {score.method}. The deviation is the distance of a marker centre from its place at "
+        f"the reference temperature. Of the deviations after compensation, {100 * i:.0f} % (I) and {100 * j:.0f} % (J) "
+        "lie in the 95 % interval that the model claims."
+    )
+    if min(score.coverage_95) < _LEAST_COVERAGE:
+        note += (
+            " That is too few: at the held-out temperatures the camera did something that the fitted frames do not "
+            "show. Most often its drift depends on the way there (thermal lag, hysteresis) and not on its temperature "
+            "alone."
+        )
+    if score.outside:
+        note += f" {score.outside:.1%} of the centres are outside the model's valid range."
+    yield paragraph(note)
+
+
+def _gains(before: Pair, after: Pair) -> Iterator[str]:
+    for b, a in zip(before, after, strict=True):
+        yield from (f"{b:.3f}", f"{a:.3f}" if a >= 0.01 else f"{a:.4f}", f"{improvement_percent(b, a):.1f} %")
