@@ -127,6 +127,13 @@ def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_
     assert took_s == pytest.approx(sum(expected_s[mark.step_id] for mark in marks[::2]), rel=0.02)
     assert sum(expected_s.values()) < 14 * 3600  # 18:00 to 08:00
     report = (directory / REPORT_NAME).read_text(encoding="utf-8")
-    for title in ("Result", "Warm-up", "Drift over temperature", "Before and after compensation", "Model", "Recorded data"):
+    for title in (
+        "Result",
+        "Warm-up",
+        "Drift over temperature",
+        "Before and after compensation",
+        "Model",
+        "Recorded data",
+    ):
         assert f">{title}<" in report
     assert packaged("recipes", "overnight").read_text() == session.attachments["recipe.yaml"]
