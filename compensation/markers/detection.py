@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from compensation.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
 from compensation.markers.edge_fit import EdgeFit, Flag, fit_edges
-from compensation.markers.edge_model import B0, CX, CY, F0, M11, M12, M22, SIGMA, EdgeState
+from compensation.markers.edge_model import B0, F0, M11, M12, M22, SIGMA, EdgeState
+from compensation.markers.expected import expected_edges, implied_edges
 from compensation.markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px
 from compensation.markers.noise import Image, Noise
+from compensation.markers.refit import refit_edges
 from compensation.target import Target
 
 __all__ = [
@@ -38,10 +40,9 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-_FIRST_BLUR_PX = 1.2
 _POOR_CHI = 1.25
 _POOR_MISFIT = 1.6
-"""Of 36 sectors less the ellipse's five numbers: chance reaches it once in 10 million markers."""
+"""Of 36 sectors less the numbers of the ellipse, or of a plane: chance reaches it once in a million markers."""
 _LEAST_CONTRAST_SIGMA = 5.0
 _SIZE_TOLERANCE = 1.35
 _PLACE_TOLERANCE_PITCH = 0.2
@@ -161,7 +162,7 @@ def _first_fit(
     grey: Image, target: Target, candidates: Candidates, identified: Identified, noise: Noise | None
 ) -> Detection:
     """Fit from the homography's ellipses, put where the candidates are and scaled to the size they have."""
-    start = _expected_edges(identified.homography, target)
+    start = expected_edges(identified.homography, target)
     seen = identified.candidate >= 0
     areas = candidates.areas_px2[identified.candidate[seen]]
     scale = float(np.median(np.sqrt(areas / np.pi) / start.radii_px()[seen]))
@@ -188,7 +189,8 @@ def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> 
     if good.sum() < target.least_markers:
         return None
     homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
-    return _judged(fit, good, homography, target, relative=noise is None)
+    detection = _judged(fit, good, homography, target, relative=noise is None)
+    return _refitted(detection, fit, grey, target, model)
 
 
 def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Target, relative: bool) -> Detection:
@@ -202,7 +204,7 @@ def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Ta
     if relative:
         chi = chi / usual
     flags = np.where(good, fit.flags, fit.flags | Flag.MISSING) | np.where(poor, Flag.POOR_FIT, 0)
-    expected = _expected_edges(homography, target)
+    expected = expected_edges(homography, target)
     scale = np.median(fit.state.radii_px()[good] / expected.radii_px()[good])
     parameters = expected.parameters
     parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
@@ -219,34 +221,37 @@ def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Ta
     )
 
 
+def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, noise: Noise) -> Detection:
+    """The detection with its poor markers measured again from what looks clean of them, where that is enough."""
+    clean = detection.flags == 0
+    poor = np.flatnonzero((detection.flags & (Flag.POOR_FIT | Flag.BORDER | Flag.MISSING)) == Flag.POOR_FIT)
+    implied = implied_edges(detection.state, detection.homography, target, clean, poor)
+    if implied is None:
+        return detection
+    usual = float(np.median(fit.chi[clean]))
+    scaled = Noise(noise.floor_DN2 * usual**2, noise.slope_DN * usual**2)
+    patience = float(np.median(fit.misfit[clean])) / usual
+    again = refit_edges(grey, implied.state, implied.spread, scaled, _reach(target)[poor], patience)
+    credible = (again.chi < _POOR_CHI) & _has_contrast(again.state, target, scaled)
+    which = poor[credible]
+    for whole, part in (
+        (detection.centres_px, again.state.centres_px()),
+        (detection.covariance_px2, again.covariance_px2),
+        (detection.chi, again.chi),
+        (detection.state.parameters, again.state.parameters),
+        (detection.state.scale_px, again.state.scale_px),
+    ):
+        whole[which] = part[credible]
+    detection.flags[which] ^= np.uint8(Flag.POOR_FIT | Flag.REFITTED)
+    return detection
+
+
 def _reach(target: Target) -> Float:
     """How many radii from its centre a marker's surroundings end: half way to the nearest outline."""
     centres, radii = target.coordinates_mm(), target.diameters_mm() / 2
     gap = np.linalg.norm(centres[:, None] - centres[None], axis=2) - radii[:, None] - radii[None]
     np.fill_diagonal(gap, np.inf)
     return 1 + gap.min(axis=1) / (2 * radii)
-
-
-def _expected_edges(homography: Float, target: Target) -> EdgeState:
-    """The image ellipses of the target's circles, levels unknown (NaN): conic C = H^-T Q H^-1 of each circle Q."""
-    x, y = target.coordinates_mm().T
-    radius = target.diameters_mm() / 2
-    circle = np.zeros((target.count, 3, 3))
-    circle[:, [0, 1, 2], [0, 1, 2]] = np.stack([np.ones_like(x), np.ones_like(x), x**2 + y**2 - radius**2], axis=1)
-    circle[:, 0, 2] = circle[:, 2, 0] = -x
-    circle[:, 1, 2] = circle[:, 2, 1] = -y
-    back = np.linalg.inv(homography)
-    conic = back.T @ circle @ back
-    centre = -np.linalg.solve(conic[:, :2, :2], conic[:, :2, 2, None])[:, :, 0]
-    level = conic[:, 2, 2] + np.einsum("ni,ni->n", conic[:, :2, 2], centre)
-    shape = -conic[:, :2, :2] / level[:, None, None]
-    scale = np.linalg.det(shape) ** -0.25
-    shape = shape * (scale**2)[:, None, None]
-    parameters = np.full((target.count, 12), np.nan)
-    parameters[:, [CX, CY]] = centre
-    parameters[:, M11], parameters[:, M12], parameters[:, M22] = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
-    parameters[:, SIGMA] = _FIRST_BLUR_PX
-    return EdgeState(parameters, scale)
 
 
 def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.bool_]:
@@ -258,7 +263,7 @@ def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.
 
 def _in_its_place(state: EdgeState, homography: Float, target: Target, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Whether each ellipse has about the place and the size that the other markers imply."""
-    expected = _expected_edges(homography, target)
+    expected = expected_edges(homography, target)
     known = np.where(good[:, None], state.centres_px(), np.nan)
     off = np.linalg.norm(state.centres_px() - expected_px(target.coordinates_mm(), known, homography), axis=1)
     ratio = state.radii_px() / expected.radii_px()

@@ -23,11 +23,12 @@ from compensation.markers.newton import (
     TOO_FEW,
     Work,
     centre_covariance,
+    no_belief,
     settle,
 )
 from compensation.markers.noise import Image, Noise, full_scale_DN
 from compensation.markers.pixels import Pixels, empty_pixels
-from compensation.markers.sectors import outline_misfit
+from compensation.markers.sectors import misfit
 
 _SATURATED_PART = 0.1
 
@@ -48,6 +49,8 @@ class Flag(IntFlag):
     """No ellipse explains the pixels."""
     MISSING = 32
     """No centre: nothing like the marker was seen in its place, or not enough of it."""
+    REFITTED = 64
+    """A part of it does not look like the others; the centre and its covariance come from the rest (refit.py)."""
 
 
 _BORDER, _SATURATED, _TOO_FEW, _DIVERGED = map(int, (Flag.BORDER, Flag.SATURATED, Flag.TOO_FEW, Flag.DIVERGED))
@@ -56,7 +59,7 @@ _BORDER, _SATURATED, _TOO_FEW, _DIVERGED = map(int, (Flag.BORDER, Flag.SATURATED
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeFit:
     """state: what was fitted. covariance_px2: (N, 2, 2), noise times chi^2. chi: (N,), 1 when the noise model explains
-    the residuals; misfit: (N,), the same of the outline alone (sectors.py). flags: (N,) uint8 of Flag. Markers that
+    the residuals; misfit: (N,), the same sector by sector (sectors.py). flags: (N,) uint8 of Flag. Markers that
     failed keep their start values, with NaN covariance, chi and misfit.
     """
 
@@ -76,13 +79,13 @@ def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float) -> Edg
     covariance, quality, flags = np.empty((count, 2, 2)), np.empty((count, 2)), np.empty(count, np.uint8)
     _fit_all(
         np.ascontiguousarray(image), parameters, start.scale_px, np.asarray(reach, np.float64),
-        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(_room(image, start)),
+        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
         covariance, quality, flags,
     )  # fmt: skip
     return EdgeFit(EdgeState(parameters, start.scale_px), covariance, quality[:, 0], quality[:, 1], flags)
 
 
-def _room(image: Image, start: EdgeState) -> int:
+def room(image: Image, start: EdgeState) -> int:
     """Pixels of the largest marker with its band, when it turns out half as large again and six times as blurred."""
     side = 3 * start.half_extents_px() + 12 * np.maximum(BAND_SIGMA * start.parameters[:, SIGMA, None], LEAST_BAND_PX)
     return int(min(np.nanmax(np.prod(side + 3, axis=1), initial=1), image.size))
@@ -105,14 +108,15 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
         """Fit each row of `parameters` in place; chi and misfit into `quality` (N, 2)."""
         _ = sources
         work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
+        belief = no_belief()
         for n in range(len(scale)):
             p = parameters[n].copy()
-            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work)
+            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)
             flags[n] = _BORDER * outcome.cut + _SATURATED * (outcome.burnt > _SATURATED_PART * outcome.seen)
             if outcome.status == SETTLED:
                 parameters[n] = p
                 covariance[n] = centre_covariance(work) * outcome.variance
-                quality[n] = np.sqrt(outcome.variance), outline_misfit(pixels, p)
+                quality[n] = np.sqrt(outcome.variance), misfit(pixels, p)
             else:
                 covariance[n], quality[n] = np.nan, np.nan
                 flags[n] += _TOO_FEW * (outcome.status == TOO_FEW) + _DIVERGED * (outcome.status == DIVERGED)

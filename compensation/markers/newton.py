@@ -27,7 +27,8 @@ from compensation.markers.edge_model import (
     normal_equations,
 )
 from compensation.markers.noise import Image
-from compensation.markers.pixels import SHARE, VALUE, Limits, Pixels, U, V, gather
+from compensation.markers.pixels import SHARE, VALUE, Gathered, Limits, Pixels, U, V, gather
+from compensation.markers.sectors import SECTORS, Bools, set_aside
 
 BAND_SIGMA = 9.0
 """Half width of the fitted band in blurs."""
@@ -69,15 +70,38 @@ class Work(NamedTuple):
     right: Float
 
 
+class Belief(NamedTuple):
+    """What is known before looking: sectors `kept` (36,), the others are not looked at; m11, m12, m22 and sigma (4,),
+    with weights (4,), 1 / variance, 0 where nothing is known."""
+
+    kept: Bools
+    mean: Float
+    weight: Float
+
+
+@compiled
+def no_belief() -> Belief:
+    """All sectors count, and any shape is as likely as any other."""
+    return Belief(np.ones(SECTORS, np.bool_), np.zeros(4), np.zeros(4))
+
+
 @compiled
 def settle(
-    image: Image, p: Float, scale: float, reach: float, noise: Variance, ceiling: int, pixels: Pixels, work: Work
+    image: Image,
+    p: Float,
+    scale: float,
+    reach: float,
+    noise: Variance,
+    ceiling: int,
+    pixels: Pixels,
+    work: Work,
+    belief: Belief,
 ) -> Outcome:
     """Fit `p` (12,) to the image in place. The pixels are gathered again when the outline has left them or turned out
     more blurred than it was thought to be, which also makes the result independent of the start."""
     start, gathered_at = p.copy(), p.copy()
     far = bool(np.isnan(p[B0]))
-    gathered = gather(image, p[:2], p[M11:SIGMA], scale, band(p, scale, reach, far), ceiling, pixels)
+    gathered = look(image, p, scale, band(p, scale, reach, far), ceiling, pixels, belief)
     gatherings = 1
     variance = np.nan
     if far:
@@ -88,6 +112,7 @@ def settle(
         squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right)
         if weights < _PIXELS_PER_PARAMETER * free:
             return Outcome(TOO_FEW, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+        add_belief(work, p, belief)
         if fixed:
             hold_slopes(work)
         variance = squares / (weights - free)
@@ -97,7 +122,7 @@ def settle(
             return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
         far = math.hypot(step[CX], step[CY]) > _FAR_PX
         if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale):
-            gathered = gather(image, p[:2], p[M11:SIGMA], scale, band(p, scale, reach, far), ceiling, pixels)
+            gathered = look(image, p, scale, band(p, scale, reach, far), ceiling, pixels, belief)
             gathered_at[:] = p
             gatherings += 1
             if gathered.seen < 0:
@@ -108,6 +133,25 @@ def settle(
     if strayed(start, p, scale, 1.0):
         return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
     return Outcome(SETTLED, variance, gathered.seen, gathered.burnt, gathered.cut)
+
+
+@compiled
+def look(
+    image: Image, p: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels, belief: Belief
+) -> Gathered:
+    """Gather the pixels round the outline of `p`, without those of sectors that are not kept."""
+    gathered = gather(image, p[:2], p[M11:SIGMA], scale, limits, ceiling, pixels)
+    if not belief.kept.all():
+        set_aside(pixels, p, belief.kept)
+    return gathered
+
+
+@compiled
+def add_belief(work: Work, p: Float, belief: Belief) -> None:
+    """Pull the shape and the blur to what they are believed to be."""
+    for i in range(4):
+        work.normal[M11 + i, M11 + i] += belief.weight[i]
+        work.right[M11 + i] += belief.weight[i] * (belief.mean[i] - p[M11 + i])
 
 
 @compiled

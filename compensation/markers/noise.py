@@ -44,12 +44,20 @@ class Noise:
 
 
 def full_scale_DN(image: Image) -> int:
-    """Largest value a pixel can have: 255, or of 16 bits 2^k - 1 for the smallest k of `_DEPTHS_bit` that holds the
-    brightest pixel, as cameras fill them from below (Mono10, Mono12)."""
+    """Largest value a pixel can have, found from the picture, as files and frames do not carry the pixel format.
+
+    255 of 8 bits. Of 16: 2^k - 1 for the smallest k of `_DEPTHS_bit` that holds the brightest pixel, as cameras fill
+    them from below (Mono10, Mono12); less the bits that no pixel uses where they fill them from above (Mono16 of a
+    12-bit sensor: 65520).
+    """
     if image.dtype == np.uint8:
         return 255
     brightest = int(image.max())
-    return next((1 << depth) - 1 for depth in _DEPTHS_bit if brightest < 1 << depth)
+    depth = next(depth for depth in _DEPTHS_bit if brightest < 1 << depth)
+    if depth < _DEPTHS_bit[-1]:
+        return (1 << depth) - 1
+    used = int(np.bitwise_or.reduce(image, axis=None))
+    return (1 << depth) - (used & -used)
 
 
 def estimate_noise(images: Sequence[Image], windows: NDArray[np.int32] | None = None) -> Noise | None:

@@ -183,9 +183,13 @@ def test_plain_ground_diverges_and_says_so_while_the_others_are_measured():
     assert not np.delete(result.flags, 4).any()
 
 
-def test_an_overexposed_ground_is_flagged_and_does_not_shift_the_centres():
+@pytest.mark.parametrize("from_above", [False, True], ids=["8 bits", "8 upper bits of 16"])
+def test_an_overexposed_ground_is_flagged_and_does_not_shift_the_centres(from_above: bool):
     scene = Scene(columns=3, rows=3, size=(800, 800), ground_DN=300)
-    result = fit(scene, photograph(scene, render(scene), 3), start_from(scene, 0.5))
+    image, noise = photograph(scene, render(scene), 3), Noise(1 + 1 / 12, 1 / 40)
+    if from_above:
+        image, noise = image.astype(np.uint16) << 8, Noise(noise.floor_DN2 * 256**2, noise.slope_DN * 256)
+    result = fit(scene, image, start_from(scene, 0.5), noise)
     assert np.all(result.flags == Flag.SATURATED)
     assert rms_mpx(result.state.centres_px() - true_centres_px(scene)) < 5
 

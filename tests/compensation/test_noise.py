@@ -53,5 +53,11 @@ def test_one_image_tells_nothing_and_neither_do_two_of_different_size():
     ("brightest", "full_scale"), [(90, 255), (700, 1023), (1800, 4095), (4095, 4095), (60000, 65535)]
 )
 def test_the_full_scale_of_16_bits_is_that_of_a_camera(brightest, full_scale):
-    assert full_scale_DN(np.array([[0, brightest]], np.uint16)) == full_scale
+    assert full_scale_DN(np.array([[1, brightest]], np.uint16)) == full_scale
     assert full_scale_DN(np.array([[90]], np.uint8)) == 255
+
+
+@pytest.mark.parametrize(("depth", "full_scale"), [(12, 65520), (10, 65472)])
+def test_a_camera_that_fills_16_bits_from_above_is_recognised_by_the_bits_it_leaves_empty(depth, full_scale):
+    values = np.arange(1 << depth, dtype=np.uint16)[::7, None] << (16 - depth)
+    assert full_scale_DN(values) == full_scale

@@ -67,7 +67,7 @@ def test_a_frame_without_the_target_stays_with_its_reason(observed: Observations
 
 def test_a_flagged_centre_is_not_used(observed: Observations):
     assert np.argwhere(observed.flags).tolist() == [list(GLARE)]
-    assert observed.flags[GLARE] == Flag.POOR_FIT  # it has a centre, but not one to be trusted
+    assert observed.flags[GLARE] == Flag.REFITTED  # it has a centre, from a part of its outline
     assert np.isnan(observed.centres_px[GLARE]).all()
     assert np.isnan(observed.covariance_px2[GLARE]).all()
 
