@@ -31,9 +31,12 @@ from compensation.finding.found import finder
 from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found, read_image
 from compensation.markers.table import DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
-from compensation.report.report import Extras, can_be_fitted, check_report_writable, write_report
+from compensation.report.extras import Extras
+from compensation.report.report import can_be_fitted, check_report_writable, write_report
+from compensation.report.table_positions import table_positions
 from compensation.target import Target
 from compensation.validate_cli import validate_session
+from compensation.validation3d.reading import load_validation
 from drivers.interface import ConfigError
 from stand.progress import progress
 from stand.recording.session import Session
@@ -127,6 +130,9 @@ def report(
     budget: Annotated[
         str | None, typer.Option(help="With the stand's budget, by its geometry: a file, or the installed `paper`.")
     ] = None,
+    validation: Annotated[
+        Path | None, typer.Option(help="With the result of `compensate validate`: the JSON file beside its page.")
+    ] = None,
     target: TargetOption = None,
     workers: Workers = 1,
     cluster: Cluster = None,
@@ -139,16 +145,20 @@ def report(
     Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
     """
     with one_line_errors():
-        check_report_writable(out, model)
+        check_report_writable(out, model, validation)
         found_by = finder(workers, cluster, use_cache=cache)
         given = None if model is None else load_model(model)
         wanted = named_target(target)
-        budgets = {} if budget is None else budgets_of_sessions(sessions, budget, wanted)
+        extras = Extras(
+            budgets={} if budget is None else budgets_of_sessions(sessions, budget, wanted),
+            positions=table_positions([Session.open(path).steps() for path in sessions]),
+            validation=None if validation is None else load_validation(validation),
+        )
         observations = observe_sessions(sessions, progress, wanted, found_by)
         has_cycle = can_be_fitted(observations)
         used = fit_model(observations) if given is None and has_cycle else given
         evaluation = None if used is None or not has_cycle else evaluate(used, observations)
-        write_report(out, observations, used, evaluation, Extras(budgets))
+        write_report(out, observations, used, evaluation, extras)
         typer.echo("no thermal cycle: no model, drift alone" if evaluation is None else table(evaluation))
 
 

@@ -59,8 +59,8 @@ def _markers(session: SessionNumbers, numbers: Numbers) -> str:
 
 def _unusable(unusable: tuple[UnusableFrames, ...]) -> Iterator[str]:
     yield heading("Frames left out")
-    rows = [(one.session_id, one.reason, str(len(one.frames)), _places(one.frames)) for one in unusable]
-    yield table(("session", "reason", "how many", "frames, from 0"), rows[:_LISTED_REASONS])
+    rows = [(one.reason, one.session_id, str(len(one.frames)), _places(one.frames)) for one in unusable]
+    yield table(("reason", "session", "how many", "frames, from 0"), rows[:_LISTED_REASONS])
     if len(rows) > _LISTED_REASONS:
         yield paragraph(
             f"and {len(rows) - _LISTED_REASONS} more reasons; all are in the file beside this page.", aside=True

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import fields
 from datetime import UTC, datetime
 
 import numpy as np
 
-from compensation.budget.budget import Budget
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.validation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.markers.detection import Flag
 from compensation.observations import Float, Mask, Observations, Role
+from compensation.report.extras import Extras
 from compensation.report.numbers import (
     FORMAT,
     HysteresisNumbers,
@@ -28,6 +29,7 @@ from compensation.report.numbers import (
     WarmUpNumbers,
 )
 from compensation.report.tracks import WarmUp, warm_ups
+from compensation.validation3d.document import as_json as validation_json
 
 PAPER_WARM_UP_PX = (0.3, 1.1)
 """Mean drift of the paper's camera, not modified, while it warmed itself by 20 K at 24 degC (section 3.1)."""
@@ -39,9 +41,11 @@ def numbers_of(
     observations: Observations,
     model: DriftModel | None,
     evaluation: Evaluation | None,
-    budgets: Mapping[str, Budget],
+    extras: Extras | None = None,
 ) -> Numbers:
     """Everything that the report says."""
+    extras = extras or Extras()
+    validation = extras.validation
     return Numbers(
         format=FORMAT,
         versions={name: importlib.metadata.version(name) for name in _LIBRARIES},
@@ -56,7 +60,9 @@ def numbers_of(
         hysteresis_before=_hysteresis(hysteresis(observations)),
         hysteresis_after=() if model is None else _hysteresis(hysteresis(observations, model)),
         model=None if model is None else _model(model),
-        budgets=dict(budgets),
+        budgets=dict(extras.budgets),
+        positions=extras.positions,
+        validation=None if validation is None else json.loads(validation_json(validation)),
         paper={"before_px": PAPER_BEFORE_PX, "after_px": PAPER_AFTER_PX, "warm_up_px": PAPER_WARM_UP_PX},
     )
 

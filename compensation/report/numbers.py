@@ -17,6 +17,7 @@ from compensation.drift.candidates import Candidate
 from compensation.drift.hysteresis import Gap
 from compensation.drift.validation import TemperatureRms
 from compensation.observations import Float
+from compensation.report.table_positions import TablePositions
 
 FORMAT = "thermostand report 1"
 Pair = tuple[float, float]
@@ -121,7 +122,8 @@ class ModelNumbers:
 @dataclass(frozen=True, slots=True)
 class Numbers:
     """The whole of it; model, score: None without one. hysteresis: before compensation and, with a model, after.
-    budgets: the stand's, by session id. paper: its figures, px."""
+    budgets: the stand's, by session id. positions: of the table. validation: as `compensate validate` writes it, None
+    without one. paper: its figures, px."""
 
     format: str
     versions: dict[str, str]
@@ -137,6 +139,8 @@ class Numbers:
     hysteresis_after: tuple[HysteresisNumbers, ...]
     model: ModelNumbers | None
     budgets: dict[str, Budget]
+    positions: TablePositions
+    validation: object
     paper: dict[str, Pair]
 
 

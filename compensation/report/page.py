@@ -16,8 +16,9 @@ p.aside { color: #555; margin-top: 0 }
 table { border-collapse: collapse; margin: .6rem 0 }
 th, td { padding: .2rem .9rem .2rem 0; text-align: right; font-variant-numeric: tabular-nums }
 th:first-child, td:first-child { text-align: left }
+td:not(:first-child) { white-space: nowrap }
 thead th { border-bottom: 1px solid #999 }
-table.facts td { text-align: left; vertical-align: top }
+table.facts td { text-align: left; vertical-align: top; white-space: normal }
 table.facts td:first-child { white-space: nowrap; color: #555 }
 tr.chosen td { font-weight: 600 }
 figure { margin: 1.2rem 0 }

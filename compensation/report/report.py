@@ -5,11 +5,9 @@ report.json has every number of report.html under the names of compensation/repo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from compensation.budget.budget import Budget
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.model_file import save_model
@@ -19,19 +17,16 @@ from compensation.observations import Observations, Progress, Role, observe_sess
 from compensation.report.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.report.data_section import data_section, utc
 from compensation.report.drift_section import drift_section
+from compensation.report.extras import Extras
 from compensation.report.gather import numbers_of
 from compensation.report.numbers import Numbers, as_json
 from compensation.report.page import heading, page, paragraph
 from compensation.report.result_section import result_section
+from compensation.report.space_section import space_section
 from compensation.report.stand_section import stand_section
+from compensation.report.table_positions import table_positions
 from drivers.interface import SessionError
-
-
-@dataclass(frozen=True, slots=True)
-class Extras:
-    """What a report may have besides: the stand's budgets by session id."""
-
-    budgets: Mapping[str, Budget] = field(default_factory=dict[str, Budget])
+from stand.recording.session import Session
 
 
 def analyse(session_paths: Sequence[Path], model_path: Path, report_path: Path, progress: Progress) -> Evaluation:
@@ -49,7 +44,8 @@ def analyse(session_paths: Sequence[Path], model_path: Path, report_path: Path, 
         evaluation = evaluate(model, observations)
         report(2, "drawing")
         save_model(model, model_path)
-        write_report(report_path, observations, model, evaluation)
+        extras = Extras(positions=table_positions([Session.open(path).steps() for path in session_paths]))
+        write_report(report_path, observations, model, evaluation, extras)
         report(3, "written")
     return evaluation
 
@@ -82,8 +78,9 @@ def write_report(
     extras: Extras | None = None,
 ) -> None:
     """Write page and numbers, each whole or not at all; SessionError when the place refuses."""
-    numbers = _numbers(observations, model, evaluation, extras)
-    text = _page(observations, model, evaluation, numbers)
+    extras = extras or Extras()
+    numbers = numbers_of(observations, model, evaluation, extras)
+    text = _page(observations, evaluation, numbers, extras)
     write_whole(path, text)
     write_whole(numbers_path(path), as_json(numbers))
 
@@ -95,22 +92,17 @@ def report_page(
     extras: Extras | None = None,
 ) -> str:
     """The report as HTML text; the same data give the same text."""
-    return _page(observations, model, evaluation, _numbers(observations, model, evaluation, extras))
-
-
-def _numbers(
-    observations: Observations, model: DriftModel | None, evaluation: Evaluation | None, extras: Extras | None
-) -> Numbers:
     extras = extras or Extras()
-    return numbers_of(observations, model, evaluation, extras.budgets)
+    return _page(observations, evaluation, numbers_of(observations, model, evaluation, extras), extras)
 
 
-def _page(observations: Observations, model: DriftModel | None, evaluation: Evaluation | None, numbers: Numbers) -> str:
-    subject = "Thermal drift" if model is None else "Thermal compensation"
+def _page(observations: Observations, evaluation: Evaluation | None, numbers: Numbers, extras: Extras) -> str:
+    subject = "Thermal drift" if numbers.model is None else "Thermal compensation"
     title = f"{subject} of camera {numbers.camera}"
-    parts = [heading(title, 1), paragraph(_lead(numbers), aside=True), *result_section(numbers)]
+    parts = [heading(title, 1), paragraph(_lead(numbers), aside=True), *result_section(numbers, extras.validation)]
     parts += drift_section(observations, numbers)
     parts += _compensation(observations, evaluation, numbers)
+    parts += space_section(extras.positions, observations.target, extras.validation)
     parts += stand_section(numbers)
     parts += data_section(numbers)
     return page(title, parts)

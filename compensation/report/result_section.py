@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from compensation.drift.validation import improvement_percent
 from compensation.report.numbers import Numbers, Pair, ScoreNumbers
 from compensation.report.page import heading, paragraph, table
+from compensation.report.validation_report import gains_table
+from compensation.validation3d.validation import Validation
 
 PAPER = (
     "Paper: Adamczyk et al., Temperature Compensation Method for Digital Cameras in 2D and 3D Measurement "
@@ -15,7 +17,7 @@ PAPER = (
 _LEAST_COVERAGE = 0.9
 
 
-def result_section(numbers: Numbers) -> Iterator[str]:
+def result_section(numbers: Numbers, validation: Validation | None = None) -> Iterator[str]:
     """The table and what to know of it; without a model, that there is none."""
     yield heading("Result")
     if numbers.score is None:
@@ -25,6 +27,11 @@ def result_section(numbers: Numbers) -> Iterator[str]:
         )
     else:
         yield from _gain(numbers, numbers.score)
+    if validation is not None:
+        yield paragraph(
+            "In space, the mean absolute deviation of the target from its place at the reference temperature:"
+        )
+        yield gains_table(validation, ours(numbers))
     yield paragraph(PAPER, aside=True)
 
 

@@ -23,48 +23,60 @@ _HEADS = ("Temp.", "Pos.", *(f"{axis} {when}" for when in ("before", "after") fo
 def validation_page(validation: Validation) -> str:
     """The report as HTML text; the same validation gives the same text."""
     title = f"Validation of {validation.session_id} in three dimensions"
-    parts = [
-        heading(title, 1),
-        paragraph("The laboratory was simulated.", aside=True) if validation.simulated else "",
-        heading("Result"),
+    simulated = paragraph("The laboratory was simulated.", aside=True) if validation.simulated else ""
+    return page(title, [heading(title, 1), simulated, *validation_parts(validation)])
+
+
+def validation_parts(validation: Validation, level: int = 2) -> list[str]:
+    """What a page says of the validation, under headings of this level."""
+    return [
+        heading("Result", level),
         _means(validation),
         paragraph(_method(validation)),
-        heading("Deviations by temperature"),
+        heading("Deviations by temperature", level),
         figure(
             as_svg(figures.bars(validation), "bars"),
             "Mean absolute deviation of the positions at each temperature but the reference, before (blue) and after "
             "(orange) compensation, in the form of the paper's figure 15; dashed are the paper's means.",
         ),
         *_by_position(validation),
-        heading("Table in the form of the paper's Table 1"),
+        heading("Table in the form of the paper's Table 1", level),
         table(_HEADS, list(_rows(validation))),
         paragraph("Translation deviation, mm; Temp. is the camera's own temperature, °C. * outside the valid range."),
         paragraph(flagged(validation) + "."),
-        heading("The paper's Table 1"),
+        heading("The paper's Table 1", level),
         table(_HEADS, list(_paper_rows())),
-        heading("Rotation, table and uncertainty"),
+        heading("Rotation, table and uncertainty", level),
         _other(validation),
         facts(_facts(validation)),
     ]
-    return page(title, parts)
+
+
+def gains_table(validation: Validation, ours: str = "this session") -> str:
+    """Mean absolute deviations before and after, beside the paper's."""
+    rows = [
+        ["paper", *_gains([1e3 * mm for mm in BEFORE_mm], [1e3 * mm for mm in AFTER_mm])],
+        [ours, *_gains(validation.before.mean_um.tolist(), validation.after.mean_um.tolist())],
+    ]
+    heads = [cell for axis in figures.AXES for cell in (f"{axis} before", "after", "gain")]
+    return table(["mean |deviation|, µm", *heads], rows, 1)
 
 
 def _means(validation: Validation) -> str:
-    rows = [
-        ["paper", *_gains([1e3 * mm for mm in BEFORE_mm], [1e3 * mm for mm in AFTER_mm])],
-        ["this session", *_gains(validation.before.mean_um.tolist(), validation.after.mean_um.tolist())],
-    ]
-    heads = [cell for axis in figures.AXES for cell in (f"{axis} before, µm", "after", "gain")]
     uncertain = [
         [one.name, *(f"{value:.2f} ± {u:.2f}" for value, u in zip(one.mean_um, one.u_mean_um, strict=True))]
         for one in validation.variants
     ]
-    return table(["", *heads], rows, 1) + table(["with standard uncertainty, µm", *figures.AXES], uncertain)
+    return gains_table(validation) + table(["with standard uncertainty, µm", *figures.AXES], uncertain)
 
 
 def _gains(before_um: Sequence[float], after_um: Sequence[float]) -> Iterator[str]:
     for before, after in zip(before_um, after_um, strict=True):
-        yield from (f"{before:.1f}", f"{after:.1f}", f"{improvement_percent(before, after):.0f} %")
+        yield from (
+            f"{before:.1f}",
+            f"{after:.1f}" if after >= 10 else f"{after:.2f}",
+            f"{improvement_percent(before, after):.0f} %",
+        )
 
 
 def _method(validation: Validation) -> str:

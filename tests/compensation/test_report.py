@@ -18,9 +18,10 @@ from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import Evaluation, evaluate
 from compensation.observations import Observations
 from compensation.report.compensation_section import uncertainty_section
+from compensation.report.extras import Extras
 from compensation.report.gather import numbers_of
 from compensation.report.numbers import Numbers, as_json
-from compensation.report.report import Extras, can_be_fitted, check_report_writable, report_page, write_report
+from compensation.report.report import can_be_fitted, check_report_writable, report_page, write_report
 from compensation.report.result_section import result_section
 from drivers.interface import SessionError
 
@@ -76,7 +77,7 @@ def page(written: Path) -> str:
 
 @pytest.fixture(scope="module")
 def numbers(analysed: Analysed) -> Numbers:
-    return numbers_of(*analysed, {})
+    return numbers_of(*analysed)
 
 
 def warm_up_only(frames: int = 12, roles: tuple[str, ...] = ("warm_up",)) -> Observations:
@@ -129,7 +130,7 @@ def test_it_says_what_was_found_and_what_was_left_out(page: str, analysed: Analy
         "night-1", "thermal-cycle",
         "34 (4 reference, 14 fit, 12 validation, 4 warm-up); 1 of them cannot be used",
         "1 set aside (1 saturated)",
-        "<td>night-1</td><td>found 3 of 54 markers &lt;of&gt; paper-9x6</td><td>1</td><td>33</td>",
+        "<td>found 3 of 54 markers &lt;of&gt; paper-9x6</td><td>night-1</td><td>1</td><td>33</td>",
         "camera 25.00 to 67.00 °C",
         "<td>granite along the axis</td><td>25.17</td><td>4.05</td><td>-48.61</td><td>7.82</td>",
         "<td>linear table, resolution</td><td>0.31</td><td></td><td>0.47</td><td></td>",
@@ -234,7 +235,7 @@ def test_what_a_session_says_of_itself_cannot_change_the_page():
     assert "<script" not in text
     assert '<b id="x' not in text
     assert text.count("&lt;script&gt;") >= 6
-    assert json.loads(as_json(numbers_of(own, None, None, {})))["sessions"][0]["operator"] == evil
+    assert json.loads(as_json(numbers_of(own, None, None)))["sessions"][0]["operator"] == evil
 
 
 def test_a_report_that_cannot_be_written_leaves_nothing(tmp_path: Path):

@@ -1,0 +1,19 @@
+"""What a report may have besides drift and compensation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from compensation.budget.budget import Budget
+from compensation.report.table_positions import TablePositions
+from compensation.validation3d.validation import Validation
+
+
+@dataclass(frozen=True, slots=True)
+class Extras:
+    """budgets: the stand's, by session id. positions: where the table stood. validation: in three dimensions."""
+
+    budgets: Mapping[str, Budget] = field(default_factory=dict[str, Budget])
+    positions: TablePositions = field(default_factory=TablePositions)
+    validation: Validation | None = None
