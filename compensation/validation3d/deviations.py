@@ -166,11 +166,13 @@ class _Apart:
 
 
 def _apart(found: Found | None, other: Found | None) -> _Apart:
-    """Corrections count once: at the reference they are near nothing, and so are their errors."""
+    """What the drift model leaves unexplained counts twice, at the reference as well; the stand's correction is nothing
+    there, and its errors count once."""
     if found is None or other is None:
         return _Apart(*np.full((6, 3), np.nan))
     noise = np.diagonal(found.noise) + np.diagonal(other.noise)
-    model, stand = np.diagonal(found.model), np.diagonal(found.stand)
+    model = np.diagonal(found.model) + np.diagonal(other.model)
+    stand = np.diagonal(found.stand)
     return _Apart(
         translation_um=1e3 * (found.place_mm - other.place_mm),
         rotation_mrad=rotation_mrad(found, other),
