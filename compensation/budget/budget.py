@@ -12,7 +12,7 @@ from compensation.budget.air import Index, ciddor_1996, edlen_1966
 from compensation.budget.correction import granite_mm, indices, post_mm, refraction_px, target_strain, varied
 from compensation.budget.geometry import Geometry, StandState
 from compensation.budget.refraction import tilted_shift_mm
-from compensation.budget.states import capture_states, is_known, mean_state, states_at
+from compensation.budget.states import capture_states, mean_state, states_at
 from compensation.budget.table import Repeatability, home_residuals, v0_repeats
 from compensation.target import Target
 from drivers.interface import SessionError
@@ -52,14 +52,14 @@ def budget(session: Session, target: Target, geometry: Geometry) -> Budget:
 
     SessionError when a thermometer was silent in all captures.
     """
-    captures = [capture for capture in capture_states(session) if is_known(capture.state)]
+    captures = [capture for capture in capture_states(session) if _is_known(capture.state)]
     if not captures:
         raise SessionError(
             f"{session.path}: in no capture were all five thermometers alive: the stand cannot be judged"
         )
     reference = mean_state([c.state for c in captures if c.role == "reference"] or [captures[0].state])
     ends_ns = np.array([time_ns for capture in captures for time_ns in (capture.start_ns, capture.end_ns)], np.int64)
-    states = [*(capture.state for capture in captures), *filter(is_known, states_at(session, ends_ns))]
+    states = [*(capture.state for capture in captures), *filter(_is_known, states_at(session, ends_ns))]
     thermal = _thermal(states, reference, geometry, _outermost_mm(target))
     events = session.events()
     table = (
@@ -189,6 +189,10 @@ def _outermost_mm(target: Target) -> float:
     """From the target's middle to its outermost marker."""
     places = target.coordinates_mm()
     return float(np.linalg.norm(places - (places.min(axis=0) + places.max(axis=0)) / 2, axis=1).max())
+
+
+def _is_known(state: StandState) -> bool:
+    return all(math.isfinite(getattr(state, name)) for name in StandState.__dataclass_fields__)
 
 
 def _number(value: float, width: int, digits: int) -> str:

@@ -49,11 +49,6 @@ def mean_state(states: Sequence[StandState]) -> StandState:
     return StandState(*map(float, means))
 
 
-def is_known(state: StandState) -> bool:
-    """Whether all five thermometers were alive."""
-    return all(math.isfinite(getattr(state, f"{sensor}_degC")) for sensor in _SENSORS)
-
-
 def capture_states(session: Session) -> list[CaptureState]:
     """Every capture that was completed, in order; SessionError when there is none."""
     started = {mark.step_id: mark for mark in session.steps() if mark.kind == "Capture" and mark.state == "started"}

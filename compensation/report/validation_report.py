@@ -164,5 +164,5 @@ def _facts(validation: Validation) -> list[tuple[str, str]]:
             f"chi {np.nanmean(validation.before.chi):.2f} before, "
             f"{np.nanmean(validation.after.chi):.2f} after; 1 when noise explains it",
         ),
-        ("Drift model's errors", "taken as a smooth field, alike over a third of the image's width"),
+        ("Drift model's errors", "taken as a smooth field, alike over half of the image's width"),
     ]

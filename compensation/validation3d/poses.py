@@ -12,7 +12,7 @@ from compensation.calibration.least_squares import Float
 from compensation.calibration.pose import Lens, Pose, find_pose
 from compensation.calibration.rotation import crosses, vector
 
-_CORRELATED = 1 / 3
+_CORRELATED = 1 / 2
 """Of the image's width: over this distance errors of a drift model are taken to be alike."""
 
 

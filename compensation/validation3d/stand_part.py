@@ -6,13 +6,14 @@ model fitted at one distance therefore takes out a little too much or too little
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from compensation.budget.correction import displacement_px, varied
 from compensation.budget.geometry import Geometry, Quantity, StandState
-from compensation.budget.states import is_known, mean_state, states_at
+from compensation.budget.states import mean_state, states_at
 from compensation.observations import Float, Observations
 from compensation.validation3d.positions import ValidationFrames
 from drivers.interface import SessionError
@@ -44,9 +45,7 @@ def stand_part(
     used = frames.used
     states = dict(zip(used.tolist(), states_at(session, observations.time_ns[used]), strict=True))
     reference = mean_state([states[index] for row in frames.frames[0] for index in row.tolist()])
-    unknown = [state for state in (reference, *states.values()) if not is_known(state)]
-    if unknown:
-        raise SessionError(f"{session.path}: a thermometer was silent: the stand's part cannot be told ({unknown[0]})")
+    _check_known(session, [reference, *states.values()])
     at = [geometry.model_copy(update={"distance_mm": _moved(geometry, z_mm)}) for z_mm in distances_mm.tolist()]
     inputs = 1 + sum(1 for _ in varied(reference, geometry))
     here, at_fit = (np.full((inputs, *observations.centres_px.shape), np.nan) for _ in range(2))
@@ -58,6 +57,16 @@ def stand_part(
                 at_fit[:, index] = _displacements_px(states[index], reference, geometry, centres)
     excess = here - at_fit
     return StandPart(here[0], excess[0], here[1:] - here[0], excess[1:] - excess[0])
+
+
+def _check_known(session: Session, states: list[StandState]) -> None:
+    for name in StandState.__dataclass_fields__:
+        if not all(math.isfinite(getattr(state, name)) for state in states):
+            silent = name.removesuffix("_degC")
+            raise SessionError(
+                f"{session.path}: the thermometer {silent} was silent while poses were taken, so the stand's part "
+                "cannot be told; leave out --budget"
+            )
 
 
 def _moved(geometry: Geometry, distance_mm: float) -> Quantity:

@@ -17,13 +17,13 @@ def summary(validation: Validation) -> str:
     lines = [
         f"mean absolute deviation of {', '.join(validation.names)} from {validation.chamber_degC[0]:g} degC over "
         f"{len(validation.chamber_degC) - 1} temperatures{where}, um",
-        f"{'':<{width}}{'X':>14}{'Y':>14}{'Z':>14}",
+        f"{'':<{width}}{'X':>17}{'Y':>17}{'Z':>17}",
         _paper_line("paper, before", BEFORE_mm, width),
         _paper_line("paper, after", AFTER_mm, width),
     ]
     for one in validation.variants:
         cells = (f"{value:.2f} +- {u:.2f}" for value, u in zip(one.mean_um, one.u_mean_um, strict=True))
-        lines.append(f"{one.name:<{width}}" + "".join(f"{cell:>14}" for cell in cells))
+        lines.append(f"{one.name:<{width}}" + "".join(f"{cell:>17}" for cell in cells))
     table_um, rotation_mrad = validation.after.table_um, validation.after.mean_rotation_mrad
     lines += [
         f"table repeatability from V0 seen again: {_triple(table_um)} um; "

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from math import isnan
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from compensation.target import Target
 from compensation.validation3d.positions import validation_frames
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.documents import parse_document
-from drivers.interface import Frame, Reading, SessionError
+from drivers.interface import Frame, Quality, Reading, SessionError
 from stand.hub import Batch, Hub, Item, StepMark, StepState
 from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.recording.session import Session
@@ -54,7 +55,7 @@ def scene_at(place: tuple[float, float], above_K: float = 0.0) -> Scene:
     return Scene(size=SIZE, f_px=F_px, distance_mm=z_mm, diameter_mm=10, tilt_y_deg=place[1], shift_mm=shift_mm)
 
 
-def published(index: int, time_ns: int) -> Iterator[Item]:
+def published(index: int, time_ns: int, silent: str) -> Iterator[Item]:
     chamber_degC, place = VISITS[index]
     for number, (axis, position) in enumerate(zip(("linear", "rotary"), place, strict=True)):
         for state in (StepState.STARTED, StepState.DONE):
@@ -63,7 +64,11 @@ def published(index: int, time_ns: int) -> Iterator[Item]:
     above_K = chamber_degC - 24
     degC = {"granite_inside": 24 + GRANITE_K * (above_K > 0), "granite_outside": 24.0, "artifact": 24.0}
     degC |= {"air": 24.0, "laboratory": 24.0}
-    readings = tuple(Reading(f"thermometers.{name}", value, "degC", time_ns) for name, value in degC.items())
+    degC |= {silent: float("nan")} if silent and above_K else {}
+    readings = tuple(
+        Reading(f"thermometers.{name}", value, "degC", time_ns, Quality.BAD if isnan(value) else Quality.GOOD)
+        for name, value in degC.items()
+    )
     yield Batch("thermometers", time_ns, readings)
     step, role = f"capture-{index}", "repeatability" if index % 3 == 2 else "pose"
     capture: dict[str, object] = {"frames": 1, "role": role, "chamber_degC": chamber_degC}
@@ -74,7 +79,7 @@ def published(index: int, time_ns: int) -> Iterator[Item]:
     yield StepMark(time_ns, step, 3 * index + 2, "Capture", StepState.DONE, capture)
 
 
-async def record(directory: Path, visits: int = len(VISITS)) -> None:
+async def record(directory: Path, visits: int = len(VISITS), silent: str = "") -> None:
     clock, hub = VirtualClock(START_NS), Hub()
     info = SessionInfo("night-2", "validation", "TS-0001", "operator", "0.1.0", "virtual")
     devices = {"thermometers": "thermometers", "camera": "camera"}
@@ -84,7 +89,7 @@ async def record(directory: Path, visits: int = len(VISITS)) -> None:
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
     for index in range(visits):
         await clock.sleep_until(START_NS + index * 30 * NS_PER_S)
-        for item in published(index, clock.now_ns()):
+        for item in published(index, clock.now_ns(), silent):
             hub.publish(item)
     await clock.sleep_until(clock.now_ns() + NS_PER_S)
     for task in tasks:
@@ -199,6 +204,15 @@ def recorded_alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sessions") / "alone"
     asyncio.run(record(path, visits=3))
     return path
+
+
+def test_a_silent_thermometer_is_named_where_it_is_needed(folder: Path, tmp_path: Path):
+    asyncio.run(record(tmp_path / "silent", silent="artifact"))
+    out = tmp_path / "validation.html"
+    refused = run(folder, tmp_path / "silent", out, "--budget", "paper")
+    assert refused.exit_code == 2
+    assert "the thermometer artifact was silent" in refused.stderr.splitlines()[-1]
+    assert run(folder, tmp_path / "silent", out).exit_code == 0
 
 
 def test_pose_frames_teach_the_drift_nothing(folder: Path):
