@@ -107,6 +107,8 @@ def test_the_tables_repeatability_is_told_by_v0_seen_again(laboratory: Laborator
     many = (24.0,) * 30
     moving = undrifted(laboratory, camera, table_mm=(0.001, 0.0, 0.004), temperatures_degC=many)
     assert moving.table_um == pytest.approx([1, 0, 4], rel=0.25, abs=0.3)
+    normalised = (moving.translation_um / moving.u_um)[1:]
+    assert np.sqrt(np.mean(normalised**2, axis=(0, 1))) == pytest.approx([1, 1, 1], abs=0.4)
     still = undrifted(laboratory, camera, seed=8, temperatures_degC=many)
     assert np.all(still.table_um < (0.1, 0.3, 0.4))
 
