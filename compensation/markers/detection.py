@@ -22,6 +22,7 @@ from compensation.markers.edge_fit import EdgeFit, Flag, fit_edges
 from compensation.markers.edge_model import B0, F0, M11, M12, M22, SIGMA, EdgeState
 from compensation.markers.expected import expected_edges, implied_edges
 from compensation.markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px
+from compensation.markers.light import under_common_light
 from compensation.markers.noise import Image, Noise
 from compensation.markers.refit import refit_edges
 from compensation.target import Target
@@ -208,9 +209,10 @@ def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Ta
     scale = np.median(fit.state.radii_px()[good] / expected.radii_px()[good])
     parameters = expected.parameters
     parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
+    centres, covariance = under_common_light(fit, good & ~poor)
     return Detection(
-        centres_px=np.where(good[:, None], fit.state.centres_px(), np.nan),
-        covariance_px2=np.where(good[:, None, None], fit.covariance_px2, np.nan),
+        centres_px=np.where(good[:, None], centres, np.nan),
+        covariance_px2=np.where(good[:, None, None], covariance, np.nan),
         flags=flags.astype(np.uint8),
         chi=chi,
         homography=homography,

@@ -22,7 +22,7 @@ from compensation.markers.newton import (
     SETTLED,
     TOO_FEW,
     Work,
-    centre_covariance,
+    inverse,
     no_belief,
     settle,
 )
@@ -58,16 +58,21 @@ _BORDER, _SATURATED, _TOO_FEW, _DIVERGED = map(int, (Flag.BORDER, Flag.SATURATED
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeFit:
-    """state: what was fitted. covariance_px2: (N, 2, 2), noise times chi^2. chi: (N,), 1 when the noise model explains
-    the residuals; misfit: (N,), the same sector by sector (sectors.py). flags: (N,) uint8 of Flag. Markers that
-    failed keep their start values, with NaN covariance, chi and misfit.
+    """state: what was fitted. covariance: of its parameters (N, 12, 12), noise times chi^2. chi: (N,), 1 when the noise
+    model explains the residuals; misfit: (N,), the same sector by sector (sectors.py). flags: (N,) uint8 of Flag.
+    Markers that failed keep their start values, with NaN covariance, chi and misfit.
     """
 
     state: EdgeState
-    covariance_px2: Float
+    covariance: Float
     chi: Float
     misfit: Float
     flags: NDArray[np.uint8]
+
+    @property
+    def covariance_px2(self) -> Float:
+        """Of the centres (N, 2, 2)."""
+        return self.covariance[:, :2, :2]
 
 
 def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float) -> EdgeFit:
@@ -76,7 +81,11 @@ def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float) -> Edg
     """
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
-    covariance, quality, flags = np.empty((count, 2, 2)), np.empty((count, 2)), np.empty(count, np.uint8)
+    covariance, quality, flags = (
+        np.empty((count, PARAMETERS, PARAMETERS)),
+        np.empty((count, 2)),
+        np.empty(count, np.uint8),
+    )
     _fit_all(
         np.ascontiguousarray(image), parameters, start.scale_px, np.asarray(reach, np.float64),
         (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
@@ -115,7 +124,7 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
             flags[n] = _BORDER * outcome.cut + _SATURATED * (outcome.burnt > _SATURATED_PART * outcome.seen)
             if outcome.status == SETTLED:
                 parameters[n] = p
-                covariance[n] = centre_covariance(work) * outcome.variance
+                covariance[n] = inverse(work) * outcome.variance
                 quality[n] = np.sqrt(outcome.variance), misfit(pixels, p)
             else:
                 covariance[n], quality[n] = np.nan, np.nan

@@ -212,16 +212,13 @@ def newton_step(work: Work) -> Float:
 
 
 @compiled
-def centre_covariance(work: Work) -> Float:
-    """The centre's part, (2, 2), of the inverse of J'WJ."""
+def inverse(work: Work) -> Float:
+    """The inverse of J'WJ (12, 12)."""
     factor, size = _cholesky(work.normal)
-    covariance = np.empty((2, 2))
-    for i in range(2):
-        unit = np.zeros(PARAMETERS)
-        unit[i] = 1.0
-        _solve(factor, size, unit)
-        covariance[i] = unit[:2]
-    return covariance
+    columns = np.eye(PARAMETERS)
+    for i in range(PARAMETERS):
+        _solve(factor, size, columns[i])
+    return columns
 
 
 @compiled

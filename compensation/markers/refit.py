@@ -18,7 +18,7 @@ from compensation.compiled import compiled, digest, entry
 from compensation.markers import edge_model, newton, pixels, sectors
 from compensation.markers.edge_fit import room
 from compensation.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance
-from compensation.markers.newton import SETTLED, Belief, Work, centre_covariance, settle
+from compensation.markers.newton import SETTLED, Belief, Work, inverse, settle
 from compensation.markers.noise import Image, Noise, full_scale_DN
 from compensation.markers.pixels import Pixels, empty_pixels
 from compensation.markers.sectors import SECTORS, Bools, sector_misfits
@@ -114,7 +114,7 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
             if outcome.status == SETTLED:
                 moved = p[:2] - before
                 parameters[n] = p
-                covariance[n] = centre_covariance(work) * max(outcome.variance, 1.0) + np.outer(moved, moved)
+                covariance[n] = inverse(work)[:2, :2] * max(outcome.variance, 1.0) + np.outer(moved, moved)
                 chi[n] = math.sqrt(outcome.variance)
 
     return refit_all
