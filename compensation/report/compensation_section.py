@@ -20,6 +20,8 @@ _FORMS = {
     "thermal": "displacement to the reference = the motions of a homography, each linear in the camera's thermal state",
 }
 _MOST_THERMAL = 10
+_COMMON = "homography x (1, T, T^2), "
+"""Of every thermal form, said once."""
 
 
 def compensation_section(observations: Observations, evaluation: Evaluation, score: ScoreNumbers) -> Iterator[str]:
@@ -89,7 +91,8 @@ def model_section(model: ModelNumbers) -> Iterator[str]:
     yield paragraph(
         "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is "
         "the simplest of each form within one standard error of the best, or the one asked for; the thermal form takes "
-        "the paper's place when it is better by more than one standard error.",
+        "the paper's place when it is better by more than one standard error. Every thermal form is a homography times "
+        "1, T, T^2 (T: the camera's temperature) and what is listed.",
         aside=True,
     )
     yield from _candidates(model)
@@ -123,7 +126,7 @@ def _why(model: ModelNumbers) -> str:
 
 
 def _candidate(one: Candidate) -> tuple[str, ...]:
-    name = one.name if one.name.startswith(one.form) else f"{one.form}: {one.name}"
+    name = f"{one.form}: {one.name.removeprefix(_COMMON)}"
     rms = (f"{1e3 * value:.1f}" for value in one.rms_px)
     return (name, str(one.terms), *rms, "" if one.bic is None else f"{one.bic:.0f}")
 

@@ -66,6 +66,12 @@ def _warm_ups(observations: Observations, numbers: Numbers) -> Iterator[str]:
     if len(found) > len(shown):
         yield paragraph(f"Of {len(found)} warm-ups the first {len(shown)} are drawn.", aside=True)
     yield _warm_up_table(numbers, len(found) > 1)
+    if numbers.model is not None:
+        yield paragraph(
+            "Left: RMS of what the model leaves of the deviations from the reference during the warm-up. The thermal "
+            "form may have been fitted to these frames, the paper's form was not.",
+            aside=True,
+        )
 
 
 def _titles(found: Sequence[WarmUp]) -> list[str]:
@@ -87,7 +93,9 @@ def _panel(observations: Observations, track: Track, title: str) -> Paths:
 
 def _warm_up_table(numbers: Numbers, several: bool) -> str:
     i, j = numbers.paper["warm_up_px"]
-    rows = [("paper (measured), camera not modified", "", "", "", f"{i:.1f}", f"{j:.1f}")]
+    rows: list[tuple[str, ...]] = [
+        ("paper (measured), camera not modified", "", "", "", f"{i:.1f}", f"{j:.1f}", "", "")
+    ]
     first_deg = numbers.warm_ups[0].roll_deg
     for one in numbers.warm_ups:
         name = (
@@ -102,9 +110,10 @@ def _warm_up_table(numbers: Numbers, several: bool) -> str:
                 f"{begin:.1f} to {end:.1f}",
                 f"{one.drift_px[0]:.3f}",
                 f"{one.drift_px[1]:.3f}",
+                *(_mpx(value) for value in one.left_px),
             )
         )
-    return table(("warm-up", "frames", "minutes", "camera, °C", "mean drift I, px", "J"), rows)
+    return table(("warm-up", "frames", "minutes", "camera, °C", "mean drift I, px", "J", "left I, mpx", "J"), rows)
 
 
 def _cycles(observations: Observations, numbers: Numbers) -> Iterator[str]:

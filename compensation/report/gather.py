@@ -11,8 +11,10 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.hysteresis import Hysteresis, hysteresis
+from compensation.drift.training import frame_states
 from compensation.drift.validation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.markers.detection import Flag
 from compensation.observations import Float, Mask, Observations, Role
@@ -55,7 +57,7 @@ def numbers_of(
         image_px=observations.image_size,
         sessions=tuple(_session(observations, index) for index in range(len(observations.sessions))),
         unusable=tuple(_unusable(observations)),
-        warm_ups=tuple(_warm_up(observations, one) for one in warm_ups(observations)),
+        warm_ups=tuple(_warm_up(observations, one, model) for one in warm_ups(observations)),
         score=None if evaluation is None else _score(evaluation),
         hysteresis_before=_hysteresis(hysteresis(observations)),
         hysteresis_after=() if model is None else _hysteresis(hysteresis(observations, model)),
@@ -119,7 +121,7 @@ def _unusable(observations: Observations) -> Iterator[UnusableFrames]:
             yield UnusableFrames(facts.session_id, reason, tuple(frames))
 
 
-def _warm_up(observations: Observations, one: WarmUp) -> WarmUpNumbers:
+def _warm_up(observations: Observations, one: WarmUp, model: DriftModel | None) -> WarmUpNumbers:
     track = one.track
     camera_degC = observations.camera_degC[track.frames]
     mean = track.mean_px[np.isfinite(track.mean_px).all(axis=1)]
@@ -133,7 +135,21 @@ def _warm_up(observations: Observations, one: WarmUp) -> WarmUpNumbers:
         end_s=float(one.since_on_s[-1]),
         camera_degC=(float(camera_degC[0]), float(camera_degC[-1])),
         drift_px=(i, j),
+        left_px=(math.nan, math.nan) if model is None else _left_px(observations, one, model),
     )
+
+
+def _left_px(observations: Observations, one: WarmUp, model: DriftModel) -> Pair:
+    """NaN for a camera that stood differently at the reference, and where the model has no answer."""
+    frames = np.zeros(len(observations.frame), bool)
+    frames[one.track.frames] = True
+    if not one.track.shares_reference:
+        return math.nan, math.nan
+    rows = displacements(observations, frames)
+    states = frame_states(observations, model.memory).where(rows.frame)
+    left = rows.displacement_px - model.shift(rows.measured_px, states)
+    known = left[np.isfinite(left).all(axis=1)]
+    return _root_mean(known**2) if len(known) else (math.nan, math.nan)
 
 
 def _score(evaluation: Evaluation) -> ScoreNumbers:

@@ -58,6 +58,7 @@ class UnusableFrames:
 class WarmUpNumbers:
     """roll_deg: relative to the first frame of all. begin_s, end_s: of first and last frame, since the camera was
     switched on (or, when that is not known, since the first frame). drift_px: mean over the markers, last minus first.
+    left_px: RMS that the model leaves of the deviations from the reference, NaN without one.
     """
 
     session_id: str
@@ -68,6 +69,7 @@ class WarmUpNumbers:
     end_s: float
     camera_degC: Pair
     drift_px: Pair
+    left_px: Pair
 
 
 @dataclass(frozen=True, slots=True)

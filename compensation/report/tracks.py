@@ -24,15 +24,20 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Frames that show drift from one start. frames (F,): rows of the observations, in order of time. start_px (N, 2):
-    where the markers are without drift. moved_px (F, N, 2): from there; NaN without the marker. roll_deg: of the target
-    in the image, positive from I towards J, relative to the recording's first frame."""
+    """Frames that show drift from one start.
+
+    frames (F,): rows of the observations, in order of time. start_px (N, 2): where the markers are without drift.
+    moved_px (F, N, 2): from there; NaN without the marker. roll_deg: of the target in the image, positive from I
+    towards J, relative to the recording's first frame. shares_reference: whether the camera stood as at its session's
+    reference.
+    """
 
     session: int
     frames: Rows
     start_px: Float
     moved_px: Float
     roll_deg: float
+    shares_reference: bool
 
     @property
     def mean_px(self) -> Float:
@@ -113,7 +118,8 @@ def _warm_up(observations: Observations, frames: Rows) -> WarmUp:
     times_ns = observations.time_ns[frames]
     on_ns = _switched_on_ns(observations, session, int(times_ns[0]))
     since_ns = times_ns - (int(times_ns[0]) if on_ns is None else on_ns)
-    track = Track(session, frames, start, moved, _roll_deg(observations, start))
+    at_reference = _is_near(start - reference_centres(observations)[0][session])
+    track = Track(session, frames, start, moved, _roll_deg(observations, start), at_reference)
     return WarmUp(track, since_ns / _NS_PER_S, on_ns is not None)
 
 
@@ -145,7 +151,7 @@ def cycle(observations: Observations, session: int) -> Track | None:
     if not (observations.of(Role.REFERENCE) & own).any() or not (observations.of(*CYCLE[1:]) & own).any():
         return None
     start = reference_centres(observations)[0][session]
-    return Track(session, frames, start, observations.centres_px[frames] - start, _roll_deg(observations, start))
+    return Track(session, frames, start, observations.centres_px[frames] - start, _roll_deg(observations, start), True)
 
 
 def visits(observations: Observations, track: Track) -> tuple[Visit, ...]:

@@ -249,3 +249,13 @@ def test_its_numbers_do_not_take_the_place_of_another_file(tmp_path: Path):
     for page_path, model in (("report.json", None), ("model.html", tmp_path / "model.json")):
         with pytest.raises(SessionError, match="would overwrite"):
             check_report_writable(tmp_path / page_path, model)
+
+
+def test_what_the_model_leaves_of_a_warm_up_is_told(numbers: Numbers, page: str, analysed: Analysed):
+    night, model, _ = analysed
+    (warm_up,) = numbers.warm_ups  # four of the frames at the reference: nothing is left but noise
+    np.testing.assert_allclose(warm_up.left_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=0.15)
+    assert "".join(f"<td>{1e3 * value:.1f}</td>" for value in warm_up.left_px) in page
+    moved = np.where((night.role == "warm_up")[:, None, None], night.centres_px + 400, night.centres_px)
+    (elsewhere,) = numbers_of(replace(night, centres_px=moved), model, None).warm_ups
+    assert np.isnan(elsewhere.left_px).all()
