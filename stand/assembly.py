@@ -19,14 +19,14 @@ from drivers.regulator import Regulator
 from drivers.relays import Relays
 from drivers.stage import Axis, AxisSettings
 from drivers.thermometers import ThermometerChannel, Thermometers
-from stand.compressor import CompressorLimits
 from stand.config import CameraConfig, StandConfig, packaged
-from stand.guard import Guard
+from stand.guarding.compressor import CompressorLimits
+from stand.guarding.guard import Guard
+from stand.guarding.interlocks import Fault
+from stand.guarding.notify import Notifier
+from stand.guarding.rules import Announcements, watches
 from stand.hub import Hub
-from stand.interlocks import Fault
-from stand.notify import Notifier
 from stand.poller import Poller
-from stand.rules import Announcements, watches
 from stand.stand import Devices, Limits, Stand
 
 

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 from drivers.documents import Document, load_document
 from drivers.interface import ConfigError
 from experiments.parameters import Chamber_degC
-from stand.config_guard import GuardConfig
+from stand.guarding.config_guard import GuardConfig
 
 
 def _tcp_address(address: str) -> str:

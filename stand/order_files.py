@@ -8,9 +8,9 @@ from compensation.target import Target
 from drivers.documents import parse_document, read_document
 from drivers.registers import load_register_map
 from stand.config import StandConfig, load_config, packaged
-from stand.estimate import price
+from stand.estimating.estimate import price
 from stand.recipe import Recipe
-from stand.session_setup import Order
+from stand.running.session_setup import Order
 
 
 def load_order(recipe: str, config: str) -> Order:

@@ -15,12 +15,12 @@ from drivers.regulator import Regulator
 from drivers.relays import Relays
 from drivers.stage import Axis
 from drivers.thermometers import Thermometers
-from stand.camera_cooling import Cooling, cool_down, last_word
-from stand.compressor import CompressorLimits, CompressorState, decide, keep, restored
-from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
+from stand.guarding.compressor import CompressorLimits, CompressorState, decide, keep, restored
+from stand.guarding.interlocks import Fault
 from stand.hub import Event, Hub
-from stand.interlocks import Fault
-from stand.stage_care import check_home, ready
+from stand.running.camera_cooling import Cooling, cool_down, last_word
+from stand.running.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
+from stand.running.stage_care import check_home, ready
 
 # Real seconds for all actuators together to reach their safe state; the dead-man relay drops by itself after that.
 _SAFE_LIMIT_S = 10.0

@@ -24,15 +24,15 @@ from drivers.interface import StandTripped
 from drivers.registers import load_register_map
 from drivers.relays import Relays
 from stand.assembly import Assembly, assemble
-from stand.compressor import CompressorLimits
 from stand.config import StandConfig, packaged
-from stand.guard import Guard
+from stand.guarding.compressor import CompressorLimits
+from stand.guarding.guard import Guard
+from stand.guarding.interlocks import Watch, over_temperature
 from stand.hub import Hub
-from stand.interlocks import Watch, over_temperature
+from stand.running.stop import Interrupted, Stop
+from stand.running.tasks import cancelled
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from stand.stand import Devices, Limits, Stand
-from stand.stop import Interrupted, Stop
-from stand.tasks import cancelled
 from tests.bench.figures import Figure, at_most, progress
 from tests.bench.orders import simulated_order
 

@@ -15,8 +15,8 @@ from drivers.aravis_library import library
 from drivers.clock import seconds_ns
 from drivers.interface import Frame, StandError
 from stand.hub import Hub, Item
-from stand.run import run_real
-from stand.session_setup import Order
+from stand.running.run import run_real
+from stand.running.session_setup import Order
 from stand.simulator import Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
 from tests.bench.orders import simulated_order

@@ -24,8 +24,8 @@ from drivers.aravis_library import library
 from drivers.clock import NS_PER_S
 from drivers.interface import StandError
 from stand.hub import Hub, Item
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.bench.figures import Figure, at_least, at_most, progress, skipped
 from tests.bench.orders import simulated_order
 

@@ -9,7 +9,7 @@ import yaml
 
 from stand.config import load_config, packaged
 from stand.recipe import load_recipe
-from stand.session_setup import Order
+from stand.running.session_setup import Order
 
 CAMERA_ADDRESS = "127.0.0.92"
 

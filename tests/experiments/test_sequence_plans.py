@@ -36,7 +36,7 @@ from experiments.steps import (
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
 from stand.config import load_config, packaged
-from stand.estimate import price
+from stand.estimating.estimate import price
 from stand.recipe import Experiment, Recipe, load_recipe
 
 RECIPES = [

@@ -7,8 +7,8 @@ from drivers.clock import NS_PER_S, FollowedClock, seconds_ns
 from drivers.interface import Reading
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.regulator import FakeRegulator
-from stand.compressor import CompressorLimits, CompressorState, decide
 from stand.config import CompressorConfig
+from stand.guarding.compressor import CompressorLimits, CompressorState, decide
 from stand.hub import Batch, Hub
 
 START_NS = 1_767_290_400 * NS_PER_S

@@ -8,14 +8,14 @@ from pathlib import Path
 from compensation.target import Target
 from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
 from drivers.interface import Frame, Reading, StandTripped, Unreachable
-from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
 from stand.hub import Batch, Hub, StepMark, StepState
-from stand.journal import JOURNAL_NAME, Journal
-from stand.resume import journaled
-from stand.scheduler import Progress, Scheduler
-from stand.settling_watch import SettlingWatch
+from stand.running.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
+from stand.running.journal import JOURNAL_NAME, Journal
+from stand.running.resume import journaled
+from stand.running.scheduler import Progress, Scheduler
+from stand.running.settling_watch import SettlingWatch
+from stand.running.stop import Stop
 from stand.stand import Interlocked
-from stand.stop import Stop
 
 TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
 COMMIT_S = 0.2  # what the disk takes to have all that was published

@@ -11,8 +11,8 @@ from drivers.interface import Quality, Reading, bad_reading
 from drivers.sim.plant import Plant, PlantSpec
 from experiments.steps import CoolDown, estimate_s
 from experiments.warm_up import WarmUp
-from stand.camera_cooling import Cooling, cool_down, last_word
 from stand.hub import Batch, Event, Hub, Item
+from stand.running.camera_cooling import Cooling, cool_down, last_word
 
 BAND_K, TIME_CONSTANT_S = WarmUp().band_K, WarmUp().time_constant_s
 

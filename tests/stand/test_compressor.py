@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.clock import seconds_ns
-from stand.compressor import CompressorLimits, CompressorState, decide, keep, restored
+from stand.guarding.compressor import CompressorLimits, CompressorState, decide, keep, restored
 
 LIMITS = CompressorLimits(
     min_off_s=300, min_on_s=180, max_starts_per_h=6, start_above_cool_percent=20, stop_above_heat_percent=60

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from drivers.interface import SessionError
-from stand.control import LINE_LIMIT_BYTES, SOCKET_NAME, RunStatus, handlers, serve
-from stand.control_client import ask, ask_status, running_sessions
-from stand.gate import Gate
+from stand.remote.control import LINE_LIMIT_BYTES, SOCKET_NAME, RunStatus, handlers, serve
+from stand.remote.control_client import ask, ask_status, running_sessions
+from stand.running.gate import Gate
 
 STATUS = RunStatus(
     recipe="thermal-cycle",
@@ -216,7 +216,7 @@ async def test_a_second_daemon_is_refused_and_leaves_the_first_alone(tmp_path: P
 DAEMON = """
 import asyncio, sys
 from pathlib import Path
-from stand.control import serve
+from stand.remote.control import serve
 
 async def run():
     async with serve(Path(sys.argv[1]), {"echo": lambda request: {}}):

@@ -8,10 +8,10 @@ import yaml
 from click.testing import Result
 from typer.testing import CliRunner
 
+from stand.commandline.control_cli import app
 from stand.config import packaged
-from stand.control import SOCKET_NAME, RunStatus, handlers, serve
-from stand.control_cli import app
-from stand.gate import Gate
+from stand.remote.control import SOCKET_NAME, RunStatus, handlers, serve
+from stand.running.gate import Gate
 
 runner = CliRunner()
 

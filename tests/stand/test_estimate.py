@@ -29,14 +29,14 @@ from experiments.steps import (
     parameters_of,
 )
 from stand.config import StandConfig, load_config, packaged
-from stand.durations import Pace, Situation, expect
-from stand.estimate import PricedStep, price
-from stand.eta import Eta
-from stand.follow import Follow
+from stand.estimating.durations import Pace, Situation, expect
+from stand.estimating.estimate import PricedStep, price
+from stand.estimating.eta import Eta
+from stand.estimating.follow import Follow
+from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
+from stand.estimating.thermal_model import ChamberModel, Response
 from stand.hub import Batch, Event, StepMark, StepState
-from stand.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
 from stand.recording.session import Session
-from stand.thermal_model import ChamberModel, Response
 from tests.recording.recorded import record
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S

@@ -11,10 +11,10 @@ import pytest
 
 from drivers.clock import Clock, VirtualClock, WallClock, block_until, seconds_ns
 from drivers.interface import Unreachable
-from stand.guard import Guard
+from stand.guarding.guard import Guard
+from stand.guarding.interlocks import Fault, Readings, Rule, Watch
+from stand.guarding.notify import Notifier, run_command
 from stand.hub import Event, Hub
-from stand.interlocks import Fault, Readings, Rule, Watch
-from stand.notify import Notifier, run_command
 
 
 class PlainStand:

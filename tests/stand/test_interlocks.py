@@ -4,8 +4,7 @@ import pytest
 
 from drivers.clock import seconds_ns
 from drivers.interface import Quality, Reading, bad_reading
-from stand.hub import Batch, Hub
-from stand.interlocks import (
+from stand.guarding.interlocks import (
     Fault,
     Rule,
     Watch,
@@ -19,6 +18,7 @@ from stand.interlocks import (
     stopped_while_permitted,
     trustworthy,
 )
+from stand.hub import Batch, Hub
 
 PV, AIR = "regulator.pv", "thermometers.air"
 RUNNING, PERMIT = "regulator.running", "relays.heater_enable"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.clock import WallClock
 from drivers.interface import SessionError
-from stand.journal import (
+from stand.running.journal import (
     JOURNAL_NAME,
     Begun,
     Cleared,

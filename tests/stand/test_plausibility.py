@@ -8,9 +8,8 @@ import pytest
 from drivers.clock import NS_PER_S, seconds_ns
 from drivers.interface import Reading, bad_reading
 from stand.config import load_config, packaged
-from stand.hub import Batch, Hub
-from stand.interlocks import Fault
-from stand.plausibility import (
+from stand.guarding.interlocks import Fault
+from stand.guarding.plausibility import (
     Heating,
     HeatingLimits,
     OffLimits,
@@ -20,7 +19,8 @@ from stand.plausibility import (
     stuck_while_other_moves,
     warming_while_off,
 )
-from stand.rules import Announcements, watches
+from stand.guarding.rules import Announcements, watches
+from stand.hub import Batch, Hub
 from tests.stand.chamber_night import START_NS, Night
 
 LIMITS = HeatingLimits(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)

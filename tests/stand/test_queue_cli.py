@@ -7,9 +7,9 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from stand import queue
-from stand.queue_cli import app
-from stand.queue_file import QUEUE_NAME, State, working
+from stand.commandline.queue_cli import app
+from stand.queueing import queue
+from stand.queueing.queue_file import QUEUE_NAME, State, working
 
 runner = CliRunner()
 

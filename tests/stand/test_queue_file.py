@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from drivers.interface import ConfigError, SessionError, StandTripped
-from stand import queue
 from stand.order_files import load_order
-from stand.queue_file import LAST_NAME, QUEUE_NAME, State, working
-from stand.session_setup import Order
+from stand.queueing import queue
+from stand.queueing.queue_file import LAST_NAME, QUEUE_NAME, State, working
+from stand.running.session_setup import Order
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -224,7 +224,7 @@ def test_a_number_that_is_not_there_is_said_to(tmp_path: Path, number: int):
 ADDING = """
 import sys
 from pathlib import Path
-from stand import queue
+from stand.queueing import queue
 from stand.order_files import load_order
 order = load_order("warm-up", "simulated")
 print("ready", flush=True)

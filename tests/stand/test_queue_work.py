@@ -10,11 +10,11 @@ import pytest
 
 from drivers.clock import FollowedClock
 from drivers.interface import DeviceFault, SessionError, StandTripped, Unreachable
-from stand import queue
 from stand.order_files import load_order
-from stand.queue_file import Entry, working
-from stand.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, work
-from stand.stop import Interrupted
+from stand.queueing import queue
+from stand.queueing.queue_file import Entry, working
+from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, work
+from stand.running.stop import Interrupted
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -140,7 +140,7 @@ KILLED = """
 import asyncio, os, signal, sys
 from pathlib import Path
 from drivers.clock import WallClock
-from stand.queue_work import work
+from stand.queueing.queue_work import work
 
 async def run(entry, notes):
     notes.begun(Path(sys.argv[1]) / "night")

@@ -8,10 +8,10 @@ import pytest
 from drivers.clock import seconds_ns
 from drivers.interface import Reading, bad_reading
 from stand.config import load_config, packaged
+from stand.guarding.interlocks import Fault
+from stand.guarding.rules import Announcements, watches
 from stand.hub import Batch, Event, Hub, StepMark, StepState
-from stand.interlocks import Fault
 from stand.recording.space import Notice, SpaceWatch
-from stand.rules import Announcements, watches
 
 
 class Table:

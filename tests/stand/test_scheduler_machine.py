@@ -23,12 +23,12 @@ from experiments.steps import (
     StopChamber,
     number_steps,
 )
-from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
+from stand.guarding.interlocks import Fault
 from stand.hub import StepMark, StepState
-from stand.interlocks import Fault
-from stand.journal import JOURNAL_NAME, Dwell, Step, read_lines
-from stand.scheduler import BAND_K
-from stand.stop import Interrupted
+from stand.running.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
+from stand.running.journal import JOURNAL_NAME, Dwell, Step, read_lines
+from stand.running.scheduler import BAND_K
+from stand.running.stop import Interrupted
 from tests.stand.small_stand import Life
 
 FRAMES = 4

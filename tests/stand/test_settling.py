@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from compensation.markers.detection import Detection
 from compensation.markers.edge_model import EdgeState
 from experiments.steps import SoakUntilSettled
-from stand.settling import Rate, Seen, camera_rate, digit_K, drift_rate, judge, movement
+from stand.running.settling import Rate, Seen, camera_rate, digit_K, drift_rate, judge, movement
 
 SOAK = SoakUntilSettled(
     max_s=2700.0,

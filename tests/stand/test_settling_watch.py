@@ -10,8 +10,8 @@ import pytest
 from drivers.clock import NS_PER_S
 from drivers.interface import Reading
 from experiments.steps import SoakUntilSettled, StartChamber, StopChamber, number_steps
-from stand.gate import INTERLOCK, OPERATOR
 from stand.hub import Batch, Event, StepMark, StepState
+from stand.running.gate import INTERLOCK, OPERATOR
 from tests.compensation.rendered import Scene, photograph, render
 from tests.stand.small_stand import Life
 

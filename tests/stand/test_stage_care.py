@@ -9,7 +9,7 @@ import pytest
 from drivers.clock import seconds_ns
 from drivers.interface import DeviceFault, Quality
 from stand.hub import Event, Hub, Item
-from stand.stage_care import check_home, ready
+from stand.running.stage_care import check_home, ready
 from tests.system.stage_bench import OVERSHOOT, UNIT_PER_STEP, Bench, Kind, running_bench
 
 

@@ -12,7 +12,7 @@ from drivers.aravis_library import library
 from drivers.interface import StandError
 from stand.config import StandConfig, load_config, packaged
 from stand.recipe import load_recipe
-from stand.session_setup import Order
+from stand.running.session_setup import Order
 from stand.simulator import Simulator, laboratory_of
 
 SHORT_RECIPE = """

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from drivers.interface import Frame
 from stand.hub import StepMark, StepState
-from stand.resume import interruption
-from stand.run import resume, run_virtual
+from stand.running.resume import interruption
+from stand.running.run import resume, run_virtual
 
 DOWNTIME_S = 45.0
 

@@ -12,8 +12,8 @@ from drivers.interface import Frame
 from experiments.steps import Capture
 from stand.hub import Event, Item
 from stand.recording.session import Session
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

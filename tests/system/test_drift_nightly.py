@@ -19,8 +19,8 @@ from compensation.observations import Observations, Role, observe_sessions
 from drivers.interface import Frame
 from stand.hub import Hub, Item
 from stand.progress import progress
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

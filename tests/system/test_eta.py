@@ -10,14 +10,14 @@ import pytest
 from drivers.clock import NS_PER_S
 from experiments.steps import Soak
 from stand.config import packaged
-from stand.estimate import price
-from stand.follow import Follow
+from stand.estimating.estimate import price
+from stand.estimating.follow import Follow
+from stand.estimating.learned import learn, load_learned
 from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
-from stand.learned import learn, load_learned
 from stand.recording.session import Session
-from stand.resume import interruption
-from stand.run import Interrupted, resume, run_virtual
-from stand.session_setup import Order
+from stand.running.resume import interruption
+from stand.running.run import Interrupted, resume, run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")

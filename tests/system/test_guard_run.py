@@ -12,13 +12,13 @@ import pytest
 
 from drivers.clock import seconds_ns
 from drivers.interface import SessionError, StandTripped
-from stand.control_client import ask, ask_status
 from stand.hub import Batch, Event, Hub, Item
-from stand.journal import JOURNAL_NAME, Cleared, Tripped, read_lines
 from stand.recording.session import Session
-from stand.resume import interruption
-from stand.run import Interrupted, run_virtual
-from stand.session_setup import Order
+from stand.remote.control_client import ask, ask_status
+from stand.running.journal import JOURNAL_NAME, Cleared, Tripped, read_lines
+from stand.running.resume import interruption
+from stand.running.run import Interrupted, run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step, fault

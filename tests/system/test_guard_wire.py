@@ -18,14 +18,14 @@ import pytest
 from drivers.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
 from drivers.interface import Quality
 from stand.assembly import Assembly, assemble
-from stand.compressor import CompressorState, keep
 from stand.config import CompressorConfig, StandConfig, packaged
+from stand.guarding.compressor import CompressorState, keep
+from stand.guarding.interlocks import Fault
+from stand.guarding.rules import Announcements, watches
 from stand.hub import Event, Hub
-from stand.interlocks import Fault
 from stand.recording.session import Session
-from stand.rules import Announcements, watches
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from stand.simulator import ControlSocket, Simulator
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 

@@ -12,8 +12,8 @@ from compensation.drift.validation import Evaluation
 from compensation.report.report import analyse
 from stand.config import packaged
 from stand.progress import progress
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from drivers.interface import SessionError, StandError
-from stand.control_client import ask
 from stand.hub import Event, Hub, Item, StepMark, StepState
-from stand.journal import JOURNAL_NAME, Held, read_lines
 from stand.recording.session import Session
-from stand.run import Interrupted, run_virtual
-from stand.session_setup import Order
+from stand.remote.control_client import ask
+from stand.running.journal import JOURNAL_NAME, Held, read_lines
+from stand.running.run import Interrupted, run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_attended import PROMPTED
 from tests.system.test_guard_run import check_safe

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.steps import Capture
-from stand import queue
+from stand.estimating.learned import load_learned
 from stand.hub import StepState
-from stand.learned import load_learned
 from stand.order_files import load_order
-from stand.queue_work import MOST_FRUITLESS_STARTS
+from stand.queueing import queue
+from stand.queueing.queue_work import MOST_FRUITLESS_STARTS
 from stand.recording.session import Session
 from tests.system.conftest import require_aravis
 

@@ -13,8 +13,8 @@ import pytest
 from drivers.interface import Unreachable
 from stand.hub import Hub, Item, StepMark
 from stand.recording.session import Session
-from stand.run import Interrupted, run_real
-from stand.session_setup import Order
+from stand.running.run import Interrupted, run_real
+from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.system.conftest import require_aravis
 

@@ -10,8 +10,8 @@ import pytest
 from compensation.observations import observe, session_target
 from stand.hub import Event, Hub
 from stand.recording.session import Session
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

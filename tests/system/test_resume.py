@@ -13,15 +13,15 @@ import pytest
 
 from drivers.interface import SessionError, StandTripped, Unreachable
 from experiments.steps import Capture
-from stand.control import SOCKET_NAME
-from stand.control_client import ask, ask_status
 from stand.hub import Hub, StepState
-from stand.journal import JOURNAL_NAME, Dwell, Gap, Step, encode_line, read_lines
 from stand.recording.session import Session
 from stand.recording.verify import verify
-from stand.resume import interruption
-from stand.run import Interrupted, resume, run_virtual
-from stand.session_setup import Order
+from stand.remote.control import SOCKET_NAME
+from stand.remote.control_client import ask, ask_status
+from stand.running.journal import JOURNAL_NAME, Dwell, Gap, Step, encode_line, read_lines
+from stand.running.resume import interruption
+from stand.running.run import Interrupted, resume, run_virtual
+from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon

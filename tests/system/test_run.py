@@ -19,8 +19,8 @@ from drivers.clock import seconds_ns
 from drivers.interface import ConfigError, SessionError, StandTripped, Unreachable
 from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
 from stand.recording.session import Session
-from stand.run import Interrupted, run_virtual
-from stand.session_setup import Order
+from stand.running.run import Interrupted, run_virtual
+from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
@@ -140,7 +140,7 @@ DAEMON = """
 import asyncio, pickle, sys
 from pathlib import Path
 from stand.hub import Batch
-from stand.run import run_virtual
+from stand.running.run import run_virtual
 
 order, out = pickle.loads(sys.stdin.buffer.read())
 

@@ -18,8 +18,8 @@ from drivers.interface import DeviceFault, StandTripped
 from stand.config import StandConfig
 from stand.hub import Item, StepMark, StepState
 from stand.recording.session import Session
-from stand.run import Interrupted, run_real, run_virtual
-from stand.session_setup import Order
+from stand.running.run import Interrupted, run_real, run_virtual
+from stand.running.session_setup import Order
 from stand.simulator import Simulator
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon

@@ -11,8 +11,8 @@ from experiments.steps import Role
 from stand.hub import Event, StepMark, StepState
 from stand.progress import progress
 from stand.recording.session import Session
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

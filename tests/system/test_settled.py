@@ -8,11 +8,11 @@ import pytest
 from compensation.observations import Observations, Role, observe_sessions
 from drivers.clock import NS_PER_S
 from stand.hub import StepState
-from stand.journal import Dwell, read_lines
 from stand.progress import progress
 from stand.recording.session import Session
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.journal import Dwell, read_lines
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

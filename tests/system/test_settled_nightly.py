@@ -25,8 +25,8 @@ from drivers.interface import Frame
 from stand.hub import Hub, Item
 from stand.progress import progress
 from stand.recording.session import Session
-from stand.run import run_virtual
-from stand.session_setup import Order
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

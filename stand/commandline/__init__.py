@@ -1,0 +1,1 @@
+"""The commands of `stand` and what they print."""

@@ -1,0 +1,212 @@
+"""What a plan will take, before anything moves: time, frames, bytes; and whether this stand may do it at all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from drivers.interface import ConfigError
+from drivers.stage import PROFILES
+from experiments.steps import (
+    AnySoak,
+    Capture,
+    CheckHome,
+    CoolDown,
+    MoveTo,
+    PlannedStep,
+    SetTemperature,
+    SoakUntilSettled,
+    StartChamber,
+    Step,
+    estimate_s,
+    frames_of,
+    kind_of,
+    longest_s,
+    parameters_of,
+)
+from stand.config import StandConfig
+from stand.estimating.durations import COOL_DOWN_AS_FOUND, LABORATORY_degC, Situation, axis_of, expect
+from stand.estimating.learned import Learned
+from stand.estimating.thermal_model import ChamberModel
+
+# Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
+# with its share of the index, committed every second.
+_BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0, "roi": 0.074}
+_TELEMETRY_BYTES_PER_MESSAGE = 116.0
+_SENSOR_PX = (2448, 2048)
+
+_LONGEST_S = 366 * 86400.0  # a longer plan is a slip of the keyboard, and its end soon beyond any calendar
+
+
+@dataclass(frozen=True, slots=True)
+class PricedStep:
+    """A step with its expected duration (s), frames and recorded bytes.
+
+    work, stated_s: what of the duration follows from the step, the rest being usual for this kind of work.
+    in_band_after_s: of a soak, when the chamber is expected at its set-point, s after the soak begins; None when it is
+    there already. warning: why the dwell before a first capture, or a cool-down, is too short, or why the duration of a
+    cool-down is not known; "" when there is none.
+    """
+
+    planned: PlannedStep
+    duration_s: float
+    frames: int
+    size_bytes: float
+    work: str
+    stated_s: float
+    in_band_after_s: float | None = None
+    warning: str = ""
+
+    def as_json(self) -> dict[str, object]:
+        """One entry of `stand plan --json`."""
+        return {
+            "index": self.planned.index,
+            "id": self.planned.step_id,
+            "kind": kind_of(self.planned.step),
+            "parameters": parameters_of(self.planned.step),
+            "duration_s": self.duration_s,
+            "frames": self.frames,
+            "bytes": round(self.size_bytes),
+            "in_band_after_s": self.in_band_after_s,
+            "warning": self.warning,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Approach:
+    """The chamber on its way between two set-points, `age_s` after the step from one to the other."""
+
+    from_degC: float
+    to_degC: float
+    age_s: float = 0.0
+    captured: bool = False
+
+    def after(self, step: Step, duration_s: float) -> _Approach:
+        """When the step is done; a new set-point is taken to find the air at the old one."""
+        if isinstance(step, StartChamber | SetTemperature):
+            return _Approach(self.to_degC, step.chamber_degC)
+        # A soak that waits for the camera has time enough when its longest is enough.
+        lasts_s = longest_s(step) if isinstance(step, SoakUntilSettled) else duration_s
+        return replace(self, age_s=self.age_s + lasts_s, captured=self.captured or isinstance(step, Capture))
+
+
+def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | None = None) -> tuple[PricedStep, ...]:
+    """Every step priced; ConfigError naming the first step that goes outside the stand's limits, or saying that
+    the whole would take more than a year."""
+    learned = learned or Learned()
+    frame_px = (config.camera.width_px or _SENSOR_PX[0]) * (config.camera.height_px or _SENSOR_PX[1])
+    telemetry_bytes_per_s = _messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
+    found, approach = Situation(), _Approach(LABORATORY_degC, LABORATORY_degC)
+    priced: list[PricedStep] = []
+    for planned in plan:
+        _check(planned, config)
+        step = planned.step
+        expected = expect(step, found, config, learned.overheads_s, learned.chamber)
+        duration_s = expected.duration_s
+        in_band_after_s = _in_band_after_s(step, approach, learned.chamber)
+        frames = _frames(step, duration_s, in_band_after_s)
+        size_bytes = frame_px * _image_bytes_per_px(step, frames, config) + duration_s * telemetry_bytes_per_s
+        priced.append(
+            PricedStep(
+                planned,
+                duration_s,
+                frames,
+                size_bytes,
+                expected.work,
+                expected.stated_s,
+                in_band_after_s,
+                _warning(step, approach, learned.chamber) or _unknown(expected.work, learned),
+            )
+        )
+        found, approach = found.after(step), approach.after(step, duration_s)
+    total_s = sum(step.duration_s for step in priced)
+    if total_s > _LONGEST_S:
+        raise ConfigError(f"the plan takes {total_s / 86400:.0f} days; more than a year is refused")
+    return tuple(priced)
+
+
+def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:
+    """Of a soak: s until the chamber is in its band; None when it is, and of other steps."""
+    after_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s
+    return after_s if isinstance(step, AnySoak) and after_s > 0.0 else None
+
+
+def _frames(step: Step, duration_s: float, in_band_after_s: float | None) -> int:
+    """Of a soak: its looks, from when the chamber is in its band."""
+    if not isinstance(step, SoakUntilSettled):
+        return frames_of(step)
+    return max(0, math.ceil((duration_s - (in_band_after_s or 0.0)) / step.look_every_s))
+
+
+def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:
+    """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then. Of a
+    cool-down: that it is too short for a camera that was on."""
+    if isinstance(step, CoolDown):
+        needed_s = estimate_s(replace(step, max_s=math.inf), 0.0)
+        too_short = f"ends after {_minutes(step.max_s)}; the camera needs {_minutes(needed_s)} to be within its band"
+        return f"the cool-down {too_short}" if step.max_s < needed_s else ""
+    arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC)
+    settled_s = chamber.settled_s(approach.from_degC, approach.to_degC)
+    if not isinstance(step, Capture) or approach.captured or approach.age_s >= settled_s:
+        return ""
+    spare_s = approach.age_s - arrives_s
+    return (
+        f"the dwell at {approach.to_degC:g} degC ends {_minutes(abs(spare_s))} "
+        f"{'before' if spare_s < 0.0 else 'after'} the chamber arrives; "
+        f"the camera needs {_minutes(settled_s - arrives_s)} to follow"
+    )
+
+
+def _unknown(work: str, learned: Learned) -> str:
+    if work != COOL_DOWN_AS_FOUND or work in learned.overheads_s:
+        return ""
+    return "as of a camera that was on; one that is cold already takes no time"
+
+
+def _minutes(duration_s: float) -> str:
+    return f"{duration_s / 60:.0f} min"
+
+
+def _messages_per_s(config: StandConfig) -> float:
+    polled = (config.regulator, config.relays, config.thermometers, config.flap, config.camera, *config.axes.values())
+    return sum(1.0 / device.poll_s for device in polled)
+
+
+def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
+    """What all frames of a step take, per pixel of one; with `roi` a step's first frame is whole, then one at times."""
+    recording, whole = config.recording, 0
+    if isinstance(step, Capture | SoakUntilSettled) and recording.frame_encoding == "roi" and frames:
+        interval_s = step.interval_s if isinstance(step, Capture) else step.look_every_s
+        whole = min(frames, 1 + int((frames - 1) * interval_s / recording.whole_every_s))
+    return whole * _BYTES_PER_PIXEL["png"] + (frames - whole) * _BYTES_PER_PIXEL[recording.frame_encoding]
+
+
+def _check(planned: PlannedStep, config: StandConfig) -> None:
+    step = planned.step
+    where = f"step {planned.index} ({kind_of(step)})"
+    if isinstance(step, StartChamber | SetTemperature):
+        low, high = config.limits.chamber_degC
+        if not low <= step.chamber_degC <= high:
+            raise ConfigError(f"{where}: {step.chamber_degC} degC is outside limits.chamber_degC {low}..{high}")
+    if isinstance(step, MoveTo | CheckHome):
+        try:
+            axis = axis_of(config, step.axis)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+        low, high = axis.limits
+        if isinstance(step, MoveTo) and not low <= step.position <= high:
+            raise ConfigError(
+                f"{where}: {step.position} {axis.unit} is outside the limits {axis.limits} of {step.axis}"
+            )
+        # An axis without scale is homed before it moves, which ends at 0; a home check begins at the profile's place.
+        home_from = PROFILES[axis.profile].home_from if isinstance(step, CheckHome) else None
+        outside = [place for place in (0.0, home_from) if place is not None and not low <= place <= high]
+        if outside:
+            raise ConfigError(
+                f"{where}: homing {step.axis} goes to {outside[0]:g} {axis.unit}, which axes.{step.axis}.limits "
+                f"{axis.limits} exclude"
+            )
+    if isinstance(step, Capture) and step.frames > 1 and step.interval_s < 1 / config.camera.frame_rate_hz - 1e-9:
+        rate_hz = config.camera.frame_rate_hz
+        raise ConfigError(f"{where}: a frame every {step.interval_s} s is faster than camera.frame_rate_hz {rate_hz}")

@@ -1,0 +1,153 @@
+"""What the last nights taught about durations: learned from the sessions in a folder, kept in a file beside them."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from statistics import median
+from typing import get_args
+
+import yaml
+from pydantic import Field
+
+from drivers.clock import NS_PER_S
+from drivers.documents import Document
+from drivers.interface import ConfigError, SessionError
+from experiments.steps import Role, Step
+from stand.config import StandConfig
+from stand.estimating.durations import Situation, expect
+from stand.estimating.thermal_model import ChamberModel, Ramp, fit, ramps_of
+from stand.hub import StepMark, StepState
+from stand.recording.session import Session
+from stand.recording.sink import sync_folder
+
+LEARNED_FILE = "learned.json"
+_NIGHTS = 5  # as far back as a stand is likely to be as it is now
+
+
+class Learned(Document):
+    """The chamber's model, and per kind of work (durations.Expectation) what it takes beyond what is stated, s.
+
+    `nights`: the sessions it is learned from, none when all are defaults.
+    """
+
+    chamber: ChamberModel = ChamberModel()
+    overheads_s: dict[str, float] = Field(default_factory=dict)
+    nights: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """One line about where the estimates come from."""
+        if not self.nights:
+            return "estimates are defaults; they are learned from recorded runs"
+        model = self.chamber
+        return (
+            f"estimates as learned from {len(self.nights)} runs, the last {self.nights[-1]} "
+            f"({model.heating_ramps} ramps up, {model.cooling_ramps} down)"
+        )
+
+
+def load_learned(directory: Path) -> Learned:
+    """What is kept in `directory`; defaults when there is nothing or nothing that can be read: an estimate is no
+    reason not to run, and the file is written anew at the end of each."""
+    try:
+        return Learned.model_validate_json((directory / LEARNED_FILE).read_bytes())
+    except (OSError, ValueError):
+        return Learned()
+
+
+@dataclass(frozen=True, slots=True)
+class _Night:
+    """What a session teaches."""
+
+    name: str
+    marks: list[StepMark]
+    ramps: list[Ramp]
+
+
+def learn(directory: Path, config: StandConfig) -> Learned:
+    """Learn from the last sessions of this stand (by its name) in `directory`, and keep it there.
+
+    Sessions that cannot be read teach nothing. The file is replaced at once or not at all; SessionError when the disk
+    refuses.
+    """
+    nights = list(islice(_nights(directory, config), _NIGHTS))
+    if not nights:
+        return load_learned(directory)
+    seen_s: defaultdict[str, list[float]] = defaultdict(list)
+    chamber = fit([ramp for night in nights for ramp in night.ramps])
+    for night in nights:
+        for work, overhead_s in overheads_of(night.marks, config, chamber):
+            seen_s[work].append(overhead_s)
+    learned = Learned(
+        chamber=chamber,
+        overheads_s={work: round(median(values_s), 3) for work, values_s in sorted(seen_s.items())},
+        nights=tuple(sorted(night.name for night in nights)),
+    )
+    _replace(directory / LEARNED_FILE, learned.model_dump_json(indent=2))
+    return learned
+
+
+def overheads_of(
+    marks: Iterable[StepMark], config: StandConfig, chamber: ChamberModel | None = None
+) -> list[tuple[str, float]]:
+    """(kind of work, s beyond what is stated) of every step of a session that was done in one go, in order; `config` is
+    the stand's as it is now, `chamber` its model. Steps that are not known any more are left out."""
+    found, overheads = Situation(), list[tuple[str, float]]()
+    for mark, duration_s in _done(marks):
+        step = _step_of(mark)
+        if step is None:
+            continue
+        if duration_s is not None:
+            expected = expect(step, found, config, chamber=chamber)
+            overheads.append((expected.work, duration_s - expected.stated_s))
+        found = found.after(step)
+    return overheads
+
+
+def _step_of(mark: StepMark) -> Step | None:
+    kind = next((kind for kind in get_args(Step) if kind.__name__ == mark.kind), None)
+    values = {name: Role(value) if name == "role" else value for name, value in mark.parameters.items()}
+    try:
+        return None if kind is None else kind(**values)
+    except (TypeError, ValueError):  # recorded when this kind of step had other parameters
+        return None
+
+
+def _nights(directory: Path, config: StandConfig) -> Iterator[_Night]:
+    """The readable sessions of the stand of that name, the last one first; their names begin with the time."""
+    for path in sorted(directory.glob("*/"), reverse=True):
+        with suppress(SessionError, ConfigError, yaml.YAMLError):
+            session = Session.open(path)
+            recorded = yaml.safe_load(session.attachment("config.yaml") or "{}")
+            if isinstance(recorded, dict) and recorded.get("name") == config.name:
+                yield _Night(path.name, session.steps(), ramps_of(session))
+
+
+def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float | None]]:
+    """The marks of steps that ended well, each with its duration, s; None when it was interrupted and begun again."""
+    begun_ns: dict[int, int | None] = {}
+    for mark in marks:
+        if mark.state is StepState.STARTED:
+            begun_ns[mark.index] = None if mark.index in begun_ns else mark.time_ns
+            continue
+        start_ns = begun_ns.pop(mark.index, None)
+        if mark.state is StepState.DONE:
+            yield mark, None if start_ns is None else (mark.time_ns - start_ns) / NS_PER_S
+
+
+def _replace(path: Path, text: str) -> None:
+    part = path.with_name(f"{path.name}.part")
+    try:
+        with part.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be written ({error.strerror})") from error

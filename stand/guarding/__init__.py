@@ -1,0 +1,1 @@
+"""What must never happen, and what is done when it does."""

@@ -1,0 +1,244 @@
+"""The guard's rules that need a memory: is what the chamber does what heat, or none, can do?
+
+Each is a pure step, (memory, readings, time) -> (memory, fault), and `remembering` makes a rule of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from drivers.clock import NS_PER_S, seconds_ns
+from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+
+Memory = TypeVar("Memory")
+
+
+def remembering(step: Callable[[Memory | None, Readings, int], tuple[Memory | None, Fault | None]]) -> Rule:
+    """A rule that hands each step's memory to the next; it begins with None."""
+    memory: Memory | None = None
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        nonlocal memory
+        memory, fault = step(memory, readings, now_ns)
+        return fault
+
+    return rule
+
+
+@dataclass(frozen=True, slots=True)
+class HeatingLimits:
+    """output_percent: from here on the regulator counts as heating. hysteresis_K: this far below the set-point all is
+    well. gain_K, window_s: while the temperature approaches, it must rise this much in each such time.
+    max_error_K_s: sum over time of what it lacks, that is allowed when it does not approach.
+    """
+
+    output_percent: float
+    hysteresis_K: float
+    gain_K: float
+    window_s: float
+    max_error_K_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Heating:
+    """Where the check of one stretch of heating stands."""
+
+    set_point_degC: float
+    checked_ns: int
+    goal_degC: float
+    deadline_ns: int
+    error_K_s: float = 0.0
+    approaching: bool = True
+    first_goal: bool = True
+
+
+def heating(
+    last: Heating | None, limits: HeatingLimits, set_point_degC: float, pv_degC: float, now_ns: int
+) -> Heating | None:
+    """The check after one more look at a heater that is on; None near the set-point, where all is well.
+
+    Klipper's verify_heater (klippy/extras/verify_heater.py): the first goal follows a falling temperature down, each
+    goal reached clears the error, a missed deadline ends the approach, and then the error decides. Unlike there, a goal
+    reached late is one: a chamber's window is long.
+    """
+    lacking_K = set_point_degC - limits.hysteresis_K - pv_degC
+    if not lacking_K > 0:
+        return None
+    goal_degC, deadline_ns = pv_degC + limits.gain_K, now_ns + seconds_ns(limits.window_s)
+    if last is None or last.set_point_degC != set_point_degC:
+        return Heating(set_point_degC, now_ns, goal_degC, deadline_ns)
+    if pv_degC >= last.goal_degC:
+        return Heating(set_point_degC, now_ns, goal_degC, deadline_ns, first_goal=False)
+    return replace(
+        last,
+        checked_ns=now_ns,
+        error_K_s=last.error_K_s + lacking_K * (now_ns - last.checked_ns) / NS_PER_S,
+        approaching=last.approaching and now_ns < last.deadline_ns,
+        goal_degC=min(last.goal_degC, goal_degC) if last.first_goal else last.goal_degC,
+    )
+
+
+def heater_not_warming(limits: HeatingLimits, regulator: str, permit: str) -> Rule:
+    """`regulator` heats, the relay `permit` lets the heat through, and the temperature does not rise: a dead heater, an
+    open thermal cut-out, a detached sensor.
+
+    Only a high output with the permit on is looked at: cooling, a resting compressor, or one that runs against little
+    heat, are no fault.
+    """
+    mv_heat, set_point, pv = (f"{regulator}.{quantity}" for quantity in ("mv_heat", "sp", "pv"))
+
+    def step(last: Heating | None, readings: Readings, now_ns: int) -> tuple[Heating | None, Fault | None]:
+        if not (value_of(readings, mv_heat) >= limits.output_percent and value_of(readings, permit) == 1):
+            return None, None
+        pv_degC = value_of(readings, pv)
+        state = heating(last, limits, value_of(readings, set_point), pv_degC, now_ns)
+        if state is None or state.approaching or state.error_K_s < limits.max_error_K_s:
+            return state, None
+        text = f"{pv} {pv_degC:.1f} degC has not risen by {limits.gain_K} K in {limits.window_s:g} s of heating"
+        return state, Fault("heater_not_warming", f"{text} towards {state.set_point_degC:.1f} degC")
+
+    return remembering(step)
+
+
+@dataclass(frozen=True, slots=True)
+class OffLimits:
+    """settle_s: how long a heater that was switched off still gives heat. rise_K: what the air may rise after that.
+    above_surroundings_K: how far it may end above everything that could warm it."""
+
+    settle_s: float
+    rise_K: float
+    above_surroundings_K: float
+
+
+@dataclass(frozen=True, slots=True)
+class Off:
+    """Heat is off since `since_ns`; the lowest air since it settled, None until then."""
+
+    since_ns: int
+    lowest_degC: float | None = None
+
+
+def warming_while_off(limits: OffLimits, air: str, regulator: str, permit: str, surroundings: tuple[str, ...]) -> Rule:
+    """The air rises though the regulator's output is 0 or the permit is off: a welded relay or a shorted SSR.
+
+    The heater's power cannot be seen. What else can warm the air, the laboratory and what was warm before, cannot bring
+    it above itself: so it must have risen, above the set-point, and above the warmest of `surroundings` that is known.
+    """
+    mv_heat, set_point, running = (f"{regulator}.{quantity}" for quantity in ("mv_heat", "sp", "running"))
+
+    def is_heat(readings: Readings, air_degC: float) -> bool:
+        if value_of(readings, running) == 1 and air_degC <= value_of(readings, set_point):
+            return False
+        warmed_K = (air_degC - value_of(readings, channel) for channel in surroundings)
+        known = [excess_K for excess_K in warmed_K if not math.isnan(excess_K)]
+        return bool(known) and min(known) > limits.above_surroundings_K
+
+    def step(last: Off | None, readings: Readings, now_ns: int) -> tuple[Off | None, Fault | None]:
+        if not (value_of(readings, mv_heat) <= 0 or value_of(readings, permit) == 0):
+            return None, None
+        air_degC = value_of(readings, air)
+        if last is None:
+            return Off(now_ns), None
+        if math.isnan(air_degC) or now_ns - last.since_ns < seconds_ns(limits.settle_s):
+            return last, None
+        lowest_degC = air_degC if last.lowest_degC is None else min(last.lowest_degC, air_degC)
+        state = Off(last.since_ns, lowest_degC)
+        if air_degC - lowest_degC >= limits.rise_K and is_heat(readings, air_degC):
+            text = f"{air} has risen from {lowest_degC:.2f} to {air_degC:.2f} degC with the heater off"
+            return state, Fault("warming_while_off", text)
+        return state, None
+
+    return remembering(step)
+
+
+@dataclass(frozen=True, slots=True)
+class VainLimits:
+    """In window_s of cooling without heat the air must fall by fall_K, unless the laboratory or the granite is warmer
+    than margin_K below it."""
+
+    window_s: float
+    fall_K: float
+    margin_K: float
+
+
+@dataclass(frozen=True, slots=True)
+class Cooling:
+    """The compressor has run without heat since `since_ns`, when the air was at `air_degC`."""
+
+    since_ns: int
+    air_degC: float
+
+
+def cooling_in_vain(
+    limits: VainLimits, air: str, regulator: str, compressor: str, surroundings: tuple[str, ...]
+) -> Rule:
+    """The compressor runs, the regulator's heating output is 0, and yet the air, which nothing around it warms, does
+    not fall: a welded relay that heats as much as is cooled, or a compressor that does not cool. The two look alike.
+
+    Below its surroundings the chamber may need all its cold to stay where it is, and nothing can be told.
+    """
+    mv_heat = f"{regulator}.mv_heat"
+
+    def is_alone(readings: Readings, air_degC: float) -> bool:
+        return all(value_of(readings, channel) < air_degC - limits.margin_K for channel in surroundings)
+
+    def step(last: Cooling | None, readings: Readings, now_ns: int) -> tuple[Cooling | None, Fault | None]:
+        air_degC = value_of(readings, air)
+        cools = value_of(readings, compressor) == 1 and value_of(readings, mv_heat) <= 0
+        if not (cools and is_alone(readings, air_degC)):
+            return None, None
+        if last is None or air_degC <= last.air_degC - limits.fall_K:
+            return Cooling(now_ns, air_degC), None
+        if now_ns - last.since_ns < seconds_ns(limits.window_s):
+            return last, None
+        text = (
+            f"{air} stays at {air_degC:.2f} degC though the compressor has run for {limits.window_s:g} s without heat"
+        )
+        return last, Fault("cooling_in_vain", text)
+
+    return remembering(step)
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A value that has not changed since `since_ns`, and what another sensor read then."""
+
+    value: float
+    since_ns: int
+    other: float
+
+
+def stuck(channel: str, after_s: float) -> Rule:
+    """`channel` has been exactly constant for `after_s`: a converter that works is noisier than that."""
+
+    def step(last: Constant | None, readings: Readings, now_ns: int) -> tuple[Constant | None, Fault | None]:
+        value = value_of(readings, channel)
+        if last is None or value != last.value:
+            return Constant(value, now_ns, 0.0), None
+        if now_ns - last.since_ns < seconds_ns(after_s):
+            return last, None
+        return last, Fault("sensor_stuck", f"{channel} has been exactly {value} for {after_s:g} s")
+
+    return remembering(step)
+
+
+def stuck_while_other_moves(channel: str, other: str, moved_K: float, after_s: float) -> Rule:
+    """`channel` has been exactly constant for at least `after_s`, in which `other`, in the same air, went `moved_K`.
+
+    The regulator shows 0.1 K and holds that for an hour, while its output goes from one end to the other to do so:
+    neither a constant value nor an output that moves tells a stuck probe, a second sensor does.
+    """
+
+    def step(last: Constant | None, readings: Readings, now_ns: int) -> tuple[Constant | None, Fault | None]:
+        value, other_value = value_of(readings, channel), value_of(readings, other)
+        if last is None or value != last.value:
+            return Constant(value, now_ns, other_value), None
+        went_K = abs(other_value - last.other)
+        if now_ns - last.since_ns < seconds_ns(after_s) or not went_K >= moved_K:
+            return last, None
+        return last, Fault("sensor_stuck", f"{channel} stays at {value} while {other} went by {went_K:.2f} K")
+
+    return remembering(step)

@@ -1,0 +1,126 @@
+"""A queue of runs that outlives the daemon: add, list, move, remove, and what a worker notes while it runs them.
+
+Every function takes the recording directory, is whole on the disk when it returns, and may be called by several
+processes at once. SessionError when the queue cannot be read or written, or a number is not in it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivers.interface import SessionError, StandTripped
+from stand.estimating.estimate import price
+from stand.order_files import parse_order
+from stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
+from stand.running.session_setup import Order
+
+
+def order_of(entry: Entry) -> Order:
+    """What an entry asks for; ConfigError when this version of the program refuses it."""
+    texts = {"config.yaml": entry.config_text, "recipe.yaml": entry.recipe_text, "target.yaml": entry.target_text}
+    names = {"config.yaml": entry.config, "recipe.yaml": entry.recipe, "target.yaml": "its target"}
+    order = parse_order(texts, {key: f"run {entry.id} of the queue: {name}" for key, name in names.items()})
+    price(order.recipe.plan(), order.config)
+    return order
+
+
+def queued(directory: Path) -> Queue:
+    """The queue as it is now."""
+    return read_queue(directory)
+
+
+def add(directory: Path, order: Order, config: str, now_ns: int) -> Entry:
+    """Queue a run behind all others; `config` is the name of its configuration, for messages."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SessionError(f"{directory}: cannot be made ({error.strerror})") from error
+    with changing(directory) as draft:
+        entry = Entry(
+            id=draft.queue.next_id,
+            recipe=order.recipe.name,
+            config=config,
+            config_text=order.config_text,
+            recipe_text=order.recipe_text,
+            target_text=order.target_text,
+            added_ns=now_ns,
+        )
+        draft.set(next_id=entry.id + 1, entries=(*draft.queue.entries, entry))
+    return entry
+
+
+def move(directory: Path, number: int, position: int) -> None:
+    """Make a run the `position`-th of those still to be done, 1 is the next; behind the last is the last."""
+    if position < 1:
+        raise SessionError(f"position {position}: the next run has position 1")
+    with changing(directory) as draft:
+        entry = draft.entry(number)
+        if not entry.is_open:
+            raise SessionError(f"run {number} is {entry.state}; only a run that is still to be done can be moved")
+        rest = [other for other in draft.queue.entries if other.is_open and other.id != number]
+        rest.insert(position - 1, entry)
+        draft.set(entries=(*(other for other in draft.queue.entries if not other.is_open), *rest))
+
+
+def remove(directory: Path, number: int) -> Entry:
+    """Take a run out of the queue, whatever became of it; its session stays. SessionError when it is running."""
+    with changing(directory) as draft:
+        entry = draft.entry(number)
+        if entry.state is State.RUNNING:
+            raise SessionError(f"run {number} is running; `stand stop` ends it")
+        draft.set(entries=tuple(other for other in draft.queue.entries if other.id != number))
+    return entry
+
+
+def take(directory: Path, now_ns: int) -> Entry | None:
+    """The next run, marked as running, as it was before: an interrupted one has its session. None when all are done.
+
+    StandTripped when the queue was halted and no operator has said that it may go on.
+    """
+    with changing(directory) as draft:
+        queue = draft.queue
+        if queue.halted:
+            remedy = "see to it, then `stand queue start --clear`"
+            raise StandTripped(f"{directory}: the queue was halted: {queue.halted}; {remedy}")
+        running = next((entry for entry in queue.entries if entry.state is State.RUNNING), None)
+        if running is not None:
+            raise SessionError(f"run {running.id} is running; one at a time")
+        entry = next((entry for entry in queue.entries if entry.is_open), None)
+        if entry is not None:
+            changes = {
+                "state": State.RUNNING,
+                "began_ns": entry.began_ns if entry.session else now_ns,
+                "reason": "",
+                "fruitless_starts": entry.fruitless_starts + 1,
+            }
+            draft.put(entry.model_copy(update=changes))
+    return entry
+
+
+def note_session(directory: Path, number: int, session: Path) -> None:
+    """The run has a session now; when it is interrupted it is resumed there."""
+    with changing(directory) as draft:
+        draft.put(draft.entry(number).model_copy(update={"session": session.name}))
+
+
+def note_step(directory: Path, number: int) -> None:
+    """The run under way has finished a step that it had not finished before."""
+    with changing(directory) as draft:
+        draft.put(draft.entry(number).model_copy(update={"fruitless_starts": 0}))
+
+
+def finish(directory: Path, number: int, state: State, now_ns: int, reason: str = "", *, halt: bool = False) -> None:
+    """The run under way has ended; with `halt` nothing is begun before an operator says so."""
+    with changing(directory) as draft:
+        changes = {"state": state, "ended_ns": now_ns, "reason": reason}
+        if state is State.INTERRUPTED:
+            changes["fruitless_starts"] = 0  # by an operator, who may do so as often as he likes
+        draft.put(draft.entry(number).model_copy(update=changes))
+        if halt:
+            draft.set(halted=f"run {number}: {reason}")
+
+
+def clear(directory: Path) -> None:
+    """An operator says that a halted queue may go on."""
+    with changing(directory) as draft:
+        draft.set(halted="")

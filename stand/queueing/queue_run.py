@@ -1,0 +1,125 @@
+"""How one run of a queue is performed: begun, or resumed in the session it has."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+from drivers.interface import ConfigError, SessionError, StandError, StandTripped
+from stand.commandline.session_report import NotReported, check_reportable, report_session
+from stand.estimating.estimate import price
+from stand.estimating.follow import Follow
+from stand.estimating.learned import learn, load_learned
+from stand.hub import Event, Hub, Item, StepMark, StepState
+from stand.progress import progress
+from stand.queueing.queue import order_of
+from stand.queueing.queue_file import Entry
+from stand.queueing.queue_work import Halt, Notes
+from stand.running.journal import Ended, Journal
+from stand.running.resume import Interruption, interruption
+from stand.running.run import resume, run_real, run_virtual
+from stand.running.session_setup import Order
+from stand.running.stop import Interrupted
+
+
+async def run_entry(
+    directory: Path, entry: Entry, notes: Notes, tell: Callable[[str], None], *, virtual_time: bool
+) -> Path:
+    """Run `entry` into a session below `directory`, or go on in the one it has; progress is shown, `tell` gets
+    warnings.
+
+    Returns the session's folder. Halt when an interrupted run cannot be resumed, or one that failed has left the stand
+    not confirmed safe; else raises as a run does.
+    """
+    session = directory / entry.session if entry.session else None
+    if session is not None and await asyncio.to_thread(_is_complete, session):
+        return session  # killed between its end and the note of it
+    order = order_of(entry)
+    before = None if session is None else await asyncio.to_thread(_interruption, session)
+    watch = _Watch(frozenset() if before is None else before.progress.done, notes.step_done)
+    try:
+        with _followed(directory, order, before, tell) as follow:
+
+            def subscribe(hub: Hub) -> None:
+                hub.subscribe(follow)
+                hub.subscribe(watch)
+
+            if before is not None:
+                return await resume(before, subscribe)
+            if virtual_time:
+                return await run_virtual(order, directory, None, subscribe, notes.begun)
+            return await run_real(order, directory, subscribe, notes.begun)
+    except (Interrupted, StandTripped):
+        raise
+    except StandError as error:
+        if watch.unsafe:
+            raise Halt(f"{error}; NOT SAFE: {'; '.join(watch.unsafe)}") from error
+        raise
+
+
+class _Watch:
+    """Tells of steps that were not done before, and keeps which actuators have not confirmed their safe state."""
+
+    def __init__(self, done: Collection[str], step_done: Callable[[], None]) -> None:
+        self.unsafe: list[str] = []
+        self._done = done
+        self._step_done = step_done
+
+    def __call__(self, item: Item) -> None:
+        if isinstance(item, Event) and item.kind == "not_confirmed_safe":
+            self.unsafe.append(item.text)
+        if isinstance(item, StepMark) and item.state is StepState.DONE and item.step_id not in self._done:
+            self._step_done()
+
+
+def conclude(entry: Entry, session: Path, tell: Callable[[str], None], *, report: bool) -> None:
+    """What follows a complete run, which none of it makes fail: what it teaches about durations is kept for the next,
+    and with `report` the drift is fitted and reported in the session's folder, when the recipe has any. Takes a minute.
+    """
+    order = order_of(entry)
+    try:
+        learn(session.parent, order.config)
+    except (SessionError, OSError) as error:
+        tell(f"warning: {error}")
+    if not report:
+        return
+    try:
+        check_reportable(order.recipe.plan())
+        for line in report_session(session, session):
+            tell(line)
+    except (ConfigError, NotReported) as error:
+        tell(f"{session.name}: {error}")
+    except Exception as error:  # noqa: BLE001 - the night goes on, whatever a fit makes of one session
+        tell(f"{session.name}: is recorded, but not reported: {type(error).__name__}: {error}")
+
+
+@contextmanager
+def _followed(
+    directory: Path, order: Order, before: Interruption | None, tell: Callable[[str], None]
+) -> Generator[Follow]:
+    steps = price(order.recipe.plan(), order.config, load_learned(directory))
+    with progress("run", sum(step.duration_s for step in steps)) as report:
+        if before is None:
+            yield Follow(steps, report, tell)
+        else:
+            yield Follow(steps, report, tell, before.progress.done, before.progress.earned_s)
+
+
+def _interruption(session: Path) -> Interruption:
+    try:
+        return interruption(session)
+    except SessionError as error:
+        raise Halt(str(error)) from error
+
+
+def _is_complete(session: Path) -> bool:
+    """Whether the run recorded in `session` came to its end; Halt when its journal cannot tell."""
+    try:
+        journal, entries = Journal.open(session)
+    except SessionError as error:
+        raise Halt(str(error)) from error
+    journal.release()
+    last = entries[-1] if entries else None
+    return isinstance(last, Ended) and last.status == "complete"

@@ -1,0 +1,1 @@
+"""A running stand asked and told from another terminal."""

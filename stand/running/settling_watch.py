@@ -1,0 +1,128 @@
+"""Watches a soaking camera: keeps what the chamber and the camera's thermometer say, and looks at the target."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+
+from compensation.markers.detection import Detection, DetectionError, detect
+from compensation.target import Target
+from drivers.clock import Clock, seconds_ns
+from drivers.interface import Frame
+from drivers.lane import Lane
+from experiments.steps import SoakUntilSettled
+from stand.estimating.thermal_model import BAND_K
+from stand.hub import Batch, Event, Hub, Item
+from stand.running.settling import Float, Seen, digit_K, judge, movement, seconds
+from stand.stand import Stand
+
+CHAMBER, CAMERA = "regulator.pv", "camera.temperature"
+_KEPT = 20_000  # readings: more than a day at one every 5 s
+
+
+class SettlingWatch:
+    """What is seen since `restart`; one to a run. `target`: what the camera looks at."""
+
+    def __init__(self, stand: Stand, hub: Hub, clock: Clock, target: Target) -> None:
+        self._stand = stand
+        self._hub = hub
+        self._clock = clock
+        self._target = target
+        self._lane = Lane("settling", clock)
+        self._readings = {name: deque[tuple[float, float]](maxlen=_KEPT) for name in (CHAMBER, CAMERA)}
+        self._digit_K = 0.0
+        self._looks: list[Float] = []
+        self._before: Detection | None = None
+        self._unseen = ""
+        self._due_ns: int | None = None  # the next look; None until the chamber has arrived
+        hub.subscribe(self._receive)
+
+    def close(self) -> None:
+        """End the thread that finds markers."""
+        self._lane.close()
+
+    def restart(self) -> None:
+        """A new window: what was seen before a soak, a pause or a disturbance proves nothing about the time after."""
+        for readings in self._readings.values():
+            readings.clear()
+        self._forget_looks("")
+        self._due_ns = None
+
+    async def is_settled(self, soak: SoakUntilSettled, step_id: str, soaked_s: float) -> bool:
+        """Whether the soak, `soaked_s` old, may end now; says so, and also when it has to end without.
+
+        Looks are taken every `soak.look_every_s` from when the chamber is in its band; judged is after each of them.
+        """
+        if await self._looked(soak, step_id) and soaked_s >= soak.min_s:
+            verdict = judge(self._seen(), soak, seconds(self._clock.now_ns()))
+            if verdict.settled:
+                self._tell("info", "settled", f"settled after {soaked_s / 60:.0f} min: {verdict.rates}")
+                return True
+        if soaked_s >= soak.max_s:
+            verdict = judge(self._seen(), soak, seconds(self._clock.now_ns()))
+            why = verdict.missing or "the last look came too late"
+            seen = f" ({self._unseen})" if self._unseen else ""
+            text = f"not settled after {soaked_s / 60:.0f} min: {why}{seen}"
+            self._tell("warning", "not_settled", text)
+        return False
+
+    async def _looked(self, soak: SoakUntilSettled, step_id: str) -> bool:
+        """Whether a look was due and has shown the target."""
+        now_ns, every_ns = self._clock.now_ns(), seconds_ns(soak.look_every_s)
+        if self._due_ns is None and self._has_arrived(soak.chamber_degC):
+            self._due_ns = now_ns
+        if self._due_ns is None or now_ns < self._due_ns:
+            return False
+        self._due_ns += (1 + (now_ns - self._due_ns) // every_ns) * every_ns
+        frame = await self._stand.look(soak.exposure_s, step_id)
+        if frame is None:
+            self._forget_looks("the camera was lost")
+            return False
+        await self._lane.call(self._find, frame)
+        return bool(self._looks)
+
+    def _find(self, frame: Frame) -> None:
+        """In the lane: the markers, and how far they have moved since the look before."""
+        try:
+            found = detect(frame.image, self._target, self._before)
+        except DetectionError as error:
+            return self._forget_looks(f"the target was not found: {error}")
+        seen = movement(self._before or found, found)
+        if seen is None:
+            return self._forget_looks("too few markers are whole")
+        moved_px, uncertainty_px = seen
+        so_far_px = self._looks[-1][1:5] if self._looks else np.zeros(4)
+        self._looks.append(np.array((seconds(frame.time_ns), *(so_far_px + moved_px), uncertainty_px)))
+        self._before, self._unseen = found, ""
+
+    def _forget_looks(self, why: str) -> None:
+        """The next look is the first one again."""
+        self._looks.clear()
+        self._before, self._unseen = None, why
+
+    def _receive(self, item: Item) -> None:
+        """The hub's subscriber."""
+        if isinstance(item, Batch):
+            for reading in item.readings:
+                if reading.channel in self._readings:
+                    self._readings[reading.channel].append((seconds(reading.time_ns), reading.value))
+
+    def _tell(self, level: str, kind: str, text: str) -> None:
+        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
+
+    def _has_arrived(self, chamber_degC: float) -> bool:
+        chamber = self._readings[CHAMBER]
+        return bool(chamber) and abs(chamber[-1][1] - chamber_degC) <= BAND_K
+
+    def _seen(self) -> Seen:
+        chamber, camera = (_table(self._readings[name], 2).T for name in (CHAMBER, CAMERA))
+        # A camera at rest shows one digit only; how wide that is shows while it moves.
+        self._digit_K = min(filter(None, (self._digit_K, digit_K(camera[1]))), default=0.0)
+        return Seen(chamber, camera, self._digit_K, _table(self._looks, 6))
+
+
+def _table(rows: Iterable[object], width: int) -> Float:
+    """(n, width), also when there are none."""
+    return np.array(list(rows), np.float64).reshape(-1, width)

@@ -1,0 +1,112 @@
+"""How a run ends early, whoever wants it: the actuators are made safe first, then the run is cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+
+from drivers.interface import SessionError, StandError, StandTripped
+from stand.guarding.interlocks import Fault
+from stand.running.gate import Gate, Phase, Turn, next_phase
+from stand.stand import Stand
+
+OPERATOR = "operator"  # the rule of a fault that is no fault
+_BY_OPERATOR = Fault(OPERATOR, "stopped by the operator")
+
+
+class Interrupted(StandError):
+    """The operator ended the run (Ctrl-C, SIGTERM or `stand stop`); the text says whether the stand confirmed its safe
+    state."""
+
+
+class Stop:
+    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM, and SIGHUP, when the terminal
+    is closed and nohup does not keep it away): `stop(fault)`, in any phase.
+
+    The stand is latched and made safe, the run cancelled where it waits, once, and not while it is being taken down;
+    what it then raises becomes Interrupted or StandTripped with the first reason.
+    """
+
+    def __init__(self) -> None:
+        self.fault: Fault | None = None
+        self.phase = Phase.IDLE
+        self._stand: Stand | None = None
+        self._aborting: asyncio.Task[None] | None = None
+        self._taking_down = False
+        self._signals = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            self._signals.append(signal.SIGHUP)
+
+    def watch(self, stand: Stand) -> None:
+        """The stand to be made safe; before that a stop only cancels."""
+        self._stand = stand
+        stand.gate.subscribe(lambda reason, held: self._follow(stand.gate))
+
+    def started(self) -> None:
+        """The plan begins."""
+        self._turn(Turn.START)
+        if self._stand is not None:
+            self._follow(self._stand.gate)
+
+    def __call__(self, fault: Fault = _BY_OPERATOR) -> None:
+        """Latch at once, begin to make safe, and return; the run is cancelled when the actuators have answered."""
+        self.fault = self.fault or fault
+        if self._stand is not None:
+            self._stand.latch(fault)
+        if self.phase in (Phase.ABORTING, Phase.ENDED) or self._taking_down:
+            return
+        self._turn(Turn.STOP)
+        if self._stand is None:
+            self._run.cancel()
+        else:
+            self._aborting = asyncio.create_task(self._abort(self._stand))
+
+    def taking_down(self) -> None:
+        """From here on the run makes safe and cleans up by itself and must not be cancelled."""
+        self._taking_down = True
+
+    async def settled(self) -> None:
+        """From here on nothing is cancelled, and no making safe is under way: the clock and the wires may go."""
+        self._taking_down = True
+        if self._aborting is not None:
+            await asyncio.wait([self._aborting])
+
+    def ended(self) -> None:
+        """The plan has ended, whichever way."""
+        self._turn(Turn.END)
+
+    async def _abort(self, stand: Stand) -> None:
+        try:
+            await stand.make_safe()
+        finally:
+            if not self._taking_down:
+                self._taking_down = True
+                self._run.cancel()
+
+    def _follow(self, gate: Gate) -> None:
+        self._turn(Turn.HOLD if gate.reasons else Turn.RELEASE)
+
+    def _turn(self, turn: Turn) -> None:
+        self.phase = next_phase(self.phase, turn)
+
+    async def __aenter__(self) -> Stop:
+        running = asyncio.current_task()
+        if running is None:
+            raise ValueError("a run is stopped by its task; there is none")
+        self._run = running
+        for number in self._signals:
+            asyncio.get_running_loop().add_signal_handler(number, self)
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        for number in self._signals:
+            asyncio.get_running_loop().remove_signal_handler(number)
+        if self.fault is None or error is None:
+            return
+        unsafe = self._stand.unconfirmed if self._stand is not None else ()
+        text = f"{self.fault.text}; " + (f"NOT SAFE: {'; '.join(unsafe)}" if unsafe else "the stand is safe")
+        if isinstance(error, SessionError):
+            text = f"{text}; {error}"
+        if isinstance(error, asyncio.CancelledError):
+            self._run.uncancel()
+        raise (Interrupted(text) if self.fault.rule == OPERATOR else StandTripped(text)) from error
