@@ -14,7 +14,7 @@ from compensation.report.numbers import HysteresisNumbers, Numbers
 from compensation.report.page import figure, heading, paragraph, table
 from compensation.report.path_figures import EXAGGERATION, Paths, trajectories
 from compensation.report.result_section import ours
-from compensation.report.tracks import Track, WarmUp, cycle, visits, warm_ups
+from compensation.report.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
 
 _ROLLED_DEG = 1.0
 _MOST_PANELS = 4
@@ -23,6 +23,8 @@ _S_PER_MIN = 60.0
 
 def drift_section(observations: Observations, numbers: Numbers) -> Iterator[str]:
     """Warm-up, cycle and the whole recording; what was not recorded has no figure."""
+    if not np.isfinite(moved_px(observations)).any():
+        return
     yield from _warm_ups(observations, numbers)
     yield heading("Drift over temperature" if numbers.hysteresis_before else "Drift over time")
     yield from _cycles(observations, numbers)

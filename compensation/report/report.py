@@ -29,23 +29,27 @@ from drivers.interface import SessionError
 from stand.recording.session import Session
 
 
-def analyse(session_paths: Sequence[Path], model_path: Path, report_path: Path, progress: Progress) -> Evaluation:
+def analyse(
+    session_paths: Sequence[Path], model_path: Path, report_path: Path, progress: Progress
+) -> Evaluation | None:
     """Sessions in; model, report and its numbers out, each file whole or not there; the markers are looked for once.
 
-    `progress` is stand.progress.progress or alike. Raises SessionError or ConfigError with a sentence.
+    Without a thermal cycle there is no model, and None. `progress` is stand.progress.progress or alike. Raises
+    SessionError or ConfigError with a sentence.
     """
     check_writable(model_path)
-    check_report_writable(report_path)
+    check_report_writable(report_path, model_path)
     observations = observe_sessions(session_paths, progress)
+    extras = Extras(positions=table_positions([Session.open(path).steps() for path in session_paths]))
     with progress("fit and report", 3) as report:
         report(0, "choosing the form")
-        model = fit(observations)
+        model = fit(observations) if can_be_fitted(observations) else None
         report(1, "scoring")
-        evaluation = evaluate(model, observations)
+        evaluation = None if model is None else evaluate(model, observations)
         report(2, "drawing")
-        save_model(model, model_path)
-        extras = Extras(positions=table_positions([Session.open(path).steps() for path in session_paths]))
         write_report(report_path, observations, model, evaluation, extras)
+        if model is not None:
+            save_model(model, model_path)
         report(3, "written")
     return evaluation
 

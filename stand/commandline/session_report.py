@@ -17,14 +17,15 @@ class NotReported(StandError):
 
 
 def check_reportable(plan: Iterable[PlannedStep]) -> None:
-    """ConfigError when the plan leaves nothing that a drift can be fitted to, to be told before anything moves."""
+    """ConfigError when the plan leaves no drift to report, to be told before anything moves."""
     roles = {planned.step.role for planned in plan if isinstance(planned.step, Capture)}
-    if not {Role.REFERENCE, Role.FIT} <= roles:
-        raise ConfigError("--report needs a recipe with a thermal_cycle: the drift is fitted to its frames")
+    if Role.WARM_UP not in roles and not {Role.REFERENCE, Role.FIT} <= roles:
+        raise ConfigError("--report needs a recipe with a thermal_cycle or a warm_up: their frames show the drift")
 
 
 def report_session(session: Path, folder: Path) -> list[str]:
-    """Fit and report a session into `folder`; the lines to show: the table beside the paper's and where both files are.
+    """Fit and report a session into `folder`; the lines to show: the table beside the paper's and where the files are.
+    A session without a thermal cycle has a report of its drift, and no model.
 
     The session's own folder will do: whatever reads a session looks only at what a run has left there. NotReported when
     the frames do not allow it or a file cannot be written; what was recorded is as it was.
@@ -39,4 +40,5 @@ def report_session(session: Path, folder: Path) -> list[str]:
     except (StandError, OSError) as error:
         remedy = f"`compensate report {session} -o report.html` tries again"
         raise NotReported(f"{session} is recorded, but not reported: {error}; {remedy}") from error
-    return [table(evaluation), f"model    {model}", f"report   {report}"]
+    fitted = [] if evaluation is None else [table(evaluation), f"model    {model}"]
+    return [*fitted, f"report   {report}"]

@@ -95,6 +95,7 @@ def test_fit_then_report_then_analyse_agree(recorded: Recorded, tmp_path: Path, 
     reported = run("report", recorded.path, "--model", tmp_path / "model.json", "-o", tmp_path / "report.html")
     assert reported.exit_code == 0
     evaluation = analyse([recorded.path], tmp_path / "model2.json", tmp_path / "report2.html", progress)
+    assert evaluation is not None
     assert table(evaluation) == reported.stdout.rstrip("\n")
     assert (tmp_path / "model2.json").read_bytes() == (tmp_path / "model.json").read_bytes()
     for suffix in ("html", "json"):

@@ -218,6 +218,13 @@ def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving
     assert "one temperature left out at a time" in text
 
 
+@pytest.mark.parametrize("role", ["calibration", "other"])
+def test_a_session_without_any_drift_is_reported_all_the_same(role: str):
+    text = report_page(warm_up_only(roles=(role,)), None, None)
+    assert headings(text) == ["Result", "Recorded data"]
+    assert f"({12 + 8} {role})" in text
+
+
 def test_a_long_warm_up_does_not_make_a_large_page():
     text = report_page(warm_up_only(3600), None, None)
     assert len(text.encode()) < 1_000_000

@@ -53,6 +53,11 @@ experiments:
       dwell_s: 60
       reference_frames: 1
 """
+WARM_UP_ALONE = """
+name: warm-up-alone
+experiments:
+  - warm_up: {table_position: {linear: 0, rotary: 0}, cool_down_max_s: 60, frames: 3, interval_s: 60}
+"""
 
 
 @pytest.fixture
@@ -109,6 +114,18 @@ def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, conf
     assert not (directory / REPORT_NAME).exists()
     last = ended.stderr.splitlines()[-1]
     assert last.startswith(f"error: {directory} is recorded, but not reported: a fit needs frames at 3 chamber")
+
+
+@pytest.mark.usefixtures("_aravis")
+def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, config_text: Callable[..., str]):
+    recipe = out.parent / "recipe.yaml"
+    recipe.write_text(WARM_UP_ALONE)
+    ended = run_reported(str(recipe), config_text(), out, 60)
+    assert ended.returncode == 0, ended.stderr
+    session, *lines = ended.stdout.splitlines()
+    assert lines == [f"report   {Path(session) / REPORT_NAME}"]
+    assert not (Path(session) / MODEL_NAME).exists()
+    assert ">Warm-up<" in (Path(session) / REPORT_NAME).read_text(encoding="utf-8")
 
 
 @pytest.mark.nightly
