@@ -21,7 +21,7 @@ from compensation.markers.edge_model import B0, F0, PARAMETERS, EdgeState, Float
 
 _LEAST_MARKERS = 20
 """So many tell w^2 to a quarter of the variance of r."""
-_GREATEST_SIGMA = 4.0
+_GREATEST_SIGMA = 3.0
 """A marker whose slopes differ by more is not like the others and stays as it is."""
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from compensation.compiled import compiled, digest, entry
 from compensation.markers import edge_model, newton, pixels, sectors
 from compensation.markers.edge_fit import room
-from compensation.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance
-from compensation.markers.newton import SETTLED, Belief, Work, inverse, settle
+from compensation.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
+from compensation.markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
 from compensation.markers.noise import Image, Noise, full_scale_DN
 from compensation.markers.pixels import Pixels, empty_pixels
 from compensation.markers.sectors import SECTORS, Bools, sector_misfits
@@ -26,6 +26,7 @@ from compensation.markers.sectors import SECTORS, Bools, sector_misfits
 _LEAST_SECTORS = 13
 """35 %: with fewer the centre hangs on the shape that the other markers have."""
 _GREATEST_MISFIT = 4.0
+_STRANGE = 3.0
 _BEFORE_OTHERS = 0.5
 """Sectors this much as bad as the worst go together with it; the others may only suffer from the worst."""
 
@@ -54,6 +55,13 @@ def refit_edges(image: Image, start: EdgeState, spread: Float, noise: Noise, rea
         _GREATEST_MISFIT * max(patience, 1.0), covariance, chi,
     )  # fmt: skip
     return Refit(EdgeState(parameters, start.scale_px), covariance, chi)
+
+
+@compiled
+def drop_strangers(kept: Bools, misfits: Float, greatest: float) -> None:
+    """Drop what stands out before anything is fitted: a sheet over a third of the disc tilts both planes so much that
+    good sectors look as bad as covered ones. Levels that the other markers get wrong are wrong everywhere."""
+    kept &= misfits <= max(greatest, _STRANGE * np.median(misfits))
 
 
 @compiled
@@ -98,6 +106,9 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
             p = parameters[n].copy()
             covariance[n], chi[n] = np.nan, np.nan
             belief = Belief(np.ones(SECTORS, np.bool_), p[M11 : SIGMA + 1].copy(), weight[n])
+            look(image, p, scale[n], band(p, scale[n], reach[n], False), ceiling, pixels, belief)
+            normal_equations(pixels, p, scale[n], noise, work.normal, work.right)
+            drop_strangers(belief.kept, sector_misfits(pixels, p), greatest)
             searching = True
             while searching and belief.kept.sum() >= _LEAST_SECTORS:
                 outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)

@@ -48,6 +48,12 @@ def ratio_at_least(limit: float, figure: Figure) -> Figure:
     return replace(figure, goal=f"ratio >= {limit:g} {_verdict(ratio >= limit)}")
 
 
+def ratio_at_most(limit: float, figure: Figure) -> Figure:
+    """The figure with its goal: the median of its ratios is not above `limit`."""
+    ratio = math.nan if figure.ratios is None else figure.ratios[1]
+    return replace(figure, goal=f"ratio <= {limit:g} {_verdict(ratio <= limit)}")
+
+
 def _verdict(is_met: bool) -> str:
     return "met" if is_met else "MISSED"
 

@@ -174,6 +174,14 @@ def test_no_marker_that_glare_or_an_occluder_spoils_is_silently_wrong():
     assert 0.7 < np.sqrt(np.mean(np.square(refitted)) / 2) < 1.1
 
 
+def test_a_sheet_over_a_quarter_of_each_disc_of_a_column_leaves_them_within_five_of_their_sigmas():
+    image, column = half_frame().copy(), np.arange(0, 54, 9)
+    image[:, : int(true_centres_px(HALF)[0, 0] - 7)] = 90
+    found = detect(photograph(HALF, image, 1), PAPER, half_tracked(), CAMERA)
+    assert np.all(found.flags[column] == Flag.REFITTED)
+    assert sigmas(found, column).max() < 5
+
+
 def test_a_marker_hidden_to_two_thirds_keeps_its_flag():
     image, (x, y) = half_frame().copy(), true_centres_px(HALF)[20]
     v, u = around(np.array([x, y]), 40)
