@@ -21,8 +21,8 @@ from compensation.markers.edge_model import B0, F0, PARAMETERS, EdgeState, Float
 
 _LEAST_MARKERS = 20
 """So many tell w^2 to a quarter of the variance of r."""
-_GREATEST_SIGMA = 3.0
-"""A marker whose slopes differ by more is not like the others and stays as it is."""
+_GREATEST_SIGMA = 2.0
+"""A marker whose slopes differ by more stays as it is: faint glare that no flag shows would gain weight."""
 
 
 def under_common_light(fit: EdgeFit, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
