@@ -17,47 +17,51 @@ from compensation.drift.training import frame_states
 from compensation.drift.validation import evaluate
 from compensation.observations import Role
 from drivers.sim.optics import CameraKind
-from tests.bench.figures import Figure, at_most, progress
+from tests.bench.figures import Figure, at_most, progress, side_by_side
 from tests.compensation.plant_night import Dwell, Seen, WarmUp, night, warm_up_and_cycles
 
-SEED = 1
+SEEDS = (2, 3, 4, 5)  # the families of terms were chosen with nights of seed 1 in view
 CYCLES = 2
 GOAL_MPX: dict[CameraKind, float] = {"modified": 5.0, "unmodified": 15.0}
 WARM_UP_GOAL_MPX = 3.0
 ELSEWHERE_DEGC = (15.0, 34.0)
+PEER = "the paper's form"
 
 
 def figures(directory: Path) -> list[Figure]:
-    """mpx RMS of both coordinates at held-out temperatures and in warm-ups elsewhere, and the intervals' coverage."""
-    progress("drift, one night of each camera")
-    elsewhere = {
-        air_degC: night("modified", SEED, [Dwell(24.0, "reference", 2700, 20), WarmUp(air_degC)])
-        for air_degC in ELSEWHERE_DEGC
-    }
-    found: list[Figure] = []
+    """mpx RMS of both coordinates at held-out temperatures and in warm-ups elsewhere, and the intervals' coverage: the
+    medians of several nights."""
+    found: dict[tuple[str, str, float | None], list[tuple[float, float]]] = {}
+    for seed in SEEDS:
+        progress(f"drift, one night of each camera, seed {seed}")
+        for what, unit, goal, pair in _values(seed):
+            found.setdefault((what, unit, goal), []).append(pair)
+    return [_figure(what, unit, goal, pairs) for (what, unit, goal), pairs in found.items()]
+
+
+def _figure(what: str, unit: str, goal: float | None, pairs: list[tuple[float, float]]) -> Figure:
+    thermal, paper = zip(*pairs, strict=True)
+    figure = side_by_side(what, unit, PEER, thermal, paper)
+    return figure if goal is None else at_most(goal, figure)
+
+
+def _values(seed: int) -> Iterator[tuple[str, str, float | None, tuple[float, float]]]:
+    """What, unit, goal, and the thermal form's value with the paper's."""
     for kind, goal_mpx in GOAL_MPX.items():
-        seen = night(kind, SEED, warm_up_and_cycles(CYCLES))
+        seen = night(kind, seed, warm_up_and_cycles(CYCLES))
         models = {form: fit(seen[0], form=form) for form in FORMS}
-        what = f"drift, {kind} camera, held-out temperatures"
-        found.append(at_most(goal_mpx, _figure(what, seen, Role.VALIDATION, models)))
-        found += _coverage(kind, seen, models)
-        if kind == "modified":
-            for air_degC, other in elsewhere.items():
-                what = f"drift, warm-up at {air_degC:g} degC"
-                found.append(at_most(WARM_UP_GOAL_MPX, _figure(what, other, Role.WARM_UP, models)))
-    return found
+        yield f"drift, {kind} camera, held-out temperatures", "mpx RMS", goal_mpx, _left(models, seen, Role.VALIDATION)
+        for axis, name in enumerate("IJ"):
+            covered, paper = (100 * evaluate(models[form], seen[0]).coverage_95[axis] for form in ("thermal", "paper"))
+            yield f"  95 % interval along {name}, {kind}; 92 to 98 is right", "%", None, (covered, paper)
+        for air_degC in ELSEWHERE_DEGC if kind == "modified" else ():
+            elsewhere = night(kind, seed, [Dwell(24.0, "reference", 2700, 20), WarmUp(air_degC)])
+            what = f"drift, warm-up at {air_degC:g} degC"
+            yield what, "mpx RMS", WARM_UP_GOAL_MPX, _left(models, elsewhere, Role.WARM_UP)
 
 
-def _figure(what: str, seen: Seen, role: Role, models: dict[Form, DriftModel]) -> Figure:
-    thermal, paper = (left_mpx(models[form], seen, role) for form in ("thermal", "paper"))
-    return Figure(what, "mpx RMS", thermal, "the paper's form", paper, (thermal / paper,) * 3)
-
-
-def _coverage(kind: str, seen: Seen, models: dict[Form, DriftModel]) -> Iterator[Figure]:
-    for axis, name in enumerate("IJ"):
-        covered, paper = (100 * evaluate(models[form], seen[0]).coverage_95[axis] for form in ("thermal", "paper"))
-        what = f"  95 % interval along {name}, {kind}; 92 to 98 is right"
-        yield Figure(what, "%", covered, "the paper's form", paper, (covered / paper,) * 3)
+def _left(models: dict[Form, DriftModel], seen: Seen, role: Role) -> tuple[float, float]:
+    return left_mpx(models["thermal"], seen, role), left_mpx(models["paper"], seen, role)
 
 
 def left_mpx(model: DriftModel, seen: Seen, role: Role) -> float:
