@@ -21,8 +21,9 @@ from compensation.markers.edge_model import B0, F0, PARAMETERS, EdgeState, Float
 
 _LEAST_MARKERS = 20
 """So many tell w^2 to a quarter of the variance of r."""
-_GREATEST_SIGMA = 2.0
-"""A marker whose slopes differ by more stays as it is: faint glare that no flag shows would gain weight."""
+_BELIEVED_CHI2, _DOUBTED_CHI2 = 2.0, 5.0
+"""A marker whose slopes differ by more (chi^2 of two) is pulled less and less, and then stays as it is: faint glare
+that no flag shows would gain weight."""
 
 
 def under_common_light(fit: EdgeFit, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
@@ -39,10 +40,10 @@ def under_common_light(fit: EdgeFit, clean: NDArray[np.bool_]) -> tuple[Float, F
     beyond = np.mean(differing**2 - np.diagonal(variance, axis1=1, axis2=2))
     inverse = np.linalg.inv(variance + max(float(beyond), 0.0) * np.eye(2))
     gain = shared @ inverse
-    alike = np.einsum("ni,nij,nj->n", differing, inverse, differing) < _GREATEST_SIGMA**2
-    gain[~alike] = 0
-    centres[clean] -= np.einsum("nij,nj->ni", gain, differing)
-    covariance[clean] -= gain @ shared.transpose(0, 2, 1)
+    chi2 = np.einsum("ni,nij,nj->n", differing, inverse, differing)
+    part = np.clip((_DOUBTED_CHI2 - chi2) / (_DOUBTED_CHI2 - _BELIEVED_CHI2), 0, 1)[:, None]
+    centres[clean] -= part * np.einsum("nij,nj->ni", gain, differing)
+    covariance[clean] -= (part * (2 - part))[:, :, None] * (gain @ shared.transpose(0, 2, 1))
     return centres, covariance
 
 

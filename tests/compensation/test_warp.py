@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from compensation.apply.spline import coefficients
-from compensation.apply.warp import source_offset, warp
+from compensation.apply.warp import LATTICE_PX, source_offset, warp
 from compensation.markers.detection import detect
 from compensation.target import load_target
 from stand.config import packaged
@@ -41,10 +41,12 @@ def test_the_coefficients_are_those_of_the_mirrored_spline(shape):
 def test_every_pixel_is_that_of_an_exact_spline_at_the_place_it_comes_from(shift, dtype):
     image = noise((150, 210), dtype)
     moved = warp(image, shift)
-    places = np.stack(np.meshgrid(np.arange(0, 256, 32.0), np.arange(0, 192, 32.0)), axis=-1)
+    places = np.stack(np.meshgrid(np.arange(0, 256.0, LATTICE_PX), np.arange(0, 192.0, LATTICE_PX)), axis=-1)
     offset = source_offset(shift, places.reshape(-1, 2)).reshape(places.shape)
     rows, columns = np.mgrid[:150, :210].astype(float)
-    dx, dy = (ndimage.map_coordinates(offset[:, :, i], [rows / 32, columns / 32], order=1) for i in (0, 1))
+    dx, dy = (
+        ndimage.map_coordinates(offset[:, :, i], [rows / LATTICE_PX, columns / LATTICE_PX], order=1) for i in (0, 1)
+    )
     padded = np.pad(image.astype(float), 40, mode="reflect")
     expected = ndimage.map_coordinates(padded, [rows + dy + 40, columns + dx + 40], order=3, mode="mirror")
     assert moved.dtype == np.float32

@@ -28,7 +28,14 @@ experiments:
       interval_s: 1
 """
 
-COMMAND = [sys.executable, "-c", "from stand.queue_cli import app; app()", "start", "--virtual-time", "--out"]
+COMMAND = [
+    sys.executable,
+    "-c",
+    "from stand.commandline.queue_cli import app; app()",
+    "start",
+    "--virtual-time",
+    "--out",
+]
 
 
 def kill_under_way(directory: Path) -> None:
