@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 READ_RETRIES = 2
 DEAD_AFTER_FAILURES = 5  # transactions: one read with its repeats, and two more
-PROBE_PERIOD_S = 10.0
+PROBE_PERIODS_S = (1.0, 2.0, 4.0, 8.0, 10.0)  # of a dead unit, the last for good
 REOPEN_PERIOD_S = 1.0
 QUARANTINE_MARGIN_S = 0.05
 
@@ -66,10 +66,17 @@ class BusCounters:
 
 @dataclass
 class _Health:
-    """Failures of one unit in a row, and when a dead one is next asked."""
+    """Failures of one unit in a row, whether the last was silence, and when a dead one is next asked."""
 
     failures: int = 0
+    silent: bool = False
     probe_ns: int = 0
+
+    def failed(self, silent: bool, now_ns: int) -> _Health:
+        """After one more."""
+        failures = self.failures + 1
+        period_s = PROBE_PERIODS_S[min(max(0, failures - DEAD_AFTER_FAILURES), len(PROBE_PERIODS_S) - 1)]
+        return _Health(failures, silent, now_ns + seconds_ns(period_s))
 
 
 class Bus:
@@ -77,8 +84,8 @@ class Bus:
 
     timeout_s must exceed the slowest normal reply of any unit; gap_s is the silence between frames on a serial line (a
     gateway keeps its own). All calls raise Unreachable, GarbledReply or Refused naming `device`. Reads are tried up
-    to three times when the unit answered last time. Writes go out once, and to a dead unit or line too, so that a
-    make-safe is never withheld. `counters` are public.
+    to three times when the unit answered last time, be it garbled. Writes go out once, and to a dead unit or line too,
+    so that a make-safe is never withheld. `counters` are public.
     """
 
     def __init__(
@@ -125,8 +132,10 @@ class Bus:
         health = self._health.setdefault(unit, _Health())
         if health.failures >= DEAD_AFTER_FAILURES and self.clock.now_ns() < health.probe_ns:
             self.counters.skipped += 1
-            raise Unreachable(device, f"unit {unit} on {self.name} is dead; asked again every {PROBE_PERIOD_S:g} s")
-        retries = READ_RETRIES if health.failures == 0 else 0
+            raise Unreachable(
+                device, f"unit {unit} on {self.name} is dead; asked again every {PROBE_PERIODS_S[-1]:g} s"
+            )
+        retries = 0 if health.silent else READ_RETRIES
         while True:
             if self._line_fault and self.clock.now_ns() < self._reopen_ns:
                 raise Unreachable(device, self._line_fault)
@@ -173,8 +182,8 @@ class Bus:
                 self._reopen_ns = now_ns + seconds_ns(REOPEN_PERIOD_S) if self._line_fault else now_ns
                 self._line_fault = str(fault)
             case Fault.SILENCE | Fault.GARBLED:
-                failures = self._health.get(unit, _Health()).failures + 1
-                self._health[unit] = _Health(failures, now_ns + seconds_ns(PROBE_PERIOD_S))
+                silent = fault.fault is Fault.SILENCE
+                self._health[unit] = self._health.get(unit, _Health()).failed(silent, now_ns)
             case Fault.REFUSED:
                 self._health[unit] = _Health()
         return ERRORS[fault.fault](device, f"unit {unit} on {self.name}: {fault}")

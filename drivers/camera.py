@@ -120,11 +120,11 @@ class Camera:
         channel = f"{self._name}.temperature"
         if self._lane is None:
             return (bad_reading(channel, "degC", self._clock.now_ns(), "the camera is closed"),)
-        value_degC, reason = await self._call(self._usable().temperature)
+        value_degC, reason, cause = await self._call(self._usable().temperature)
         self._usable()
         time_ns = self._clock.now_ns()
         if reason:
-            return (bad_reading(channel, "degC", time_ns, reason),)
+            return (bad_reading(channel, "degC", time_ns, reason, cause),)
         return (Reading(channel, value_degC, "degC", time_ns),)
 
     async def _grab_triggered(self, connection: Connection, exposure_s: float, due_ns: int) -> Shot:

@@ -36,7 +36,7 @@ from drivers.camera_settings import (
     set_exposure,
 )
 from drivers.clock import NS_PER_S, Clock, block_until, seconds_ns
-from drivers.interface import Refused
+from drivers.interface import Cause, Refused
 
 # Aravis' stream: ask again for a missing packet after 1 ms, then every 40 ms, for as much of a frame as was lost.
 INITIAL_PACKET_TIMEOUT_US = 1_000
@@ -218,10 +218,10 @@ class Connection:
         begin_ns = self._phase_ns + periods * self._period_ns
         return begin_ns + seconds_ns(self._exposure_s)
 
-    def temperature(self) -> tuple[float, str]:
-        """The camera's temperature in degC and "", or NaN and the reason."""
+    def temperature(self) -> tuple[float, str, Cause]:
+        """The camera's temperature in degC and "", or NaN, the reason and who says so."""
         if self._temperature is None:
-            return math.nan, self._no_temperature
+            return math.nan, self._no_temperature, "device"
         return read_temperature(self._device, self._temperature)
 
     def _discard(self) -> None:
@@ -298,7 +298,7 @@ class Connection:
         self._failed = 0
         self._counts["frames"] += 1
         self._count_stream(stream)
-        temperature_degC, _ = self.temperature()
+        temperature_degC, *_ = self.temperature()
         return Shot(image, start_ns, self._exposure_s, self._frames.total, camera_ticks, dropped, temperature_degC)
 
     def _count_stream(self, stream: GigeStream) -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from drivers.aravis import GigeDevice
 from drivers.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
-from drivers.interface import DeviceError, Refused, Unreachable
+from drivers.interface import Cause, DeviceError, Refused, Unreachable
 
 BYTES_PER_PIXEL = {"Mono8": 1, "Mono10": 2, "Mono12": 2, "Mono16": 2}
 
@@ -29,6 +29,9 @@ RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
 # Codes of arv-device-error-quark.
 SILENT = {2, 4, 5, 6}  # not connected, transfer error, timeout, device not found
+# Genicam data not found, no stream channel, busy: what a camera says, or Aravis for it, while it restarts. Every GigE
+# Vision camera has its data and a stream channel; Aravis (arvgvdevice.c) takes a count it could not read for 0.
+NOT_READY = {8, 9, 18}
 NO_CONTROL = {10, 17}  # not controller, access denied
 NO_CONTROL_HINT = "another client controls the camera, or one that died held it less than its heartbeat ago"
 
@@ -135,10 +138,15 @@ def lacks_control(error: AravisError) -> bool:
     return error.domain == DEVICE_ERRORS and error.code in NO_CONTROL
 
 
+def is_silence(error: AravisError) -> bool:
+    """Whether the camera did not answer, in time or at all, or answered while it was not ready yet."""
+    return error.domain == DEVICE_ERRORS and error.code in SILENT | NOT_READY
+
+
 def device_error(name: str, error: AravisError) -> DeviceError:
     """The stand's error for what Aravis reported."""
     if error.domain == DEVICE_ERRORS:
-        if error.code in SILENT:
+        if is_silence(error):
             return Unreachable(name, str(error))
         if lacks_control(error):
             return Refused(name, f"{error} ({NO_CONTROL_HINT})")
@@ -289,17 +297,17 @@ def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> t
     return None, f"the camera has no {' and no '.join(names)}"
 
 
-def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[float, str]:
-    """Temperature in degC and ""; or NaN and the reason. Never raises: a run goes on without it."""
+def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[float, str, Cause]:
+    """Temperature in degC and ""; or NaN, the reason and who says so. Never raises: a run goes on without it."""
     try:
         if place.register is not None:
             value_degC = (device.read_register(place.register) & place.mask) * place.scale + place.offset
         else:
             value_degC = device.get_float(place.feature or "")
     except AravisError as error:
-        return math.nan, str(error)
+        return math.nan, str(error), "wire" if is_silence(error) else "device"
     if value_degC == 0.0:  # what a faulty firmware shows; a sensor beside its own electronics is warmer
-        return math.nan, "the camera shows exactly 0 degC"
+        return math.nan, "the camera shows exactly 0 degC", "device"
     if not place.min_degC <= value_degC <= place.max_degC:
-        return math.nan, f"{value_degC:g} degC is outside {place.min_degC:g}..{place.max_degC:g}"
-    return value_degC, ""
+        return math.nan, f"{value_degC:g} degC is outside {place.min_degC:g}..{place.max_degC:g}", "device"
+    return value_degC, "", ""

@@ -13,11 +13,16 @@ import itertools
 import time
 from collections.abc import Awaitable, Callable, Generator, Sized
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
+PIECE_S = 1.0  # the longest that anybody sleeps on a timer that stands still while the host is suspended
 
 _AWAKE_NS = 2_000_000  # a thread that sleeps may be woken this late
+_BOOT_TIME = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # Linux; elsewhere only recordings are read
+_LOOK_NS, _LOOKS = 1_000_000, 5  # of two clocks at one instant
 
 
 class Now(Protocol):
@@ -50,28 +55,108 @@ def seconds_ns(duration_s: float) -> int:
     return round(duration_s * NS_PER_S)
 
 
+def boot_time_ns() -> int:
+    """ns since the host was started, time in which it was suspended included; never goes back (CLOCK_BOOTTIME)."""
+    return time.clock_gettime_ns(_BOOT_TIME)
+
+
+def _awake_ns() -> int:
+    return time.monotonic_ns()
+
+
+def _utc_ns() -> int:
+    return time.time_ns()  # noqa: TID251 - the one place that reads time
+
+
+def _boot_id() -> str:
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Boot:
+    """A start of the host and the stand's instant at which its boot time was 0. `id` is the kernel's name of it, ""
+    when it has none. Boot time outlives the process and is not moved by a step of the system clock, as UTC is."""
+
+    id: str
+    began_ns: int
+
+    def time_ns(self, stand_ns: int) -> int:
+        """The boot time of an instant of the stand's clock."""
+        return stand_ns - self.began_ns
+
+    def stand_ns(self, time_ns: int) -> int:
+        """The instant of the stand's clock of a boot time."""
+        return time_ns + self.began_ns
+
+
 class WallClock:
-    """The host's clock: the epoch read once, then the monotonic counter, so that a step of the host's time is not
-    a step of ours."""
+    """The host's clock: UTC read once, then boot time. So a step of the system clock is not a step of ours, and the
+    time of a suspend, in which CLOCK_MONOTONIC and every timer of an event loop stand still, has passed here.
+
+    `no_earlier_than_ns`: an instant that a clock before this one has reached already. A system clock that was set back
+    since is not followed behind it: that is an offset to UTC from the start. `boot_ns`, `utc_ns` and `awake_ns` (boot
+    time without suspends) read the host's clocks; tests give their own.
+    """
 
     lead_ns = 20_000_000  # a late timer of the event loop, and a camera that starts its acquisition
 
-    def __init__(self) -> None:
-        self._epoch_ns = time.time_ns() - time.monotonic_ns()  # noqa: TID251 - the one place that reads time
+    def __init__(
+        self,
+        no_earlier_than_ns: int = 0,
+        boot_ns: Callable[[], int] = boot_time_ns,
+        utc_ns: Callable[[], int] = _utc_ns,
+        awake_ns: Callable[[], int] = _awake_ns,
+    ) -> None:
+        self._boot_ns, self._utc_ns, self._awake_ns = boot_ns, utc_ns, awake_ns
+        now_ns = boot_ns()
+        self.boot = Boot(_boot_id(), max(now_ns + self._minus_boot_ns(utc_ns), no_earlier_than_ns) - now_ns)
 
     def now_ns(self) -> int:
         """ns since the epoch."""
-        return self._epoch_ns + time.monotonic_ns()
+        return self._boot_ns() + self.boot.began_ns
+
+    def utc_offset_ns(self) -> int:
+        """UTC as the system clock has it now, minus the instant now."""
+        return self._minus_boot_ns(self._utc_ns) - self.boot.began_ns
+
+    def suspended_ns(self) -> int:
+        """How long the host has been suspended since it was started."""
+        return -self._minus_boot_ns(self._awake_ns)
+
+    def _minus_boot_ns(self, read_ns: Callable[[], int]) -> int:
+        """A clock minus the boot time, read between two looks at the latter; a process that was kept from running
+        between them looks again."""
+        looks: list[tuple[int, int]] = []
+        for _ in range(_LOOKS):
+            before_ns, other_ns, after_ns = self._boot_ns(), read_ns(), self._boot_ns()
+            looks.append((after_ns - before_ns, other_ns - before_ns))
+            if after_ns - before_ns < _LOOK_NS:
+                break
+        return min(looks)[1]
 
     async def sleep_until(self, time_ns: int) -> None:
-        """Sleep to an absolute deadline; the event loop's timers come up to some ms late."""
+        """Sleep to an absolute deadline; the event loop's timers come up to some ms late. They stand still while the
+        host is suspended, so one that waits for more than a second waits in pieces."""
         await asyncio.sleep(0)
         while (left_ns := time_ns - self.now_ns()) > 0:  # noqa: ASYNC110 - a timer may come a ns too early
-            await asyncio.sleep(left_ns / NS_PER_S)
+            await asyncio.sleep(min(left_ns / NS_PER_S, PIECE_S))
 
     def hold(self) -> AbstractContextManager[None]:
         """Real time cannot be held."""
         return nullcontext()
+
+
+def boot_of(clock: Now) -> Boot | None:
+    """The start of the host that `clock` counts from; None for virtual time, which has none."""
+    return clock.boot if isinstance(clock, WallClock) else None
+
+
+def utc_offset_ns(clock: Now) -> int:
+    """UTC minus the instant now; 0 in virtual time, which is its own UTC."""
+    return clock.utc_offset_ns() if isinstance(clock, WallClock) else 0
 
 
 class FollowedClock:
@@ -98,7 +183,9 @@ class VirtualClock:
     one before set in motion has come to rest. So a run is repeatable to the byte, however the host schedules threads.
     There is one such clock to an event loop: two would each wait for the other to have nothing to run.
 
-    Before time moves, `advance(time_ns)` tells the simulator and waits for its answer.
+    When time moves, `advance(time_ns)` tells the simulator and waits for its answer before anybody is woken. The new
+    time holds from then on: what comes from outside meanwhile, such as a signal, must not date what it does to the
+    simulator before it, or the time between would seem to have passed without effect.
     """
 
     lead_ns = 0
@@ -140,9 +227,9 @@ class VirtualClock:
             if future.done():  # cancelled while asleep
                 continue
             if deadline_ns > self._now_ns:
+                self._now_ns = deadline_ns
                 if self._advance is not None:
                     await self._advance(deadline_ns)
-                self._now_ns = deadline_ns
             if not future.done():
                 future.set_result(None)
 
@@ -165,7 +252,7 @@ def block_until(clock: Now, time_ns: int) -> None:
     if isinstance(clock, VirtualClock) and clock.now_ns() < time_ns:
         raise ValueError("virtual time does not pass while a thread waits for it")
     while (left_ns := time_ns - clock.now_ns()) > 0:
-        time.sleep(max(0, left_ns - _AWAKE_NS) / NS_PER_S)  # noqa: TID251 - the one place that sleeps
+        time.sleep(min(max(0, left_ns - _AWAKE_NS) / NS_PER_S, PIECE_S))  # noqa: TID251 - the one place that sleeps
 
 
 def _about_to_run(loop: asyncio.AbstractEventLoop) -> Sized:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable
 from pathlib import Path
 from typing import TypeVar
@@ -13,6 +14,8 @@ from pydantic_core import ErrorDetails
 from drivers.interface import ConfigError
 
 _LONGEST_VALUE = 200  # characters of a faulty value that a message shows
+_MOST_FAULTS = 20  # that a message names
+_LONGEST_TEXT, _MOST_VALUES = 250_000, 100_000  # of a document: a hundred times of what ours have
 
 
 class Document(BaseModel):
@@ -26,7 +29,7 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        twice = next((key for key in keys if keys.count(key) > 1), None)
+        twice = next((key for key, count in Counter(keys).items() if count > 1), None)
         if twice is not None:
             raise yaml.constructor.ConstructorError(None, None, f"key {twice!r} is given twice", node.start_mark)
         return super().construct_mapping(node, deep)
@@ -50,20 +53,48 @@ def read_document(path: Path) -> str:
 
 def parse_document(text: str, model: type[Model], where: str) -> Model:
     """YAML text as `model`; `where` (a file name) begins every message of the ConfigError it may raise."""
+    data = yaml_data(text, where)
+    if not isinstance(data, dict):
+        raise ConfigError(f"{where}: expected keys and values at the top, found {type(data).__name__}")
     try:
-        data = yaml.load(text, _Loader)  # a SafeLoader
+        return model.model_validate(data)
+    except ValidationError as error:
+        causes = _causes(error.errors())
+        more = f"; and {len(causes) - _MOST_FAULTS} more" if len(causes) > _MOST_FAULTS else ""
+        raise ConfigError("; ".join(_sentence(where, fault) for fault in causes[:_MOST_FAULTS]) + more) from error
+
+
+def yaml_data(text: str, where: str) -> object:
+    """What YAML text holds; ConfigError, which begins with `where`, when it is no YAML or far more than a document of
+    ours: a few lines of aliases stand for millions of values."""
+    if len(text) > _LONGEST_TEXT:
+        raise ConfigError(f"{where}: has {len(text)} characters; a file of this kind has at most {_LONGEST_TEXT}")
+    try:
+        loader = _Loader(text)  # a SafeLoader
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        if _size(node, {}) > _MOST_VALUES:
+            raise ConfigError(f"{where}: aliases stand for more than {_MOST_VALUES} values; write out what is meant")
+        return loader.construct_document(node)
     except RecursionError:
         raise ConfigError(f"{where}: not YAML that can be read (nested too deeply)") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: a number or a date that Python cannot represent
         raise ConfigError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
     except (LookupError, AttributeError) as error:  # what PyYAML lets out at a tag such as !!bool x
         raise ConfigError(f"{where}: not YAML (a value does not fit its tag)") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"{where}: expected keys and values at the top, found {type(data).__name__}")
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError("; ".join(_sentence(where, fault) for fault in _causes(error.errors()))) from error
+
+
+def _size(node: yaml.Node, known: dict[int, int]) -> int:
+    """How many values a node stands for, each alias for as many as what it names; RecursionError when it is within
+    itself. `known`: of the nodes seen so far."""
+    if not isinstance(node, yaml.CollectionNode):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = _MOST_VALUES  # within itself
+        parts = node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
+        known[id(node)] = 1 + sum(_size(part, known) for part in parts)
+    return known[id(node)]
 
 
 def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
@@ -79,8 +110,10 @@ def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
 
 def _sentence(where: str, details: ErrorDetails) -> str:
     """One pydantic fault as `file: path: what is wrong (got value)`."""
-    path = ".".join(str(part) for part in details["loc"]) or "(top)"
+    path = ".".join(str(part) for part in details["loc"])
     text = details["msg"].removeprefix("Value error, ")
+    if not path:  # about the whole: the sentence names what it is about
+        return f"{where}: {text}"
     value = details["input"]
     shown = "" if isinstance(value, dict | list) or value is None else f" (got {_shown(value)})"
     if details["type"] == "extra_forbidden":

@@ -13,6 +13,7 @@ import usb.core
 import usb.util
 
 from drivers.clock import Clock, seconds_ns
+from drivers.flap_travel import POLL_S, Travel
 from drivers.interface import (
     DeviceError,
     DeviceFault,
@@ -20,10 +21,12 @@ from drivers.interface import (
     Quality,
     Reading,
     Refused,
+    Superseded,
     Unreachable,
     bad_reading,
 )
 from drivers.lane import Lane, Result
+from drivers.motion import Motion, Turn
 
 _VENDOR_POLOLU = 0x1FFB
 _PRODUCTS_JRK_G2 = {0x00B7, 0x00B9, 0x00BF, 0x00C1, 0x00C5}
@@ -44,11 +47,7 @@ _ERROR_NAMES = (
     "serial protocol error", "serial time-out", "hard over-current",
 )  # fmt: skip
 
-_POLL_S = 0.05
-_CONFIRMATIONS = 3
 _JAM_DUTY = 0.9  # of the configured maximum
-_JAM_S = 0.5
-_JAM_COUNTS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +64,7 @@ class FlapSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Variables:
+    time_ns: int  # when they were read
     target: int
     position: int
     duty: int
@@ -86,7 +86,8 @@ class _UsbDevice(Protocol):
 class Flap:
     """The flap. `backend` is a pyusb backend, None for libusb; the position is unknown until it was read.
 
-    After any USB error the controller is found again, by its serial number, at the next call.
+    After any USB error the controller is found again, by its serial number, at the next call. There is one mover: the
+    newest movement wins, and one in the other direction that was under way ends with Superseded.
     """
 
     def __init__(self, name: str, settings: FlapSettings, clock: Clock, backend: usb.backend.IBackend | None) -> None:
@@ -97,7 +98,9 @@ class Flap:
         self._lane: Lane | None = None
         self._device: _UsbDevice | None = None
         self._max_duty = (0, 0)
+        self.is_shut = False  # the last movement has confirmed it
         self._commanded = False  # a target was sent and the motor not stopped since
+        self._motion = Motion(name)
 
     async def open(self) -> None:
         """Find the controller by its serial number and check its input mode; leaves the flap where it is."""
@@ -128,46 +131,54 @@ class Flap:
             return Reading(channel, openness, "1", now_ns, Quality.STALE, reason), current
         return Reading(channel, openness, "1", now_ns), current
 
+    def allow(self) -> None:
+        """It may be opened again after it was made safe."""
+        self._motion.allow()
+
     async def move_open(self) -> None:
-        """Open and confirm; DeviceFault on a jam, an error flag or when the travel takes too long.
+        """Open and confirm; DeviceFault on a jam, an error flag or when the travel takes too long, Superseded when it
+        is closed meanwhile, or was made safe and not allowed to move since.
 
         Errors that stopped an earlier movement are cleared when their cause is gone.
         """
-        await self._move(self._settings.open_target)
+        await self._move(self._motion.take(self._settings.open_target), self._settings.open_target)
 
     async def move_closed(self) -> None:
-        """Close and confirm; errors as in move_open."""
-        await self._move(self._settings.closed_target)
+        """Close and confirm, also when it was made safe; errors as in move_open."""
+        await self._move(self._motion.take(self._settings.closed_target, safe=True), self._settings.closed_target)
 
     async def make_safe(self) -> None:
-        """Closed: the chamber is then a closed box, and the drive's own force limit protects what is in between."""
+        """Closed: the chamber is then a closed box, and the drive's own force limit protects what is in between. It
+        stays closed until `allow`."""
+        self._motion.bar()
         await self.move_closed()
 
-    async def _move(self, target: int) -> None:
-        variables = await self._call(self._set_target, target)
-        still_ns, still_position = self._clock.now_ns(), variables.position
-        deadline_ns = still_ns + seconds_ns(self._settings.travel_s)
-        confirmed = 0
-        while confirmed < _CONFIRMATIONS:
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+    async def _move(self, turn: Turn, target: int) -> None:
+        self.is_shut = False
+        await self._move_to(turn, target)
+        self.is_shut = target == self._settings.closed_target
+
+    async def _move_to(self, turn: Turn, target: int) -> None:
+        settings = self._settings
+        begun = await self._call(self._set_target, turn, target)
+        travel = Travel(target, settings.tolerance, settings.travel_s, begun.position, begun.time_ns)
+        while not travel.arrived:
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(POLL_S))
             variables = await self._call(self._variables)
-            now_ns = self._clock.now_ns()
+            turn.check()
             if variables.halting or variables.target != target:
                 raise DeviceFault(self.name, f"the motor stopped: {_names(variables.halting)}")
-            if abs(variables.position - still_position) >= _JAM_COUNTS:
-                still_ns, still_position = now_ns, variables.position
-            if self._saturated(variables.duty) and now_ns - still_ns >= seconds_ns(_JAM_S):
-                await self._stop_after(f"jammed at {variables.position} on the way to {target}")
-            confirmed = confirmed + 1 if abs(variables.position - target) <= self._settings.tolerance else 0
-            if now_ns > deadline_ns and not confirmed:
-                await self._stop_after(f"at {variables.position}, not at {target}, after {self._settings.travel_s} s")
+            if trouble := travel.look(variables.position, self._saturated(variables.duty), variables.time_ns):
+                await self._stop_after(turn, trouble)
 
     def _saturated(self, duty: int) -> bool:
         return duty != 0 and abs(duty) >= _JAM_DUTY * self._max_duty[duty < 0]
 
-    async def _stop_after(self, reason: str) -> None:
+    async def _stop_after(self, turn: Turn, reason: str) -> None:
         try:
-            await self._call(self._stop_motor)
+            await self._call(self._stop_motor, turn)
+        except Superseded:
+            raise
         except DeviceError as error:
             raise DeviceFault(self.name, f"{reason}; the motor could not be stopped ({error})") from error
         raise DeviceFault(self.name, f"{reason}; the motor is stopped")
@@ -236,23 +247,25 @@ class Flap:
             usb.util.dispose_resources(self._device)
         self._device = None
 
-    def _set_target(self, target: int) -> _Variables:
+    def _set_target(self, turn: Turn, target: int) -> _Variables:
         """Send the target, then clear old errors: in this order the motor never starts towards the old target. All of
         it is idempotent and may be repeated once. The variables are those before the errors were cleared."""
         try:
-            return self._set_target_once(target)
+            return self._set_target_once(turn, target)
         except Unreachable:
-            return self._set_target_once(target)
+            return self._set_target_once(turn, target)
 
-    def _set_target_once(self, target: int) -> _Variables:
+    def _set_target_once(self, turn: Turn, target: int) -> _Variables:
         device = self._device or self._find()
         self._check_settings(device)
+        turn.check()
         self._transfer(device, _TO_DEVICE, _SET_TARGET, target, 0, 0)
         self._commanded = True
-        return _decoded(self._read(device, _GET_VARIABLES, _CLEAR_HALTING, 0, _VARIABLES_SIZE))
+        return self._decoded(self._read(device, _GET_VARIABLES, _CLEAR_HALTING, 0, _VARIABLES_SIZE))
 
-    def _stop_motor(self) -> None:
-        """Idempotent too."""
+    def _stop_motor(self, turn: Turn) -> None:
+        """Idempotent too; the motor of a newer movement is left alone."""
+        turn.check()
         self._commanded = False
         try:
             self._transfer(self._device or self._find(), _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
@@ -260,7 +273,15 @@ class Flap:
             self._transfer(self._device or self._find(), _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
 
     def _variables(self) -> _Variables:
-        return _decoded(self._read(self._device or self._find(), _GET_VARIABLES, 0, 0, _VARIABLES_SIZE))
+        return self._decoded(self._read(self._device or self._find(), _GET_VARIABLES, 0, 0, _VARIABLES_SIZE))
+
+    def _decoded(self, block: bytes) -> _Variables:
+        """Jrk G2 user's guide, section 12: variables."""
+        target, position, duty, halting, current_mA = (
+            struct.unpack_from(kind, block, offset)[0]
+            for kind, offset in (("<H", 0x02), ("<H", 0x06), ("<h", 0x0C), ("<H", 0x12), ("<H", 0x19))
+        )
+        return _Variables(self._clock.now_ns(), target, position, duty, halting, current_mA)
 
     def _read(self, device: _UsbDevice, request: int, value: int, index: int, size: int) -> bytes:
         """`size` bytes from the device; a short answer is asked for once more."""
@@ -289,15 +310,6 @@ class Flap:
         if error.errno == errno.EACCES:
             return Refused(self.name, "no permission for the USB device; install Pololu's udev rule")
         return Unreachable(self.name, f"USB: {what} failed ({error})")
-
-
-def _decoded(block: bytes) -> _Variables:
-    """Jrk G2 user's guide, section 12: variables."""
-    target, position, duty, halting, current_mA = (
-        struct.unpack_from(kind, block, offset)[0]
-        for kind, offset in (("<H", 0x02), ("<H", 0x06), ("<h", 0x0C), ("<H", 0x12), ("<H", 0x19))
-    )
-    return _Variables(target, position, duty, halting, current_mA)
 
 
 def _names(halting: int) -> str:

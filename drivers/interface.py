@@ -8,7 +8,10 @@ Errors (who is to blame decides the class; `retryable` is a property of the clas
     │   ├── Unreachable        no answer within the deadline (retryable)
     │   ├── GarbledReply       an answer that cannot be right: CRC, length, wrong unit (retryable)
     │   ├── Refused            the device says no: exception code, errv, access denied
-    │   └── DeviceFault        the device works and reports trouble: sensor break, jam, alarm
+    │   ├── InUse              another run of this machine has it; nothing was touched
+    │   ├── DeviceFault        the device works and reports trouble: sensor break, jam, alarm
+    │   ├── Occupied           somebody has it do something else at the unit; it takes no orders until that ends
+    │   └── Superseded         a newer command, or making safe, has overtaken this one: nobody is to blame
     ├── StandTripped           the guard has made the stand safe; an operator must clear it
     └── SessionError           a recorded session cannot be read
 
@@ -20,7 +23,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,8 +63,20 @@ class Refused(DeviceError):
     """The device understood and declined; repeating the request would not help."""
 
 
+class InUse(DeviceError):
+    """Another run on this machine has the device: it was neither opened nor made safe."""
+
+
 class DeviceFault(DeviceError):
     """The device reports a fault of its own or of what it moves, heats or measures."""
+
+
+class Occupied(DeviceError):
+    """Somebody at the unit has it do something of its own, such as autotuning: it takes no orders until that ends."""
+
+
+class Superseded(DeviceError):
+    """A newer command, or making safe, has taken the actuator over; what was asked for before was not carried out."""
 
 
 class StandTripped(StandError):
@@ -80,9 +95,14 @@ class Quality(StrEnum):
     BAD = "bad"
 
 
+# Why a reading is BAD: "wire", the poll failed or its reply was garbled, and the device may be all right; "device", the
+# device itself says that it has no measurement (sensor break, converter error, out of range); "" when that is unknown.
+Cause = Literal["", "wire", "device"]
+
+
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One measured value. `value` is NaN exactly when `quality` is BAD, and `reason` then says why.
+    """One measured value. `value` is NaN exactly when `quality` is BAD; `reason` then says why, `cause` who says so.
 
     `channel` is "device.quantity" (`thermometers.air`), `unit` as in the file formats (degC, %, mm, deg, mA,
     1 for a flag or count), `time_ns` ns since the epoch on the stand's clock.
@@ -94,6 +114,7 @@ class Reading:
     time_ns: int
     quality: Quality = Quality.GOOD
     reason: str = ""
+    cause: Cause = ""
 
     def __post_init__(self) -> None:
         if math.isnan(self.value) != (self.quality is Quality.BAD):
@@ -102,9 +123,9 @@ class Reading:
             )
 
 
-def bad_reading(channel: str, unit: str, time_ns: int, reason: str) -> Reading:
+def bad_reading(channel: str, unit: str, time_ns: int, reason: str, cause: Cause = "device") -> Reading:
     """A BAD reading: value NaN, with the reason."""
-    return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason)
+    return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason, cause)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 from drivers.bus import Bus
 from drivers.clock import Clock, seconds_ns
-from drivers.interface import ConfigError, Reading, Refused, Unreachable, bad_reading
+from drivers.interface import ConfigError, Occupied, Reading, Refused, Unreachable, bad_reading
 from drivers.modbus_unit import ModbusUnit, is_confirmed
 from drivers.registers import RegisterMap, Sample, Snapshot
 
@@ -69,7 +69,8 @@ class Regulator:
     async def set_temperature(self, degC: float) -> None:
         """Send a set point and read it back.
 
-        Refused: outside the map's limits (nothing is sent), RAM mode not confirmed, autotuning, not taken over.
+        Refused: outside the map's limits (nothing is sent), RAM mode not confirmed, not taken over. Occupied:
+        autotuning, started at the unit, is active.
         """
         async with self._exclusive():
             await self._ensure_started()
@@ -77,7 +78,7 @@ class Regulator:
             if not self._ready(status):
                 await self._start_up()
             if status.bits.get(AUTOTUNE):
-                raise Refused(self.name, "autotuning is active; no set point was sent")
+                raise Occupied(self.name, "autotuning is active; no set point was sent")
             self._sp_degC = await self._unit.write("sp", degC)
 
     async def run(self) -> None:

@@ -16,6 +16,7 @@ from drivers.clock import Clock, seconds_ns
 from drivers.interface import DeviceError, DeviceFault, GarbledReply, Quality, Reading, Refused, Unreachable
 from drivers.lane import Lane, Result
 from drivers.link import SerialSettings, open_link
+from drivers.motion import Motion, Turn
 from drivers.ximc_client import XimcClient
 
 _LINE = SerialSettings(baud=115200, stopbits=2)
@@ -42,6 +43,7 @@ _POWER_OFF = 1  # PWRSts
 _HOMED = 0x20  # of Flags
 _DANGER = 0x01B3FFC0
 _EDGES = 0x3  # of GPIOFlags
+_NOT_HOMED = "not homed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +107,7 @@ class _Status:
     def doubt(self) -> str:
         """Why the position must not be relied upon, "" when it may."""
         if self.alarm or not self.homed:
-            return self.alarm or "not homed"
+            return self.alarm or _NOT_HOMED
         return "motor off, the rotor may have moved by up to a step" if self.power == _POWER_OFF else ""
 
     def answers(self, command: int) -> bool:
@@ -116,7 +118,8 @@ class _Status:
 class Axis:
     """One axis. Identity and microstep division are checked on every new link before anything else, and at homing.
 
-    A lost link is opened again by the next call.
+    A lost link is opened again by the next call. There is one mover: the newest motion wins, and one that was under way
+    ends with Superseded.
     """
 
     def __init__(self, name: str, settings: AxisSettings, clock: Clock) -> None:
@@ -129,7 +132,8 @@ class Axis:
         self._lane: Lane | None = None
         self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
         self._speed_steps_s = 1000.0
-        self._stops = 0  # how often make_safe was called
+        self._motion = Motion(name)
+        self._zero_due = False  # homing has begun, and its end was not made the zero of the scale yet
 
     async def open(self) -> None:
         """Connect and compare serial number and microstep division; Refused when another controller answers."""
@@ -149,35 +153,39 @@ class Axis:
         has an alarm, is not homed, or leaves the motor without current."""
         status = await self._call(self._status)
         now_ns = self._clock.now_ns()
+        homed = self._is_homed(status)
+        doubt = status.doubt or ("" if homed else _NOT_HOMED)
         position = Reading(
             f"{self.name}.position",
             self._units(status.position),
             self.profile.unit,
             now_ns,
-            Quality.STALE if status.doubt else Quality.GOOD,
-            status.doubt,
+            Quality.STALE if doubt else Quality.GOOD,
+            doubt,
         )
         return (
             position,
             Reading(f"{self.name}.moving", float(status.running), "1", now_ns),
-            Reading(f"{self.name}.homed", float(status.homed), "1", now_ns),
+            Reading(f"{self.name}.homed", float(homed), "1", now_ns),
         )
 
     async def homed(self) -> bool:
         """Whether the position scale is calibrated."""
-        return (await self._call(self._status)).homed
+        return self._is_homed(await self._call(self._status))
 
     async def home(self) -> float:
         """Run the controller's homing procedure and make its end the zero of the scale.
 
         Returns the residual: where the scale had this point before, mm or deg (after a power cycle without meaning).
-        DeviceFault in an alarm, or when the procedure does not end homed.
+        DeviceFault in an alarm, or when the procedure does not end homed; Superseded as in move_to.
         """
+        turn = self._motion.take()
         await self._call(self._check_identity)  # a power cycle may have brought other settings
         self._refuse_alarm(await self._call(self._status))
-        await self._call(self._send, "home", b"", _homing)
-        status = await self._wait(_HOME_LIMIT_S)
+        await self._call(self._begin_homing, turn)
+        status = await self._wait(_HOME_LIMIT_S, turn)
         if not (status.homed and status.answers(_COMMAND_HOME)):
+            turn.check()
             raise DeviceFault(self.name, "the homing procedure ended without a home position")
         await self._call(self._zero)
         return self._units(status.position)
@@ -185,26 +193,33 @@ class Axis:
     async def move_to(self, position: float) -> None:
         """Move to `position` (mm or deg), the last stretch upwards, from where the play has been taken up.
 
-        Refused outside the limits or when not homed; DeviceFault in an alarm or when the move fails.
+        Refused outside the limits or when not homed; DeviceFault in an alarm or when the move fails; Superseded when it
+        was made safe or told to go elsewhere after this was called, or made safe before and not allowed to move since.
         """
         low, high = self._settings.limits
         unit = self.profile.unit
         if not low <= position <= high:
             raise Refused(self.name, f"{position} {unit} is outside the limits {low}..{high} {unit}")
-        stops = self._stops
+        turn = self._motion.take()
         status = await self._call(self._status)
         self._refuse_alarm(status)
-        if not status.homed:
+        if not self._is_homed(status):
             raise Refused(self.name, "not homed; its positions mean nothing until it is")
         target, below = self._microsteps(position), self._microsteps(position - self.profile.overshoot)
         for stop in (below, target) if status.position > below else (target,):
-            if stops != self._stops:
-                raise DeviceFault(self.name, f"stopped on the way to {position} {unit}")
-            status = await self._approach(status.position, stop)
+            status = await self._approach(status.position, stop, turn)
+
+    def allow(self) -> None:
+        """It may move again after it was made safe."""
+        self._motion.allow()
 
     async def make_safe(self) -> None:
-        """Soft stop, confirmed; a hard stop when that does not help within 2 s, DeviceFault when nothing does."""
-        self._stops += 1
+        """Soft stop, confirmed; a hard stop when that does not help within 2 s, DeviceFault when nothing does. It stays
+        where it is until `allow`."""
+        self._motion.bar()
+        await self._stop()
+
+    async def _stop(self) -> None:
         for letters in ("sstp", "stop"):
             with contextlib.suppress(DeviceError):  # what counts is whether it stands still
                 await self._call(self._send, letters, b"", _at_rest)
@@ -220,32 +235,38 @@ class Axis:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
         return True
 
-    async def _approach(self, start: int, target: int) -> _Status:
+    async def _approach(self, start: int, target: int, turn: Turn) -> _Status:
         """One straight move between positions in microsteps; DeviceFault when it ends elsewhere."""
 
         def carried_out(status: _Status) -> bool:
             return status.position == target or (status.running and status.answers(_COMMAND_MOVE))
 
-        await self._call(self._send, "move", _TARGET.pack(*divmod(target, _MICROSTEPS)), carried_out)
-        status = await self._wait(abs(target - start) / _MICROSTEPS / self._speed_steps_s * 1.5 + 2.0)
+        await self._call(self._send, "move", _TARGET.pack(*divmod(target, _MICROSTEPS)), carried_out, turn)
+        status = await self._wait(abs(target - start) / _MICROSTEPS / self._speed_steps_s * 1.5 + 2.0, turn)
         if status.command & _FAILED or abs(status.position - target) > _ARRIVED_MICROSTEPS:
+            turn.check()
             edge = " at a limit switch" if status.gpio & _EDGES else ""
             stopped, wanted = status.position / _MICROSTEPS, target / _MICROSTEPS
             raise DeviceFault(self.name, f"stopped{edge} at step {stopped:.2f} instead of {wanted:.2f}")
         return status
 
-    async def _wait(self, limit_s: float) -> _Status:
+    async def _wait(self, limit_s: float, turn: Turn) -> _Status:
         """Poll until the controller has finished; stop it in an alarm or after `limit_s` of stand time, and say so."""
         deadline_ns = self._clock.now_ns() + seconds_ns(limit_s)
         while True:
             status = await self._call(self._status)
+            if status.running:
+                turn.check()
             if status.alarm or (status.running and self._clock.now_ns() >= deadline_ns):
                 if status.running:  # not every alarm stops the motor by itself, and a STOP at rest would clear it
-                    await self.make_safe()
+                    await self._stop()
                 raise DeviceFault(self.name, status.alarm or f"still moving after {limit_s:.0f} s; stopped")
             if not status.running:
                 return status
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+
+    def _is_homed(self, status: _Status) -> bool:
+        return status.homed and not self._zero_due
 
     def _refuse_alarm(self, status: _Status) -> None:
         """STOP would clear an alarm, but only an operator may decide that."""
@@ -296,14 +317,26 @@ class Axis:
         values = _STATUS.unpack(self._identified().query("gets", _STATUS.size))
         return _Status(values[1], values[2], values[5] * _MICROSTEPS + values[6], values[15], values[16])
 
-    def _send(self, letters: str, payload: bytes, carried_out: Callable[[_Status], bool]) -> None:
-        """Send a command. When its acknowledgement is lost the controller's state tells whether it was carried out;
-        only if it was not is it sent a second and last time."""
+    def _send(
+        self, letters: str, payload: bytes, carried_out: Callable[[_Status], bool], turn: Turn | None = None
+    ) -> None:
+        """Send a command, while it is its turn. When its acknowledgement is lost the controller's state tells whether
+        it was carried out; only if it was not is it sent a second and last time."""
+        client = self._identified()
+        _check(turn)
         try:
-            self._identified().command(letters, payload)
+            client.command(letters, payload)
         except (Unreachable, GarbledReply):
             if not carried_out(self._status()):
+                _check(turn)
                 self._identified().command(letters, payload)
+
+    def _begin_homing(self, turn: Turn) -> None:
+        """From here on the scale means nothing until its zero is set, whatever the controller says."""
+        self._identified()
+        turn.check()
+        self._zero_due = True
+        self._send("home", b"", _homing, turn)
 
     def _zero(self) -> None:
         """HOME leaves the step counter alone (libximc, command_homezero): zero it, and look whether that came."""
@@ -312,6 +345,13 @@ class Axis:
             raise DeviceFault(
                 self.name, f"the step counter could not be set to zero, it is {position / _MICROSTEPS:.2f}"
             )
+        self._zero_due = False
+
+
+def _check(turn: Turn | None) -> None:
+    """A stop needs no turn."""
+    if turn is not None:
+        turn.check()
 
 
 # What shows that a command whose acknowledgement was lost has been carried out:

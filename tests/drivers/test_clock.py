@@ -1,10 +1,21 @@
 import asyncio
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, block_until, seconds_ns
+from drivers.clock import (
+    NS_PER_S,
+    FollowedClock,
+    VirtualClock,
+    WallClock,
+    block_until,
+    boot_of,
+    boot_time_ns,
+    seconds_ns,
+)
+from tests.host import Host
 
 
 async def driven(clock: VirtualClock, *work: object) -> None:
@@ -149,3 +160,90 @@ def test_a_followed_clock_refuses_to_go_back():
     assert clock.now_ns() == 20
     with pytest.raises(ValueError, match="cannot go back"):
         clock.follow(19)
+
+
+def test_the_time_of_a_suspend_has_passed_and_a_step_of_the_system_clock_has_not():
+    host = Host()
+    clock = host.clock()
+    begin_ns = clock.now_ns()
+    assert begin_ns == host.utc_ns()
+    host.suspended_ns += seconds_ns(40)
+    assert clock.now_ns() == host.utc_ns() == begin_ns + seconds_ns(40)
+    assert (clock.suspended_ns(), clock.utc_offset_ns()) == (seconds_ns(40), 0)
+    host.step(-3600)
+    assert clock.now_ns() == begin_ns + seconds_ns(40)
+    assert clock.utc_offset_ns() == seconds_ns(-3600)
+
+
+def test_a_clock_begins_no_earlier_than_the_one_before_it_ended():
+    host = Host()
+    reached_ns = host.clock().now_ns()
+    host.step(-3600)
+    clock = host.clock(reached_ns + 1)
+    assert clock.now_ns() == reached_ns + 1
+    assert clock.utc_offset_ns() == seconds_ns(-3600) - 1
+    host.step(7200)
+    assert host.clock(reached_ns).utc_offset_ns() == 0
+
+
+def test_an_instant_is_found_again_by_its_boot_time_whatever_the_system_clock_says():
+    host = Host()
+    before = host.clock()
+    off_ns = before.boot.time_ns(before.now_ns())
+    host.awake_ns += seconds_ns(23)
+    host.step(3600)
+    after = host.clock()
+    assert after.boot.id == before.boot.id
+    assert after.now_ns() - after.boot.stand_ns(off_ns) == seconds_ns(23)
+    assert boot_of(after) is after.boot
+    assert boot_of(VirtualClock(0)) is None
+
+
+def test_a_process_that_is_kept_from_running_between_two_clocks_looks_again():
+    host, late_ns = Host(), [0, 0, seconds_ns(5), 0, 0, 0]
+
+    def utc_ns() -> int:
+        host.awake_ns += late_ns.pop() if late_ns else 0  # stopped just before the system clock is read ...
+        found_ns = host.utc_ns()
+        host.awake_ns += late_ns.pop() if late_ns else 0  # ... or just after
+        return found_ns
+
+    clock = WallClock(0, host.boot_ns, utc_ns, lambda: host.awake_ns)
+    assert clock.utc_offset_ns() == 0
+    assert not late_ns
+
+
+async def test_a_sleeper_is_late_by_no_more_than_a_second_after_a_suspend(monkeypatch: pytest.MonkeyPatch):
+    """The event loop's timers stand still in a suspend: the second piece of this sleep is one."""
+    host, pieces_s = Host(), []
+
+    async def pass_awake(piece_s: float) -> None:
+        pieces_s.append(piece_s)
+        host.awake_ns += seconds_ns(piece_s)
+        host.suspended_ns += seconds_ns(40) if len(pieces_s) == 3 else 0
+
+    clock = host.clock()
+    due_ns = clock.now_ns() + seconds_ns(30)
+    monkeypatch.setattr("drivers.clock.asyncio.sleep", pass_awake)
+    await clock.sleep_until(due_ns)
+    assert pieces_s == [0, 1, 1]
+    assert clock.now_ns() == due_ns + seconds_ns(12)
+
+
+def test_a_thread_that_waits_is_late_by_no_more_than_a_second_after_a_suspend(monkeypatch: pytest.MonkeyPatch):
+    host, pieces_s = Host(), []
+
+    def pass_awake(piece_s: float) -> None:
+        pieces_s.append(piece_s)
+        host.suspended_ns += seconds_ns(40)
+
+    monkeypatch.setattr("drivers.clock.time.sleep", pass_awake)
+    clock = host.clock()
+    block_until(clock, clock.now_ns() + seconds_ns(30))
+    assert pieces_s == [1]
+
+
+def test_boot_time_is_that_of_the_kernel():
+    before_ns = boot_time_ns()
+    uptime_ns = seconds_ns(float(Path("/proc/uptime").read_text().split()[0]))
+    assert before_ns - seconds_ns(0.011) <= uptime_ns <= boot_time_ns()  # which is told to 10 ms

@@ -1,4 +1,6 @@
 import asyncio
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -49,3 +51,46 @@ async def test_a_cancelled_caller_waits_until_its_call_has_ended():
         await caller
     assert ended.is_set()
     lane.close()
+
+
+async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goes_on():
+    lane = Lane("test", WallClock(), patient=False)
+    begun, release, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def commit() -> None:
+        begun.set()
+        release.wait(5)
+        ended.set()
+
+    caller = asyncio.create_task(lane.call(commit))
+    await asyncio.to_thread(begun.wait, 5)
+    caller.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await caller
+    waiting = asyncio.create_task(lane.call(int))
+    await asyncio.sleep(0)
+    lane.abandon()
+    with pytest.raises(TimeoutError, match="test has not answered and is waited for no longer"):
+        await waiting
+    with pytest.raises(TimeoutError):
+        await lane.call(int)
+    assert not ended.is_set()
+    release.set()
+    assert await asyncio.to_thread(ended.wait, 5)
+
+
+HANGS = """
+import asyncio, threading
+from drivers.clock import WallClock
+from drivers.lane import Lane
+
+async def main():
+    asyncio.create_task(Lane("hangs", WallClock(), patient=False).call(threading.Event().wait))
+    await asyncio.sleep(0.05)
+
+asyncio.run(main())
+"""
+
+
+def test_a_call_that_never_ends_does_not_keep_the_process_from_its_end():
+    assert subprocess.run([sys.executable, "-c", HANGS], timeout=30, check=False).returncode == 0

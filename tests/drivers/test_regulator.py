@@ -11,7 +11,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.bus import Bus, LineSettings
 from drivers.clock import WallClock, seconds_ns
-from drivers.interface import ConfigError, DeviceFault, Quality, Reading, Refused, Unreachable
+from drivers.interface import ConfigError, DeviceFault, Occupied, Quality, Reading, Refused, Unreachable
 from drivers.registers import load_register_map
 from drivers.regulator import Regulator
 
@@ -188,7 +188,7 @@ async def test_no_set_point_is_sent_while_ram_mode_is_not_confirmed(regulator: R
 async def test_no_set_point_is_sent_while_autotuning(regulator: Regulator, unit: E5cc) -> None:
     await regulator.open()
     unit.words[STATUS_16] |= AUTOTUNE
-    with pytest.raises(Refused, match="autotuning"):
+    with pytest.raises(Occupied, match="autotuning"):
         await regulator.set_temperature(30.0)
     assert unit.words[SP] == 250
 
