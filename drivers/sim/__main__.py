@@ -1,12 +1,13 @@
 """`python -m drivers.sim`: one process is one simulated laboratory. Its description comes as JSON on standard input.
 
-Prints `ready` when every fake answers; ends on SIGTERM, SIGINT or the control socket's `quit`; exits with 2 and one
-line when it cannot start. When whoever started it dies, it lives on for a minute, as a real laboratory would: long
-enough to see the heater's dead-man drop; whoever needs its addresses may end it earlier (`quit_if_orphaned`).
+Prints the addresses at which it answers (JSON, one line) when every fake does; ends on SIGTERM, SIGINT or the control
+socket's `quit`; exits with 2 and one line when it cannot start. When whoever started it dies, it lives on for a minute,
+as a real laboratory would: long enough to see the heater's dead-man drop.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
@@ -25,9 +26,6 @@ def main() -> int:
     """Build the laboratory, serve it, take it down."""
     stop, parent = threading.Event(), os.getppid()
 
-    def is_orphaned() -> bool:
-        return os.getppid() != parent
-
     def end(number: int, frame: FrameType | None) -> None:
         stop.set()
 
@@ -39,11 +37,12 @@ def main() -> int:
     except (ConfigError, OSError) as error:
         print(f"{error}", file=sys.stderr)  # noqa: T201 - the process' answer to who started it
         return 2
-    control = serve_control(laboratory, stop.set, is_orphaned)
-    print("ready", flush=True)  # noqa: T201 - the process' answer to who started it
+    control = serve_control(laboratory, stop.set)
+    addresses = {**laboratory.addresses, "control": control.address}
+    print(json.dumps(addresses), flush=True)  # noqa: T201 - the process' answer to who started it
     orphaned_s = 0
     while not stop.wait(1.0) and orphaned_s < _ORPHAN_LIMIT_S:
-        orphaned_s += is_orphaned()
+        orphaned_s += os.getppid() != parent
     control.close()
     laboratory.close()
     return 0

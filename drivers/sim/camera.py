@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import socket
 import threading
-import time
 from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import NS_PER_S, Now, seconds_ns
+from drivers.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 from drivers.sim import gvcp, gvsp
 from drivers.sim.camera_registers import Registers
 from drivers.sim.camera_schedule import Schedule, Shot
@@ -78,6 +77,7 @@ class FakeCamera:
         extended_ids: bool = False,
         faults: CameraFaults | None = None,
     ) -> None:
+        self.address = address
         self._plant = plant
         self._clock = clock
         self._render = render
@@ -142,6 +142,11 @@ class FakeCamera:
         self._control.close()
         self._stream.close()
 
+    def restart(self) -> None:
+        """It starts anew by itself: control and settings are gone."""
+        with self._wake:
+            self._restart(self._clock.now_ns())
+
     def advance(self, now_ns: int) -> None:
         """The clock has moved to now_ns: note a change of power, wake the free run. Returns at once."""
         with self._wake:
@@ -188,11 +193,13 @@ class FakeCamera:
             now_ns = self._clock.now_ns()
             self._plant.advance(now_ns)
             self._observe_power(now_ns)
-            self._channel.check_heartbeat(time.monotonic())
+            heard_s = boot_time_ns() / NS_PER_S  # a camera's timer runs on while the host is suspended
+            self._channel.check_heartbeat(heard_s)
             if not datagram or self.faults.silent_gvcp or not self._alive(now_ns):
                 return b""
             self._registers.offer_resend(not self.faults.no_resend)
-            return self._channel.feed(datagram, peer, time.monotonic())
+            self._registers.offer_stream(not self.faults.no_stream_channel)
+            return self._channel.feed(datagram, peer, heard_s)
 
     def before_read(self, address: int, count: int) -> None:
         """Measure the temperature when its register is read."""
@@ -268,7 +275,7 @@ class FakeCamera:
                 shot, again_ns = self._schedule.due(now_ns)
                 if shot is not None:
                     return shot
-                self._wake.wait((again_ns - now_ns) / NS_PER_S if self._real_time else None)
+                self._wake.wait(min((again_ns - now_ns) / NS_PER_S, PIECE_S) if self._real_time else None)
         return None
 
     def _send(self, shot: Shot, image: NDArray[np.uint8]) -> None:

@@ -14,6 +14,7 @@ HAS_USER_NAME, HAS_SERIAL = 1 << 31, 1 << 30
 DISCOVERY_bytes = 0xF8
 
 _CAPABILITY = 0x0934
+_STREAM_CHANNELS = 0x0904
 _FEATURES_ADDRESS = 0x10000
 
 
@@ -43,7 +44,7 @@ class Registers:
             0x0024: int(ipaddress.IPv4Address(address)),
             0x0034: 0xFF000000,
             0x0600: 1,  # network interfaces
-            0x0904: 1,  # stream channels
+            _STREAM_CHANNELS: 1,
         }
         for offset, word in words.items():
             struct.pack_into(">I", self._segments[0], offset, word)
@@ -55,6 +56,10 @@ class Registers:
         """Set the capability register, with or without PACKETRESEND."""
         capability = CAN_CONCATENATE | CAN_WRITE_MEMORY | HAS_USER_NAME | HAS_SERIAL | (CAN_RESEND if offered else 0)
         struct.pack_into(">I", self._segments[0], _CAPABILITY, capability)
+
+    def offer_stream(self, offered: bool) -> None:
+        """Set the count of stream channels, 1 or 0."""
+        struct.pack_into(">I", self._segments[0], _STREAM_CHANNELS, int(offered))
 
     def reset(self) -> None:
         """Every feature to its default, as after power-on."""

@@ -5,7 +5,6 @@
     {"do": "optics"}                            -> {"centres_px": [[x, y], ...]}   noise-free marker centres
     {"do": "fault", "name": S, "value": V}      -> {"name": S}         one of drivers.sim.laboratory.FAULTS
     {"do": "quit"}                              -> {}                  the laboratory ends
-    {"do": "quit_if_orphaned"}                  -> {"quits": true}     it ends if whoever started it is dead
 
 Anything wrong is answered with {"error": sentence}.
 """
@@ -23,10 +22,9 @@ from drivers.sim.wire import Lines, TcpWire
 class Control:
     """Answers control requests for one laboratory."""
 
-    def __init__(self, laboratory: Laboratory, quit_: Callable[[], None], is_orphaned: Callable[[], bool]) -> None:
+    def __init__(self, laboratory: Laboratory, quit_: Callable[[], None]) -> None:
         self._laboratory = laboratory
         self._quit = quit_
-        self._is_orphaned = is_orphaned
 
     def answer(self, line: bytes) -> bytes:
         """The answer to one request line."""
@@ -51,11 +49,6 @@ class Control:
             case {"do": "quit"}:
                 self._quit()
                 return {}
-            case {"do": "quit_if_orphaned"}:
-                quits = self._is_orphaned()
-                if quits:
-                    self._quit()
-                return {"quits": quits}
             case {"do": "optics"}:
                 return {"centres_px": self._laboratory.true_centres_px()}
             case {"do": "fault", "name": str(name), "value": value}:
@@ -67,9 +60,8 @@ class Control:
                 raise ValueError(f"cannot understand {request}")
 
 
-def serve_control(laboratory: Laboratory, quit_: Callable[[], None], is_orphaned: Callable[[], bool]) -> TcpWire:
-    """Listen on the laboratory's control address; `quit_` is called for a `quit` request, `is_orphaned` asked whether
-    whoever started the laboratory is dead."""
-    control = Control(laboratory, quit_, is_orphaned)
+def serve_control(laboratory: Laboratory, quit_: Callable[[], None]) -> TcpWire:
+    """Listen on the laboratory's control address; `quit_` is called for a `quit` request."""
+    control = Control(laboratory, quit_)
     host, port = laboratory.spec.control.removeprefix("tcp:").rsplit(":", 1)
     return TcpWire(host, int(port), lambda: Lines(control.answer), LinkFaults())

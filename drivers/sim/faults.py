@@ -13,8 +13,9 @@ class LinkFaults:
 
     silent: no reply leaves. drop, flip, cut, junk: probabilities of losing the reply, flipping one bit, sending only
     its first half, sending 7 random bytes before it. delay_s: real seconds of lateness (a wire time, not a simulated
-    one). echo: the request comes back before the reply (a badly wired RS-485 adapter). byte_by_byte: one write a byte.
-    `injected` counts what was done, by name.
+    one); late_s: that of the next reply alone. garbled: how many of the coming replies lose their second half. echo:
+    the request comes back before the reply (a badly wired RS-485 adapter). byte_by_byte: one write a byte. `injected`
+    counts what was done, by name.
     """
 
     seed: int = 0
@@ -24,6 +25,8 @@ class LinkFaults:
     cut: float = 0.0
     junk: float = 0.0
     delay_s: float = 0.0
+    late_s: float = 0.0
+    garbled: int = 0
     echo: bool = False
     byte_by_byte: bool = False
     injected: dict[str, int] = field(default_factory=dict[str, int])
@@ -38,6 +41,14 @@ class LinkFaults:
         if self.delay_s > 0:
             self._count("delay")
             time.sleep(self.delay_s)  # noqa: TID251 - a slow line is slow in real seconds
+        if self.late_s > 0:
+            late_s, self.late_s = self.late_s, 0.0
+            self._count("late")
+            time.sleep(late_s)  # noqa: TID251 - as above
+        if self.garbled > 0:
+            self.garbled -= 1
+            self._count("garbled")
+            return [reply[: max(1, len(reply) // 2)]]
         if self.silent or self._chance(self.drop, "drop"):
             return []
         if self._chance(self.flip, "flip"):

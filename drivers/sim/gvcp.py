@@ -49,6 +49,9 @@ class Status(IntEnum):
     UNAVAILABLE = 0x800C
 
 
+_NO_COMMAND = 0xFFFF  # the code of an acknowledge is that of its command plus 1, in 16 bits
+
+
 class Malformed(ValueError):
     """These bytes are no GVCP datagram: a device stays silent."""
 
@@ -96,6 +99,8 @@ def decode_request(datagram: bytes) -> Request:
     key, flags, command, length, req_id = _COMMAND.unpack_from(datagram)
     if key != _KEY:
         raise Malformed(f"key {key:#04x} instead of {_KEY:#04x}")
+    if command == _NO_COMMAND:
+        raise Malformed(f"command {command:#06x}, which no acknowledge can answer")
     return Request(command, req_id, _body(datagram, length), flags)
 
 

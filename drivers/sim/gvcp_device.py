@@ -39,7 +39,7 @@ class Device(Protocol):
 
 
 class ControlChannel:
-    """The control protocol of one device; times are s of the monotonic clock."""
+    """The control protocol of one device; times are s of the host's boot time."""
 
     def __init__(self, registers: Registers, device: Device) -> None:
         self._registers = registers

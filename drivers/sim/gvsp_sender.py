@@ -30,7 +30,8 @@ class CameraFaults:
     no_resend: capability bit off and requests ignored (the bit is read by clients at connect). silent_gvcp: the camera
     neither hears nor answers. silent_gvsp: no stream packet leaves. unpaced: packets leave as fast as they can.
     drop_leader, drop_trailer: missing from every frame until asked for again. trigger_twice: every software trigger
-    gives two frames. temperature: DeviceTemperature reads 0, is refused, or keeps its last value.
+    gives two frames. no_stream_channel: it says that it has none, as one that is not ready yet. temperature:
+    DeviceTemperature reads 0, is refused, or keeps its last value.
     """
 
     seed: int = 0
@@ -43,6 +44,7 @@ class CameraFaults:
     drop_leader: bool = False
     drop_trailer: bool = False
     trigger_twice: bool = False
+    no_stream_channel: bool = False
     temperature: Literal["zero", "access", "stuck"] | None = None
 
 

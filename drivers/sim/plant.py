@@ -6,8 +6,7 @@
         plant.advance(clock.now_ns())
         ...                             # read outputs, set inputs
 
-Temperatures are in degC, heat capacities in J/K, conductances in W/K. The chamber is a chest freezer of
-1.2 x 0.9 x 0.8 m; its evaporator is bonded to the liner and the fan-heater stirs the air. It reaches -10 to +70 degC.
+Temperatures are in degC, heat capacities in J/K, conductances in W/K. What the chamber is made of is a `ChamberSpec`.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from drivers.sim.chamber_spec import ChamberSpec, drawn
 from drivers.sim.hysteresis import BoucWen
 from drivers.sim.optics import CameraKind, Nodes, Optics, Placement, optics_at
 
@@ -26,40 +26,19 @@ STEP_s = 0.5
 STEP_ns = 500_000_000
 DAY_s = 86_400.0
 
-# Chamber
-AIR_J_K = 6_000.0  # 0.86 m3 of air, ducts and racks
-WALL_J_K = 40_000.0  # steel liner with the evaporator's tubes
-AIR_WALL_W_K = 60.0
-WALL_LABORATORY_W_K = 8.0  # the insulation
-FAN_W = 20.0
-FLAP_LEAK_W_K = 12.0  # exchange of air through the open flap
-HEATER_W = 2_000.0
-HEATER_J_K, HEATER_AIR_W_K = 500.0, 20.0  # lag 25 s
-COIL_J_K, COIL_WALL_W_K, COIL_AIR_W_K = 2_500.0, 38.0, 4.0  # lag 60 s
-COMPRESSOR_W = 600.0  # at an evaporator of 0 degC and above, where the motor limits it
-COMPRESSOR_per_K = 0.010  # capacity lost per K of evaporator below that (suction pressure)
 CUT_OUT_degC = 85.0  # hard-wired, latching
-
-# Granite slab through the wall: lag inside over an hour
-GRANITE_J_K = 60_000.0
-GRANITE_AIR_W_K = 14.0
-GRANITE_INSIDE_OUTSIDE_W_K = 0.6
-GRANITE_LABORATORY_W_K = 9.0
 
 # Laboratory side
 LABORATORY_PEAK_s = 15.0 * 3600.0  # warmest time of the day, UTC
 ARTIFACT_LAG_s = 1_200.0
 ARTIFACT_FLAP_SHARE = 0.02  # of the chamber's excess reaches the target through the open flap
 
-# Thermometers' lags; the air near the camera feels its plume, the walls and the flap
-PROBE_LAG_s = 10.0
-NEAR_LAG_s = 40.0
+# The air near the camera feels its plume, the walls and the flap
 NEAR_BODY_SHARE, NEAR_WALL_SHARE, NEAR_FLAP_SHARE = 0.012, 0.03, 0.05
 
 # Camera: steady body +19 K, sensor +20 K, lens +16 K above the air at 24 degC; two thirds of it in 11, 11 and 24 min
 CAMERA_W, SENSOR_W = 3.65, 0.9  # electronics in the body, sensor chip
 SENSOR_J_K, SENSOR_BODY_W_K = 25.0, 0.65
-BODY_J_K, BODY_AIR_W_K = 120.0, 0.19
 BODY_RADIATION_W_K = 0.03  # at a mean of 310 K
 BODY_GRANITE_W_K = 0.018
 BODY_LENS_W_K, LENS_AIR_W_K, LENS_J_K = 0.0440, 0.0078, 34.0
@@ -72,7 +51,8 @@ class PlantSpec:
     """What one simulated laboratory is; plain fields, so that a stand file can carry them.
 
     initial_degC: every node at the start, None for laboratory_degC. seed: irregularity of the unmodified camera's
-    joints. The remaining fields are those of `optics.Placement`.
+    joints. chamber_seed: which chamber is drawn (`chamber_spec.drawn`), None for the standard one. The remaining fields
+    are those of `optics.Placement`.
     """
 
     camera: CameraKind = "modified"
@@ -83,6 +63,7 @@ class PlantSpec:
     camera_powered: bool = False
     camera_roll_deg: float = 0.0
     distance_mm: float = 826.0
+    chamber_seed: int | None = None
 
 
 def _closed(time_ns: int) -> float:
@@ -103,6 +84,7 @@ class Plant:
 
     def __init__(self, spec: PlantSpec, start_ns: int) -> None:
         self.spec = spec
+        self._chamber = ChamberSpec() if spec.chamber_seed is None else drawn(spec.chamber_seed)
         self.lock = threading.RLock()
         self.now_ns = start_ns
         self.on_step: list[Callable[[int, float], None]] = []
@@ -196,46 +178,51 @@ class Plant:
         self.laboratory_degC = laboratory
 
     def _step_chamber(self, flap_open: float, laboratory: float) -> None:
+        of = self._chamber
         air, wall, coil, element = self.bulk_air_degC, self.wall_degC, self.coil_degC, self.element_degC
         if air > CUT_OUT_degC:
             self.cut_out_open = True
         heating = self.heater_enabled and not self.cut_out_open
-        self.heater_W = heater_W = HEATER_W * self.heater_on_fraction if heating else 0.0
+        self.heater_W = heater_W = of.heater_W * self.heater_on_fraction if heating else 0.0
         pumped_W = 0.0
         if self.compressor_on:
-            pumped_W = COMPRESSOR_W * max(0.0, 1.0 + COMPRESSOR_per_K * min(0.0, coil))
-        from_element_W = HEATER_AIR_W_K * (element - air)
-        air_to_wall_W = AIR_WALL_W_K * (air - wall)
-        wall_to_coil_W = COIL_WALL_W_K * (wall - coil)
-        air_to_coil_W = COIL_AIR_W_K * (air - coil)
-        leak_W = FLAP_LEAK_W_K * flap_open * (air - laboratory)
-        to_granite_W = GRANITE_AIR_W_K * (air - self.granite_inside_degC)
+            pumped_W = of.compressor_W * max(0.0, 1.0 + of.compressor_per_K * min(0.0, coil))
+        from_element_W = of.heater_air_W_K * (element - air)
+        air_to_wall_W = of.air_wall_W_K * (air - wall)
+        wall_to_coil_W = of.coil_wall_W_K * (wall - coil)
+        air_to_coil_W = of.coil_air_W_K * (air - coil)
+        leak_W = of.flap_leak_W_K * flap_open * (air - laboratory)
+        to_granite_W = of.granite_air_W_K * (air - self.granite_inside_degC)
         camera_W = CAMERA_W + SENSOR_W if self._camera_powered else 0.0
-        gain_W = from_element_W + FAN_W + camera_W - air_to_wall_W - air_to_coil_W - leak_W - to_granite_W
-        self.bulk_air_degC = air + gain_W * (STEP_s / AIR_J_K)
-        wall_gain_W = air_to_wall_W - wall_to_coil_W - WALL_LABORATORY_W_K * (wall - laboratory)
-        self.wall_degC = wall + wall_gain_W * (STEP_s / WALL_J_K)
-        self.coil_degC = coil + (wall_to_coil_W + air_to_coil_W - pumped_W) * (STEP_s / COIL_J_K)
-        self.element_degC = element + (heater_W - from_element_W) * (STEP_s / HEATER_J_K)
+        gain_W = from_element_W + of.fan_W + camera_W - air_to_wall_W - air_to_coil_W - leak_W - to_granite_W
+        self.bulk_air_degC = air + gain_W * (STEP_s / of.air_J_K)
+        wall_gain_W = air_to_wall_W - wall_to_coil_W - of.wall_laboratory_W_K * (wall - laboratory)
+        self.wall_degC = wall + wall_gain_W * (STEP_s / of.wall_J_K)
+        self.coil_degC = coil + (wall_to_coil_W + air_to_coil_W - pumped_W) * (STEP_s / of.coil_J_K)
+        self.element_degC = element + (heater_W - from_element_W) * (STEP_s / of.heater_J_K)
 
     def _step_stand(self, flap_open: float, laboratory: float) -> None:
+        of = self._chamber
         air, inside, outside = self.bulk_air_degC, self.granite_inside_degC, self.granite_outside_degC
-        through_W = GRANITE_INSIDE_OUTSIDE_W_K * (inside - outside)
-        self.granite_inside_degC = inside + (GRANITE_AIR_W_K * (air - inside) - through_W) * (STEP_s / GRANITE_J_K)
-        to_laboratory_W = GRANITE_LABORATORY_W_K * (outside - laboratory)
-        self.granite_outside_degC = outside + (through_W - to_laboratory_W) * (STEP_s / GRANITE_J_K)
+        through_W = of.granite_inside_outside_W_K * (inside - outside)
+        self.granite_inside_degC = inside + (of.granite_air_W_K * (air - inside) - through_W) * (
+            STEP_s / of.granite_J_K
+        )
+        to_laboratory_W = of.granite_laboratory_W_K * (outside - laboratory)
+        self.granite_outside_degC = outside + (through_W - to_laboratory_W) * (STEP_s / of.granite_J_K)
         around_target = laboratory + ARTIFACT_FLAP_SHARE * flap_open * (air - laboratory)
         self.artifact_degC += (around_target - self.artifact_degC) * (STEP_s / ARTIFACT_LAG_s)
-        self.chamber_degC += (air - self.chamber_degC) * (STEP_s / PROBE_LAG_s)
+        self.chamber_degC += (air - self.chamber_degC) * (STEP_s / of.probe_lag_s)
         near_camera = (
             air
             + NEAR_BODY_SHARE * (self.body_degC - air)
             + NEAR_WALL_SHARE * (self.wall_degC - air)
             + NEAR_FLAP_SHARE * flap_open * (laboratory - air)
         )
-        self.air_degC += (near_camera - self.air_degC) * (STEP_s / NEAR_LAG_s)
+        self.air_degC += (near_camera - self.air_degC) * (STEP_s / of.near_lag_s)
 
     def _step_camera(self, flap_open: float, laboratory: float) -> None:
+        of = self._chamber
         around, body, sensor, lens = self.air_degC, self.body_degC, self.sensor_degC, self.lens_degC
         wall = self.wall_degC
         electronics_W, chip_W = (CAMERA_W, SENSOR_W) if self._camera_powered else (0.0, 0.0)
@@ -243,8 +230,8 @@ class Plant:
         radiated_W = BODY_RADIATION_W_K * mean * mean * mean * (body - wall)
         to_body_W = SENSOR_BODY_W_K * (sensor - body)
         to_lens_W = BODY_LENS_W_K * (body - lens)
-        lost_W = BODY_AIR_W_K * (body - around) + radiated_W + BODY_GRANITE_W_K * (body - self.granite_inside_degC)
-        change_K = (electronics_W + to_body_W - to_lens_W - lost_W) * (STEP_s / BODY_J_K)
+        lost_W = of.body_air_W_K * (body - around) + radiated_W + BODY_GRANITE_W_K * (body - self.granite_inside_degC)
+        change_K = (electronics_W + to_body_W - to_lens_W - lost_W) * (STEP_s / of.body_J_K)
         self.body_degC = body + change_K
         self.sensor_degC = sensor + (chip_W - to_body_W) * (STEP_s / SENSOR_J_K)
         self.lens_degC = lens + (to_lens_W - LENS_AIR_W_K * (lens - around)) * (STEP_s / LENS_J_K)

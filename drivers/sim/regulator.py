@@ -50,6 +50,7 @@ from drivers.sim.regulator_table import (
 )
 
 MOST_WORDS = 104
+STILL_AIR_LAG_S = 30.0  # of a probe that hangs in the laboratory
 SHORT_PERIODS_S = {-2: 0.1, -1: 0.2, 0: 0.5}  # coded values of the control period, else whole seconds
 
 
@@ -57,11 +58,9 @@ class Chamber(Timeline, Protocol):
     """What the regulator sees and moves of the plant."""
 
     heater_on_fraction: float
-
-    @property
-    def chamber_degC(self) -> float:
-        """Temperature of the regulator's probe."""
-        ...
+    chamber_degC: float  # where the regulator's probe is
+    air_degC: float  # where the thermometer near the camera is
+    laboratory_degC: float
 
 
 class Mode(IntEnum):
@@ -81,7 +80,8 @@ class FakeRegulator:
     """E5CC on the bus as unit `unit`. Powers up stopped, in backup mode, with communications writing disabled.
 
     Faults: silent; compoway (the factory protocol is selected: no answer on Modbus); sensor_break; ad_error;
-    stuck_pv_degC (the PV stays there); pv_offset_K (the probe reads wrong); display_decimals other than 1;
+    stuck_pv_degC (the PV stays there); pv_offset_K (the probe reads wrong); pv_drift_K_per_h; probe_out (the probe was
+    pulled out of the chamber); probe_exchanged (with the thermometer near the camera); display_decimals other than 1;
     setpoint_clamp_degC (a set point is acknowledged but stored inside these limits).
     eeprom_writes counts worn cells. alpha: set-point filter coefficient, set on the panel.
     """
@@ -96,10 +96,16 @@ class FakeRegulator:
         self.ad_error = False
         self.stuck_pv_degC: float | None = None
         self.pv_offset_K = 0.0
+        self.pv_drift_K_per_h = 0.0
+        self.probe_out = False
+        self.probe_exchanged = False
         self.display_decimals = 1
         self.setpoint_clamp_degC: tuple[float, float] | None = None
+        self._tuning_share = 1.0
         self._plant = plant
         self._clock = clock
+        self._drifted_K = 0.0
+        self._felt_degC = plant.chamber_degC  # by the probe, wherever it is
         self._eeprom = {address: parameter.default for address, parameter in PARAMETERS.items()}
         self._functions = {
             0x03: reads_words(self._read, MOST_WORDS),
@@ -219,8 +225,8 @@ class FakeRegulator:
             0x0100: lambda: self._modes.discard(Mode.STOP),
             0x0101: self._stop,
             0x0300: lambda: self._modes.discard(Mode.TUNING),
-            0x0301: self._tune,
-            0x0302: self._tune,
+            0x0301: lambda: self._tune(1.0),
+            0x0302: lambda: self._tune(0.4),
             0x0400: lambda: self._modes.discard(Mode.RAM),
             0x0401: lambda: self._modes.add(Mode.RAM),
             0x0500: self._save,
@@ -237,10 +243,12 @@ class FakeRegulator:
         self._pid = None
         self.outputs = _signed(self._ram[MV_AT_STOP])
 
-    def _tune(self) -> None:
-        """Only the status bit and the refusal of writes are played; it lasts until cancelled and tunes nothing."""
+    def _tune(self, share: float) -> None:
+        """A limit cycle with that share of the outputs, around the set point; it lasts until cancelled, and the gains
+        stay what they are."""
         if self._modes & {Mode.STOP, Mode.MANUAL}:
             raise Refusal(OPERATION_ERROR)
+        self._tuning_share = share
         self._modes.add(Mode.TUNING)
 
     def _automatic(self) -> None:
@@ -283,6 +291,14 @@ class FakeRegulator:
             self._modes.add(Mode.MANUAL)
             self.outputs = Outputs(heat_pct, 0.0)
 
+    def press_autotune(self, on: bool) -> None:
+        """Somebody starts autotuning (100 %) with the keys, or cancels it; a unit that is stopped declines."""
+        with self._now():
+            if not on:
+                self._modes.discard(Mode.TUNING)
+            elif not self._modes & {Mode.STOP, Mode.MANUAL}:
+                self._tune(1.0)
+
     def press_automatic(self) -> None:
         """Somebody gives control back with the keys."""
         with self._now():
@@ -302,7 +318,17 @@ class FakeRegulator:
             self._plant.advance(self._now_ns)
             yield
 
+    def _feel(self, dt_s: float) -> None:
+        """The probe takes the temperature of its place; in the laboratory, in still air, slowly."""
+        plant = self._plant
+        if self.probe_out:
+            self._felt_degC += (plant.laboratory_degC - self._felt_degC) * dt_s / STILL_AIR_LAG_S
+        else:
+            self._felt_degC = plant.air_degC if self.probe_exchanged else plant.chamber_degC
+        self._drifted_K += self.pv_drift_K_per_h * dt_s / 3600
+
     def _on_step(self, time_ns: int, dt_s: float) -> None:
+        self._feel(dt_s)
         self.outputs = self._control(dt_s)
         dt_ns = seconds_ns(dt_s)
         on_ns = on_time_ns(time_ns, time_ns + dt_ns, self.outputs.heat_pct / 100, self._period_ns(HEAT_PERIOD))
@@ -317,13 +343,17 @@ class FakeRegulator:
             self._pid = None
             return _signed(self._ram[MV_AT_ERROR])
         pv_degC = self._pv_degC()
+        if Mode.TUNING in self._modes:
+            self._pid = None
+            heats = pv_degC < self._ram[SETPOINT]
+            return _signed(self._tuning_share * self._ram[MV_UPPER if heats else MV_LOWER])
         outputs, self._pid = step(self._pid or start(pv_degC), self._ram[SETPOINT], pv_degC, dt_s, self._gains())
         return outputs
 
     def _pv_degC(self) -> float:
         if self.stuck_pv_degC is not None:
             return self.stuck_pv_degC
-        return self._plant.chamber_degC + self.pv_offset_K + self._ram[INPUT_SHIFT]
+        return self._felt_degC + self._drifted_K + self.pv_offset_K + self._ram[INPUT_SHIFT]
 
     def _shown_degC(self) -> float:
         low_degC, high_degC = PT100_RANGE_DEGC

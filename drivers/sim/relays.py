@@ -66,7 +66,7 @@ class FakeRelays:
     heater_enable, compressor, camera_power. All relays are open at power-up.
 
     Faults: silent; lost_writes (acknowledged, not done); welded (names of contacts that stay closed whatever the
-    coil does); rearms False (a repeated timed-on does not start its time again).
+    coil does); rearms False (a repeated timed-on does not start its time again); times False (a timed-on stays on).
     """
 
     def __init__(self, plant: Contacts, clock: Now, unit: int, channels: Mapping[str, int]) -> None:
@@ -82,6 +82,7 @@ class FakeRelays:
         self.lost_writes = False
         self.welded: set[str] = set()
         self.rearms = True
+        self.times = True
         self._plant = plant
         self._clock = clock
         self._channels = dict(channels)
@@ -137,7 +138,7 @@ class FakeRelays:
         last = self._relays[relay]
         runs = last.closed == closed and last.until_ns is not None and self._now_ns < last.until_ns
         if self.rearms or not runs:
-            self._set(relay, Relay(closed, self._now_ns + time * TIMED_UNIT_NS))
+            self._set(relay, Relay(closed, self._now_ns + time * TIMED_UNIT_NS if self.times else None))
 
     def _write_coils(self, address: int, bits: Sequence[bool]) -> None:
         _check_span(address, len(bits))

@@ -36,6 +36,7 @@ READ_NAME, READ_FIRMWARE = 0x00, 0x20  # sub-functions of FC 0x46
 M_7015 = bytes.fromhex("00 70 15 00")
 FIRMWARE = bytes.fromhex("01 00 00")
 
+STILL_AIR_LAG_S = 30.0  # of a sensor that hangs in the laboratory
 NOISE_K = 0.003
 NOISY_K = 1.0
 
@@ -58,6 +59,7 @@ class Places(Timeline, Protocol):
     granite_outside_degC: float
     artifact_degC: float
     air_degC: float
+    chamber_degC: float
     laboratory_degC: float
 
 
@@ -67,9 +69,10 @@ class FakeThermometers:
 
     The noise of a reading is a pure function of (seed, channel, grid time of the plant), however often it is read.
     type_codes: range of each channel, changed over the bus too. Faults, by channel number: open_channels,
-    shorted_channels, stuck_degC (the converter gives this and no noise), noisy_channel (1 K instead of 3 mK), offset_K,
-    drift_K_per_h. late_fault_bit: the fault bits are those of the poll before. no_fault_bits: they are refused. name:
-    identity as in FC 0x46. silent.
+    shorted_channels, stuck_degC (the converter gives this and no noise), held_degC (the sensor is held there),
+    noisy_channel (1 K instead of 3 mK), offset_K, drift_K_per_h, pulled_out (of the chamber). air_exchanged: the air's
+    sensor is where the regulator's probe belongs. late_fault_bit: the fault bits are those of the poll before.
+    no_fault_bits: they are refused. name: identity as in FC 0x46. silent.
     """
 
     def __init__(self, plant: Places, clock: Now, unit: int, channels: Mapping[str, int], seed: int) -> None:
@@ -77,7 +80,7 @@ class FakeThermometers:
             "granite_inside": lambda: plant.granite_inside_degC,
             "granite_outside": lambda: plant.granite_outside_degC,
             "artifact": lambda: plant.artifact_degC,
-            "air": lambda: plant.air_degC,
+            "air": lambda: plant.chamber_degC if self.air_exchanged else plant.air_degC,
             "laboratory": lambda: plant.laboratory_degC,
         }
         if not channels.keys() <= places.keys() or not set(channels.values()) <= set(range(CHANNELS)):
@@ -91,9 +94,12 @@ class FakeThermometers:
         self.open_channels: set[int] = set()
         self.shorted_channels: set[int] = set()
         self.stuck_degC: dict[int, float] = {}
+        self.held_degC: dict[int, float] = {}
         self.noisy_channel: int | None = None
         self.offset_K: dict[int, float] = {}
         self.drift_K_per_h: dict[int, float] = {}
+        self.pulled_out: set[int] = set()
+        self.air_exchanged = False
         self.late_fault_bit = False
         self.no_fault_bits = False
         self._plant = plant
@@ -101,6 +107,7 @@ class FakeThermometers:
         self._seed = seed
         self._sensors = {number: places[name] for name, number in channels.items()}
         self._drifted_K: dict[int, float] = {}
+        self._loose_degC: dict[int, float] = {}  # of the sensors that hang in the laboratory
         self._drawn_ns = 0
         self._drawn: dict[int, float] = {}  # noise at that time by channel, in units of its standard deviation
         self._register_offsets = [0] * CHANNELS
@@ -148,7 +155,8 @@ class FakeThermometers:
             return self.stuck_degC[channel]
         noise_K = self._noise(channel) * (NOISY_K if channel == self.noisy_channel else NOISE_K)
         wrong_K = self.offset_K.get(channel, 0.0) + self._drifted_K.get(channel, 0.0)
-        return self._sensors[channel]() + noise_K + wrong_K + _signed(self._register_offsets[channel]) / 10
+        felt_degC = self.held_degC.get(channel, self._loose_degC.get(channel, self._sensors[channel]()))
+        return felt_degC + noise_K + wrong_K + _signed(self._register_offsets[channel]) / 10
 
     def _noise(self, channel: int) -> float:
         """Drawn once in a step of the plant: the values and the fault bits of a poll ask for it alike."""
@@ -216,6 +224,16 @@ class FakeThermometers:
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         for channel, rate_K_per_h in self.drift_K_per_h.items():
             self._drifted_K[channel] = self._drifted_K.get(channel, 0.0) + rate_K_per_h * dt_s / 3600
+        if self.pulled_out or self._loose_degC:
+            self._loosen(dt_s)
+
+    def _loosen(self, dt_s: float) -> None:
+        """Sensors outside go to the laboratory's temperature, in still air; those put back are where they belong."""
+        loose, outside_degC = self._loose_degC, self._plant.laboratory_degC
+        was = {channel: loose.get(channel, self._sensors[channel]()) for channel in self.pulled_out}
+        self._loose_degC = {
+            channel: degC + (outside_degC - degC) * dt_s / STILL_AIR_LAG_S for channel, degC in was.items()
+        }
 
 
 def _check_span(address: int, count: int, begin: int) -> None:

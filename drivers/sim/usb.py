@@ -93,7 +93,7 @@ class UsbServer:
     def __init__(self, host: str, port: int, devices: Sequence[UsbDevice]) -> None:
         self._devices = devices
         self._wire = TcpWire(host, port, lambda: Lines(self._answer), LinkFaults())
-        self.port = self._wire.port
+        self.port, self.address = self._wire.port, self._wire.address
 
     def close(self) -> None:
         """Stop listening and drop every connection."""

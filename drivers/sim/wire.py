@@ -41,19 +41,25 @@ class Lines:
 
 
 class PtyWire:
-    """A serial port: `path` becomes a symlink to a fresh pseudo-terminal in raw mode; replug by making a new one."""
+    """A serial port: `path` becomes a symlink to a fresh pseudo-terminal in raw mode; replug by making a new one.
 
-    def __init__(self, path: Path, engine: Engine, faults: LinkFaults) -> None:
+    Without a path it is reached at the pseudo-terminal's own one. `address` is where.
+    """
+
+    def __init__(self, path: Path | None, engine: Engine, faults: LinkFaults) -> None:
         self._path = path
         self._engine = engine
         self._faults = faults
         self._master, self._slave = os.openpty()  # the slave stays open, or reads fail while no driver is connected
         tty.setraw(self._slave)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-        path.symlink_to(os.ttyname(self._slave))
+        terminal = os.ttyname(self._slave)
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.unlink(missing_ok=True)
+            path.symlink_to(terminal)
+        self.address = f"serial:{path or terminal}"
         self._stop_read, self._stop_write = os.pipe()
-        self._thread = threading.Thread(target=self._serve, name=f"pty {path.name}", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name=f"pty {terminal}", daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
@@ -73,20 +79,23 @@ class PtyWire:
         with contextlib.suppress(OSError):
             os.write(self._stop_write, b"x")
         self._thread.join()
-        self._path.unlink(missing_ok=True)
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
         for descriptor in (self._master, self._slave, self._stop_read, self._stop_write):
             with contextlib.suppress(OSError):
                 os.close(descriptor)
 
 
 class TcpWire:
-    """A TCP server; every connection gets its own engine from `make_engine`."""
+    """A TCP server; every connection gets its own engine from `make_engine`. Port 0 is a free one; `address` says
+    which."""
 
     def __init__(self, host: str, port: int, make_engine: Callable[[], Engine], faults: LinkFaults) -> None:
         self._make_engine = make_engine
         self._faults = faults
         self._server = socket.create_server((host, port))
         self.port: int = self._server.getsockname()[1]
+        self.address = f"tcp:{host}:{self.port}"
         self._connections: set[socket.socket] = set()
         self._lock = threading.Lock()
         threading.Thread(target=self._accept, name=f"tcp {self.port}", daemon=True).start()

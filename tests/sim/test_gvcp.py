@@ -52,6 +52,12 @@ def test_a_command_cut_short_anywhere_is_malformed(wire: str) -> None:
             gvcp.decode_request(datagram[:length])
 
 
+def test_a_command_whose_acknowledge_has_no_code_is_malformed() -> None:
+    """An acknowledge is its command plus 1, in 16 bits."""
+    with pytest.raises(Malformed, match="no acknowledge can answer"):
+        gvcp.decode_request(Request(0xFFFF, 1).encode())
+
+
 @pytest.mark.parametrize("wire", [wire for wire, _ in ACKS])
 def test_an_acknowledge_cut_short_anywhere_is_malformed(wire: str) -> None:
     datagram = bytes.fromhex(wire)
@@ -99,7 +105,7 @@ u32 = st.integers(0, 0xFFFFFFFF)
 payloads = st.binary(max_size=540)
 
 
-@given(u16, u16, payloads, st.integers(0, 255))
+@given(st.integers(0, 0xFFFE), u16, payloads, st.integers(0, 255))
 def test_any_command_survives_the_round_trip(command: int, req_id: int, payload: bytes, flags: int) -> None:
     request = Request(command, req_id, payload, flags)
     assert gvcp.decode_request(request.encode()) == request

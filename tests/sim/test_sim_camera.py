@@ -20,8 +20,9 @@ from drivers.sim.genicam import features
 from drivers.sim.gvcp import Ack, Command, Request, Resend, Status
 from drivers.sim.gvsp import Kind, Packet
 from drivers.sim.gvsp_sender import CameraFaults
+from tests.addresses import camera_address
 
-ADDRESS = "127.0.0.74"
+ADDRESS = camera_address()
 WIDTH, HEIGHT = 320, 240
 START_NS = seconds_ns(1_700_000_000.0)
 FEATURES = {feature.name: feature for feature in features(WIDTH, HEIGHT, "SN1")}
@@ -529,3 +530,13 @@ def test_arv_tool_reads_and_sets_features(arv_tool: str) -> None:
 
 def test_arv_tool_is_told_why_a_value_is_refused(arv_tool: str) -> None:
     assert "invalid-parameter" in run(arv_tool, "control", "Gain=99")
+
+
+def test_datagrams_of_any_command_leave_the_camera_answering(client: Client) -> None:
+    for command in (0x0000, 0x0001, 0x7FFF, 0xFFFE, 0xFFFF):
+        client.control.sendto(Request(command, 7).encode(), (ADDRESS, gvcp.PORT))
+    client.control.settimeout(WAIT_s)
+    client.req_id = 100
+    while (ack := gvcp.decode_ack(client.control.recv(1024))).command != 0xFFFE:
+        assert ack.status != Status.OK
+    assert client.ask(Command.DISCOVERY, b"").status == Status.OK
