@@ -28,7 +28,10 @@ DAMAGE = (
 
 @contextmanager
 def reading(path: Path) -> Generator[None]:
-    """Whatever damage raises inside becomes a SessionError that names the file."""
+    """Whatever damage raises inside becomes a SessionError that names the file; one at once for a pipe or a device,
+    which nobody may ever write to."""
+    if path.exists() and not path.is_file():
+        raise SessionError(f"{path}: is no file; no session has a folder, a pipe or a device of that name")
     try:
         yield
     except DAMAGE as error:

@@ -10,12 +10,15 @@
     OUT/frames/index.csv             all those texts as one table
 
 An empty cell is what a device does not measure; nan is what it could not measure, and `remarks` then says why.
+
+Each instant is there twice: `time_ns` as it was recorded, on the stand's clock, which never steps and which durations
+are to be computed of; `time_utc` with the offset that the host's system clock had against it then (utc_offsets.py).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from operator import attrgetter
 from pathlib import Path
@@ -34,6 +37,7 @@ from stand.recording.records import Message, telemetry_messages
 from stand.recording.session import RecordedImage, Session
 from stand.recording.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
 from stand.recording.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format
+from stand.recording.utc_offsets import UtcOffsets
 
 TIME_COLUMNS = (Column("time_ns", "ns"), Column("time_utc", "utc"))
 META_COLUMNS = (
@@ -51,7 +55,7 @@ STEP_COLUMNS = (
     *TIME_COLUMNS,
     *(Column(name, "text") for name in ("step_id", "index", "kind", "state", "parameters_json")),
 )
-EVENT_COLUMNS = (*TIME_COLUMNS, *(Column(name, "text") for name in ("level", "kind", "text")))
+EVENT_COLUMNS = (*TIME_COLUMNS, *(Column(name, "text") for name in ("level", "kind", "text", "data_json")))
 
 
 def export(
@@ -95,6 +99,7 @@ class _Work:
 
 def _write_facts(session: Session, folder: Path) -> None:
     """What is small: metadata, attachments, steps and events."""
+    utc = session.utc
     text = json.dumps(session.metadata, indent=2, ensure_ascii=False)
     (folder / "session.json").write_text(text + "\n", encoding="utf-8")
     attachments = folder / "attachments"
@@ -107,19 +112,22 @@ def _write_facts(session: Session, folder: Path) -> None:
         folder / "steps.csv",
         STEP_COLUMNS,
         (
-            (m.time_ns, m.time_ns, m.step_id, m.index, m.kind, m.state.value, _json(m.parameters))
+            (m.time_ns, utc.utc_ns(m.time_ns), m.step_id, m.index, m.kind, m.state.value, _json(m.parameters))
             for m in session.steps()
         ),
     )
     _write_csv(
         folder / "events.csv",
         EVENT_COLUMNS,
-        ((e.time_ns, e.time_ns, e.level, e.kind, e.text) for e in session.events()),
+        (
+            (e.time_ns, utc.utc_ns(e.time_ns), e.level, e.kind, e.text, _json(e.data) if e.data else "")
+            for e in session.events()
+        ),
     )
 
 
-def _json(parameters: dict[str, object]) -> str:
-    return json.dumps(parameters, sort_keys=True, ensure_ascii=False)
+def _json(fields: Mapping[str, object]) -> str:
+    return json.dumps(dict(fields), sort_keys=True, ensure_ascii=False)
 
 
 def _write_csv(path: Path, columns: Sequence[Column], rows: Iterable[Sequence[Cell]]) -> None:
@@ -140,7 +148,7 @@ def _write_telemetry(session: Session, folder: Path, table_format: TableFormat, 
                     table = TABLES[table_format](folder / f"{name}.{table_format}", _COLUMNS[message.topic])
                     stack.callback(table.close)
                     tables[message.topic] = table
-                for row in _rows(message):
+                for row in _rows(message, session.utc):
                     tables[message.topic].add(row)
             work.done(path.stat().st_size, f"telemetry {path.name}")
 
@@ -161,12 +169,12 @@ _COLUMNS = {
 }
 
 
-def _rows(message: Message) -> Iterator[Sequence[Cell]]:
+def _rows(message: Message, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
     if message.topic == messages.CAMERA_META:
         meta = messages.decode_frame_meta(message.data)
         yield (
             message.time_ns,
-            message.time_ns,
+            utc.utc_ns(message.time_ns),
             meta.channel,
             meta.step_id,
             meta.block_id,
@@ -178,10 +186,10 @@ def _rows(message: Message) -> Iterator[Sequence[Cell]]:
         )
     else:
         batch = messages.decode_batch(message.topic, message.data, message.time_ns)
-        yield from _batch_rows(messages.KIND_OF_TOPIC[message.topic], batch)
+        yield from _batch_rows(messages.KIND_OF_TOPIC[message.topic], batch, utc)
 
 
-def _batch_rows(kind: messages.Kind, batch: Batch) -> Iterator[Sequence[Cell]]:
+def _batch_rows(kind: messages.Kind, batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
     """A row for each instant at which something was measured, most often one."""
     keys = [(f"{batch.device}.{quantity.name}", quantity.unit) for quantity in kind.quantities]
     for time_ns, readings in _by_instant(batch):
@@ -190,7 +198,7 @@ def _batch_rows(kind: messages.Kind, batch: Batch) -> Iterator[Sequence[Cell]]:
             reading = readings.get(key)
             cells += (None, None) if reading is None else (reading.value, reading.quality.value)
         remarks = (_remark(reading, key in keys) for key, reading in readings.items())
-        yield (time_ns, time_ns, batch.device, *cells, "; ".join(filter(None, remarks)))
+        yield (time_ns, utc.utc_ns(time_ns), batch.device, *cells, "; ".join(filter(None, remarks)))
 
 
 def _by_instant(batch: Batch) -> Iterator[tuple[int, dict[tuple[str, str], Reading]]]:
@@ -222,7 +230,7 @@ def _write_frames(session: Session, folder: Path, work: _Work) -> None:
     with closing(CsvTable(folder / "index.csv", (*SIDECAR_COLUMNS, *stand.columns))) as index:
         for number, image in enumerate(session.images(), 1):
             name = f"{number:06d}"
-            facts = (*frame_facts(f"{name}.png", image), *stand.at(image.time_ns))
+            facts = (*frame_facts(f"{name}.png", image, session.utc), *stand.at(image.time_ns))
             (folder / f"{name}.png").write_bytes(_png(image))
             (folder / f"{name}.txt").write_text(sidecar_text(stand.columns, facts), encoding="utf-8")
             index.add(facts)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from drivers.clock import NS_PER_S
 from stand.hub import Event
-from stand.recording.instants import date_time, duration
+from stand.recording.instants import duration
+from stand.recording.utc_offsets import UtcOffsets
 
 FRAMES_DROPPED = "frames_dropped"  # kind of the recorder's events
 SHORTEST_NS = 5 * NS_PER_S
@@ -37,12 +38,11 @@ class Silence:
     begin_ns: int
     end_ns: int
 
-    def __str__(self) -> str:
+    def text(self, utc: UtcOffsets) -> str:
+        """The silence as a sentence."""
         verb = "was" if len(self.names) == 1 else "were"
-        return (
-            f"{', '.join(self.names)} {verb} silent from {date_time(self.begin_ns)} to {date_time(self.end_ns)} UTC "
-            f"({duration(self.end_ns - self.begin_ns)})"
-        )
+        span = f"from {utc.date_time(self.begin_ns)} to {utc.date_time(self.end_ns)} UTC"
+        return f"{', '.join(self.names)} {verb} silent {span} ({duration(self.end_ns - self.begin_ns)})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
 from drivers.clock import NS_PER_S
@@ -35,16 +36,17 @@ def duration(length_ns: int) -> str:
     return str(timedelta(seconds=round(length_ns / NS_PER_S)))
 
 
-def parse_instant(text: str, begin_ns: int) -> int:
-    """ns since the epoch, from an ISO time (UTC when it names no zone) or from `+90`, `+1h30m`, `+2m5.5s` after
-    `begin_ns`; ConfigError when it is neither, or no year has it that an instant can be written in."""
-    time_ns = _parsed(text, begin_ns)
+def parse_instant(text: str, begin_ns: int, stand_ns: Callable[[int], int] = int) -> int:
+    """ns since the epoch on the stand's clock, from an ISO time (UTC when it names no zone), which `stand_ns` converts,
+    or from `+90`, `+1h30m`, `+2m5.5s` after `begin_ns`; ConfigError when it is neither, or no year has it that an
+    instant can be written in."""
+    time_ns = _parsed(text, begin_ns, stand_ns)
     if not 0 <= time_ns <= _LAST_NS:
         raise ConfigError(f"{text}: is not between the years 1970 and 9999")
     return time_ns
 
 
-def _parsed(text: str, begin_ns: int) -> int:
+def _parsed(text: str, begin_ns: int, stand_ns: Callable[[int], int]) -> int:
     offset = _OFFSET.fullmatch(text)
     if offset is not None and any(offset.groups()):
         hours, minutes, seconds = (float(group or 0) for group in offset.groups())
@@ -54,4 +56,4 @@ def _parsed(text: str, begin_ns: int) -> int:
     except ValueError as error:
         raise ConfigError(f"{text}: expected a time such as 2026-01-01T18:30:00, +1h30m or step:12") from error
     instant = instant if instant.tzinfo is not None else instant.replace(tzinfo=UTC)
-    return (instant - _EPOCH) // timedelta(microseconds=1) * _NS_PER_US
+    return stand_ns((instant - _EPOCH) // timedelta(microseconds=1) * _NS_PER_US)

@@ -15,7 +15,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
@@ -28,7 +28,7 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from drivers.interface import Frame, Quality, Reading, SessionError
+from drivers.interface import Cause, Frame, Quality, Reading, SessionError
 from stand.hub import Batch, Event, StepMark, StepState
 
 CAMERA_META = "/camera/meta"
@@ -165,6 +165,7 @@ _Reading = _message_class(
         _field("time_ns", 4, INSTANT),
         _field("quality", 5, ENUM, ".thermostand.Quality"),
         _field("reason", 6, STRING),
+        _field("cause", 7, STRING),
     ],
 )
 _FrameMeta = _plain_class(
@@ -183,7 +184,7 @@ _FrameMeta = _plain_class(
 _Step = _plain_class(
     "Step", {"step_id": STRING, "index": INT32, "kind": STRING, "state": STRING, "parameters_json": STRING}
 )
-_Event = _plain_class("Event", {"level": STRING, "kind": STRING, "text": STRING})
+_Event = _plain_class("Event", {"level": STRING, "kind": STRING, "text": STRING, "data_json": STRING})
 
 # Topic of the telemetry series -> message class.
 CLASSES: Mapping[str, type[Message]] = {
@@ -195,6 +196,7 @@ CLASSES: Mapping[str, type[Message]] = {
     LOG: Log,
 }
 
+CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device"}
 LOG_LEVEL = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 
@@ -221,7 +223,7 @@ class BatchEncoder:
             if names is not None:
                 fields[names[0]] = _canonical(reading.value)
                 fields[names[1]] = QUALITY_NUMBER[reading.quality]
-            if names is None or reading.reason or reading.time_ns != time_ns or is_repeated:
+            if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
                 remarks.append(_remark(reading))
         if remarks:
             fields["remarks"] = remarks
@@ -241,6 +243,7 @@ def _remark(reading: Reading) -> Message:
         time_ns=reading.time_ns,
         quality=QUALITY_NUMBER[reading.quality],
         reason=reading.reason,
+        cause=reading.cause,
     )
 
 
@@ -265,12 +268,15 @@ def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Batch:
 
 
 def _remarked(remark: Any) -> Reading:
-    return _reading(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason)
+    cause = CAUSES.get(remark.cause, "")  # none in sessions of before 2026-11-22
+    return _reading(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason, cause)
 
 
-def _reading(channel: str, value: float, unit: str, time_ns: int, quality: int, reason: str) -> Reading:
+def _reading(
+    channel: str, value: float, unit: str, time_ns: int, quality: int, reason: str, cause: Cause = ""
+) -> Reading:
     try:
-        return Reading(channel, value, unit, time_ns, QUALITY_OF_NUMBER[quality], reason)
+        return Reading(channel, value, unit, time_ns, QUALITY_OF_NUMBER[quality], reason, cause)
     except (KeyError, ValueError) as error:
         raise SessionError(f"{channel}: the recorded value {value} does not fit its quality {quality}") from error
 
@@ -323,25 +329,36 @@ def encode_step(mark: StepMark) -> bytes:
 def decode_step(data: bytes, time_ns: int) -> StepMark:
     """The inverse of encode_step; SessionError when it is not one."""
     m = _parse(STEP, data)
+    parameters = _json_object(_get(m, "parameters_json"), "step")
     try:
-        parameters = json.loads(_get(m, "parameters_json"))
         state = StepState(_get(m, "state"))
-    except (ValueError, RecursionError) as error:  # JSON may be nested deeper than Python goes
+    except ValueError as error:
         raise SessionError(f"a recorded step cannot be read ({error})") from error
-    if not isinstance(parameters, dict):
-        raise SessionError("a recorded step has parameters that are not keys and values")
     return StepMark(time_ns, _get(m, "step_id"), _get(m, "index"), _get(m, "kind"), state, parameters)
 
 
+def _json_object(text: str, what: str) -> dict[str, object]:
+    """The keys and values of a JSON text; SessionError when it is none."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:  # JSON may be nested deeper than Python goes
+        raise SessionError(f"a recorded {what} cannot be read ({error})") from error
+    if not isinstance(found, dict):
+        raise SessionError(f"a recorded {what} has JSON that is not keys and values")
+    return cast("dict[str, object]", found)
+
+
 def encode_event(event: Event) -> bytes:
-    """An event of the stand."""
-    return _Event(level=event.level, kind=event.kind, text=event.text).SerializeToString()
+    """An event of the stand; its data as JSON with sorted keys, "" when there is none."""
+    data_json = json.dumps(dict(event.data), sort_keys=True, ensure_ascii=False, default=str) if event.data else ""
+    return _Event(level=event.level, kind=event.kind, text=event.text, data_json=data_json).SerializeToString()
 
 
 def decode_event(data: bytes, time_ns: int) -> Event:
-    """The inverse of encode_event; SessionError when it is not one."""
+    """The inverse of encode_event; SessionError when it is not one. Events recorded before there was data have none."""
     message = _parse(EVENT, data)
-    return Event(time_ns, _get(message, "level"), _get(message, "kind"), _get(message, "text"))
+    fields = _json_object(_get(message, "data_json") or "{}", "event")
+    return Event(time_ns, _get(message, "level"), _get(message, "kind"), _get(message, "text"), fields)
 
 
 def encode_log(event: Event) -> bytes:

@@ -67,7 +67,8 @@ def opening_of(path: Path, own: Survey) -> Opening | None:
 def segments_of(series: Path) -> list[Path]:
     """The finished and unfinished segments in a folder; none when there is no such folder."""
     with suppress(OSError):
-        return [path for path in series.iterdir() if re.fullmatch(r"\d{4,}\.mcap(\.part)?", path.name)]
+        named = [path for path in series.iterdir() if re.fullmatch(r"\d{4,9}\.mcap(\.part)?", path.name)]
+        return [path for path in named if path.is_file()]
     return []
 
 

@@ -6,21 +6,26 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from drivers.clock import NS_PER_S
 from drivers.interface import SessionError
 from stand.hub import Event, StepMark, StepState
+from stand.recording import messages
 from stand.recording.contents import RUN_END, Channel, Contents
 from stand.recording.damage import reading
 from stand.recording.gaps import Silence, silences, told_blocks
 from stand.recording.images import decode_image
 from stand.recording.inventory import SegmentFile, State, inventory
+from stand.recording.items import event_of
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.records import FramePlace, frame_places, read_frame, read_head, telemetry_messages
 from stand.recording.summary import Summary, read_summary
+from stand.recording.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
 from stand.recording.walk import survey
 from stand.recording.wire import Source
 
@@ -29,7 +34,7 @@ from stand.recording.wire import Source
 class Glance:
     """What names, sizes, heads and indexes tell. begin_ns and end_ns: log times of the first and the last message of
     the finished segments, None when they hold none; `frames` are theirs, too. `troubles`: a sentence for each segment
-    that cannot be read."""
+    that cannot be read. utc: to UTC near both ends; the steps of the system clock between them are not looked for."""
 
     path: Path
     files: tuple[SegmentFile, ...]
@@ -39,6 +44,7 @@ class Glance:
     begin_ns: int | None
     end_ns: int | None
     troubles: tuple[str, ...]
+    utc: UtcOffsets
 
     @property
     def size_bytes(self) -> int:
@@ -90,7 +96,21 @@ def glance(path: Path) -> Glance:
         min((statistics.message_start_time for statistics in told), default=None),
         max((statistics.message_end_time for statistics in told), default=None),
         tuple(troubles),
+        _utc([(file.path, summary) for file, summary in summaries if file.series == TELEMETRY]),
     )
+
+
+def _utc(segments: list[tuple[Path, Summary]]) -> UtcOffsets:
+    """What the first segment of the telemetry and those of the last minutes say of UTC, as far as they can be read."""
+    ends_ns = [summary.statistics.message_end_time for _, summary in segments]
+    last_ns = max(ends_ns, default=0) - REPEATED_NS - NS_PER_S
+    events: list[Event] = []
+    for (path, _), end_ns in zip(segments, ends_ns, strict=True):
+        if path != segments[0][0] and end_ns < last_ns:
+            continue
+        with suppress(SessionError):
+            events += map(event_of, telemetry_messages(path, lambda channel: channel.topic == messages.EVENT))
+    return offsets_of(events)
 
 
 def _within(directory: Path, error: SessionError) -> str:
@@ -180,6 +200,11 @@ class Overview:
     def ending(self) -> Event | None:
         """How the run ended, None when the recording does not tell."""
         return next((event for event in reversed(self.events) if event.kind == RUN_END), None)
+
+    @property
+    def utc(self) -> UtcOffsets:
+        """From its instants to UTC as the host's system clock had it."""
+        return offsets_of(self.events)
 
 
 @dataclass

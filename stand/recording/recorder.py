@@ -4,6 +4,8 @@ Telemetry is committed on ticks of the stand's clock, each frame by itself; enco
 series, off the loop and with virtual time held. A slow disk fills the bounded queue of frames and then drops frames;
 a nearly full one is left to the telemetry, which waits in memory until it is on the disk. Log times are the items'
 own, so the same items at the same instants of a virtual clock give the same bytes.
+
+Heat is only justified by what is recorded: `waiting_since_ns` and `folder_lost` are what a guard needs to know.
 """
 
 from __future__ import annotations
@@ -16,25 +18,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from mcap.writer import CompressionType
 
 from drivers.clock import Clock, seconds_ns
 from drivers.interface import Frame, SessionError
 from drivers.lane import Lane
-from stand.hub import Event, Hub, Item
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from stand.hub import Batch, Event, Hub, Item
+from stand.recording.disk import Disk
+from stand.recording.forms import SessionForm
+from stand.recording.homes import Beside, Homes, Kept
+from stand.recording.images import encode_image
 from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.losses import Losses
-from stand.recording.segment import SeriesForm, Topic
-from stand.recording.series import Series
+from stand.recording.losses import DroppedReadings, Losses
+from stand.recording.restarts import restarted_step
 from stand.recording.settings import USUAL, RecordingSettings, SessionInfo
-from stand.recording.sink import sync_folder
-from stand.recording.space import Notice, SpaceWatch
+from stand.recording.space import Notice
+from stand.recording.store import RemoteStore, Store
 from stand.recording.telemetry import TelemetryEncoder
-from stand.recording.writers import ImageWriter, TelemetryWriter
+from stand.recording.waiting import Waiting
+from stand.recording.writers import Fate, ImageWriter, TelemetryWriter
 
-TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it goes on when frames or others fill the disk
 NO_IMAGE = np.empty((0, 0), np.uint8)
+FINISH_WITHIN_S = 2.0  # real seconds that a disk may take for the end of a run that is stopped
+COMPLETE_WITHIN_S = 60.0  # and of one that is complete
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +57,7 @@ class Recorder:
 
     `directory` gets the folders `frames` and `telemetry`; a directory with segments of an earlier run is continued.
     `encode` makes an image message of the settings' encoding, in a thread of its own and in order of the frames; by
-    default each by itself.
+    default each by itself. `disk` is the process that touches the disk; without one this process does.
     """
 
     def __init__(
@@ -65,10 +70,11 @@ class Recorder:
         clock: Clock,
         settings: RecordingSettings = USUAL,
         encode: Callable[[Frame], bytes] | None = None,
+        disk: Disk | None = None,
     ) -> None:
         self.directory = directory
-        self._info = info
-        self._attachments = dict(attachments)
+        self.disk = disk
+        self._form = SessionForm(info.metadata(), dict(attachments), dict(devices), settings)
         self._hub = hub
         self._clock = clock
         self._settings = settings
@@ -79,7 +85,10 @@ class Recorder:
         self._items: list[Item] = []  # telemetry since the last commit
         self._items_taken = 0
         self._losses = Losses()
+        self._dropped = DroppedReadings()
+        self._waiting = Waiting()
         self._notices: deque[Notice] = deque()  # from any thread
+        self._homes = Homes(directory, self._notices.append)
         self._telemetry_failing = False
         self._progress = asyncio.Event()  # set, and replaced, when something has been saved or lost
         self._taking = self._taking_frames = False
@@ -95,55 +104,66 @@ class Recorder:
         """What has been acknowledged since `start`: it is on the disk and stays there."""
         return Saved(self._image_writer.saved, self._telemetry_writer.messages_saved, self._losses.total)
 
+    @property
+    def waiting_since_ns(self) -> int | None:
+        """When the oldest reading, event or frame was published that is not yet durable in this session's own folder;
+        None when nothing is due. A frame that the disk refused waits until frames can be written again."""
+        return self._waiting.since_ns
+
+    @property
+    def folder_lost(self) -> str:
+        """Why the session's folder is not there any more, as a sentence; "" while it is, or is being made anew."""
+        return self._homes.lost
+
+    @property
+    def disk_free_bytes(self) -> int:
+        """As it was found at the last commit; nobody waits for the disk."""
+        return self._space.free_bytes
+
+    def beside(self, file: Beside) -> None:
+        """From now on this file counts as part of the session's folder: `folder_lost` and `refound` know of it."""
+        self._homes.beside.append(file)
+
+    def refound(self) -> None:
+        """An operator has cleared the loss of the folder: go on in it where it is back, else in a new one at its
+        place, with numbers that go on. Returns at once; nothing happens when nothing is lost."""
+        self._homes.refind()
+
     def start(self, earlier: Iterable[Item] = ()) -> None:
         """Make the folders, begin the telemetry and listen to the hub; SessionError when the disk refuses. `earlier`:
         what was published before, in its order, and belongs to the session."""
+        self._take(self._opened(), earlier)
+
+    async def begin(self, earlier: Callable[[], Iterable[Item]]) -> None:
+        """As `start`, off the loop."""
+        lane = Lane("record-begin", self._clock, patient=False)
         try:
-            for name in (FRAMES, TELEMETRY):
-                (self.directory / name).mkdir(parents=True, exist_ok=True)
-            sync_folder(self.directory)
-            sync_folder(self.directory.parent)
-            self._open_series()
+            store = await lane.call(self._opened)
+        finally:
+            lane.close()
+        self._take(store, earlier())
+
+    def _opened(self) -> Store | RemoteStore:
+        form, now_ns, tell = self._form, self._clock.now_ns(), self._notices.append
+        try:
+            if self.disk is not None:
+                return RemoteStore(self.disk, self.directory, form, now_ns, tell)
+            return Store(self.directory, form, now_ns, tell)
         except OSError as error:
             raise SessionError(f"{self.directory}: no session can be recorded here ({error})") from error
-        self._frame_lane = Lane("record-frames", self._clock)
-        self._telemetry_lane = Lane("record-telemetry", self._clock)
+
+    def _take(self, store: Store | RemoteStore, earlier: Iterable[Item]) -> None:
+        self._image_series, self._telemetry_series, self._space = store.frames, store.telemetry, store.space
+        self._image_writer = ImageWriter(store.frames, self._encode, store.space, self._losses)
+        self._telemetry_writer = TelemetryWriter(store.telemetry, self._encoder, store.telemetry_space)
+        self._frame_lane = Lane("record-frames", self._clock, patient=False)
+        self._telemetry_lane = Lane("record-telemetry", self._clock, patient=False)
+        self._begun_ns = self._clock.now_ns()
+        self._frames_kept = self._telemetry_kept = Kept(self._begun_ns, 0)
         self._taking = self._taking_frames = True
         for item in earlier:
             self._receive(item)
         self._hub.subscribe(self._receive)
-
-    def _open_series(self) -> None:
-        settings = self._settings
-        common = (self._info.metadata(), self._attachments, settings.segment_bytes, seconds_ns(settings.segment_s))
-        frames = SeriesForm(
-            FRAMES,
-            (Topic(CAMERA_IMAGE, IMAGE_CLASS[settings.frame_encoding]),),
-            CompressionType.NONE,  # PNG does not shrink further, and raw frames are chosen for speed
-            *common,
-            reserve_bytes=settings.segment_bytes,
-            keep_free_bytes=settings.stop_frames_below_bytes,
-        )
-        telemetry = SeriesForm(
-            TELEMETRY,
-            self._encoder.topics(),
-            CompressionType.ZSTD,
-            *common,
-            reserve_bytes=TELEMETRY_RESERVE_BYTES,
-            merge_chunks=True,
-        )
-        self._image_series = Series(self.directory / FRAMES, frames)
-        self._telemetry_series = Series(self.directory / TELEMETRY, telemetry)
-        space = SpaceWatch(
-            self.directory,
-            settings.stop_frames_below_bytes,
-            settings.alert_below_fraction,
-            lambda: self._image_series.reserved_bytes,
-            self._notices.append,
-        )
-        self._image_writer = ImageWriter(self._image_series, self._encode, space, self._losses)
-        self._telemetry_writer = TelemetryWriter(self._telemetry_series, self._encoder, space)
-        self._telemetry_series.open(self._clock.now_ns())
 
     def _encode_alone(self, frame: Frame) -> bytes:
         return encode_image(frame, self._settings.frame_encoding)
@@ -154,7 +174,8 @@ class Recorder:
             tasks.create_task(self._report_on_ticks())  # by itself: it has to tell of a disk that holds up the others
             tasks.create_task(self._save_telemetry_on_ticks())
             tasks.create_task(self._record_frames())
-            tasks.create_task(self._close_old_frames_on_ticks())
+            tasks.create_task(self._tend_frames_on_ticks())
+            tasks.create_task(self._refound_when_asked())
 
     async def flushed(self) -> None:
         """Return when everything published before the call is on the disk or counted as lost. Only while `run` runs;
@@ -164,29 +185,59 @@ class Recorder:
         while self._taking and (self._image_writer.done < frames or self._telemetry_writer.items_saved < items):
             await self._progress.wait()
 
-    async def finish(self) -> None:
+    async def finish(self, within_s: float | None = None) -> None:
         """Put what still waits on the disk and complete the segments; SessionError when telemetry was not saved or its
-        segment stays unfinished. Items published later are not recorded. It goes on to its end also when the caller is
-        cancelled. May be called twice."""
+        segment stays unfinished, or when the disk has not done all that within so many real seconds (None: whatever it
+        takes): it is then left to itself. Items published later are not recorded. It goes on to its end also when the
+        caller is cancelled. May be called twice."""
         if self._finishing is None:
             if not self._taking:
                 return
             self._finishing = asyncio.ensure_future(self._finish())
         try:
-            await asyncio.shield(self._finishing)
+            await asyncio.wait([self._finishing], timeout=within_s)
         except asyncio.CancelledError:
-            await asyncio.wait([self._finishing])
+            await self._left(within_s)
             raise
+        await self._left()
+        await self._finishing
+
+    async def _left(self, within_s: float | None = 0.0) -> None:
+        """Wait so long for the end of `_finish`, then for nothing any more."""
+        if self._finishing is not None:
+            await asyncio.wait([self._finishing], timeout=within_s)
+            if not self._finishing.done():
+                self._telemetry_lane.abandon()
+                self._frame_lane.abandon()
+                await asyncio.wait([self._finishing])
 
     async def _finish(self) -> None:
-        async with AsyncExitStack() as stack:  # each of these is done, whatever happens to those before it
-            stack.callback(self._telemetry_lane.close)
-            stack.callback(self._frame_lane.close)
-            stack.push_async_callback(self._finish_telemetry)
-            stack.push_async_callback(self._frame_lane.call, self._image_series.finish)
-            while not self._frames.empty():
-                await self._frame_lane.call(self._image_writer.save, self._frames.get_nowait())
-            self._taking_frames = False
+        try:
+            async with AsyncExitStack() as stack:  # each of these is done, whatever happens to those before it
+                stack.callback(self._telemetry_lane.close)
+                stack.callback(self._frame_lane.close)
+                stack.push_async_callback(self._telemetry_lane.call, self._telemetry_series.close)
+                stack.push_async_callback(self._frame_lane.call, self._image_series.close)
+                stack.push_async_callback(self._finish_telemetry)
+                stack.push_async_callback(self._frame_lane.call, self._image_series.finish)
+                await self._finish_frames()
+                self._taking_frames = False
+        except TimeoutError as error:
+            frames, messages = self._frames.qsize(), len(self._items) + self._telemetry_writer.waiting
+            raise SessionError(
+                f"{self.directory}: the disk has not answered in time; the session is unfinished, {frames} frames and "
+                f"{messages} messages waited to be saved; `stand session salvage` completes it when the disk answers"
+            ) from error
+
+    async def _finish_frames(self) -> None:
+        """Those that wait; the first may be one that found its folder gone when the recording was ended."""
+        frame = await self._frame_lane.call(lambda: self._image_writer.homeless)
+        while frame is not None or not self._frames.empty():
+            frame = frame or self._frames.get_nowait()
+            fate, reason = await self._frame_lane.call(self._image_writer.save, frame)
+            if fate is Fate.HOMELESS:
+                self._image_writer.give_up(frame, reason)
+            frame = None
 
     async def _finish_telemetry(self) -> None:
         self._report()
@@ -208,26 +259,49 @@ class Recorder:
         if not self._taking:
             return
         self._encoder.check(item)
+        now_ns = self._clock.now_ns()
+        if isinstance(item, Event) and (step_id := restarted_step(item)):
+            self._losses.supersede(step_id, item.time_ns)
         if isinstance(item, Frame):
             if not self._taking_frames:
                 return
-            self._enqueue(item)
+            self._enqueue(item, now_ns)
             item = replace(item, image=NO_IMAGE)  # the image itself waits in one place only
+        if isinstance(item, Batch) and self._is_full():
+            self._dropped.count(item, self._notices.append)
+            return
         self._items.append(item)
         self._items_taken += 1
+        self._waiting.item_published(now_ns)
 
-    def _enqueue(self, frame: Frame) -> None:
+    def _is_full(self) -> bool:
+        """Whether more waits for the disk than may: readings are the first to go, nothing else is."""
+        return len(self._items) + self._telemetry_writer.waiting >= self._settings.waiting_messages
+
+    def _enqueue(self, frame: Frame, now_ns: int) -> None:
         try:
             self._frames.put_nowait(frame)
         except asyncio.QueueFull:
             self._losses.count(frame, "the disk is too slow")
+            self._waiting.frame_refused(now_ns)
         else:
             self._frames_taken += 1
+            self._waiting.frame_published(now_ns)
 
     async def _record_frames(self) -> None:
         while True:
-            frame = await self._frames.get()
-            await self._frame_lane.call(self._image_writer.save, frame)
+            await self._homes.there.wait()
+            frame = self._image_writer.homeless or await self._frames.get()
+            fate, reason = await self._frame_lane.call(self._image_writer.save, frame)
+            if fate is Fate.HOMELESS:
+                self._homes.follow(FRAMES, reason, self._frames_kept)
+                continue
+            published_ns = self._waiting.frame_done()
+            if fate is Fate.REFUSED:
+                self._waiting.frame_refused(published_ns)
+            elif fate is Fate.SAVED:
+                self._waiting.frames_work()
+                self._frames_kept = Kept(published_ns, self._image_writer.saved)
             self._tell_progress()
 
     async def _save_telemetry_on_ticks(self) -> None:
@@ -237,12 +311,16 @@ class Recorder:
             await self._save_telemetry()
             self._report()  # a disk that is nearly full: each frame until somebody knows of it is lost
 
-    async def _close_old_frames_on_ticks(self) -> None:
-        """A soak is long: its last frames are not left unfinished, nor their reserve taken, until the next ones."""
+    async def _tend_frames_on_ticks(self) -> None:
+        """A soak is long: its last frames are not left unfinished, nor their reserve taken, until the next ones. Nor
+        does anybody take a frame while the disk is thought to refuse them: whether it still does is tried."""
         due_ns = self._clock.now_ns()
         while True:
             due_ns = await self._next_tick(due_ns)
-            await self._frame_lane.call(self._image_series.finish_full, due_ns)
+            failure = await self._frame_lane.call(self._image_writer.tend, due_ns, self._waiting.frames_refused)
+            if failure is None:
+                self._waiting.frames_work()
+            self._homes.follow(FRAMES, failure, self._frames_kept)
 
     async def _report_on_ticks(self) -> None:
         due_ns = self._clock.now_ns()
@@ -255,10 +333,29 @@ class Recorder:
         await self._clock.sleep_until(due_ns)
         return due_ns
 
+    async def _refound_when_asked(self) -> None:
+        """After `refound`: the folders are found or made again, and the loss is an event."""
+        while True:
+            await self._homes.refinding.wait()
+            anew = await self._homes.refound(
+                lambda: self._telemetry_lane.call(self._telemetry_series.refound),
+                lambda: self._frame_lane.call(self._image_series.refound),
+            )
+            if anew:
+                self._notices.append(self._homes.loss(anew, self._begun_ns))
+            await self._save_telemetry()
+            self._report()
+
     async def _save_telemetry(self) -> OSError | None:
         """Commit what was published since the last time and what failed before; the error when the disk refuses."""
         items, self._items = self._items, []
-        failure = await self._telemetry_lane.call(self._telemetry_writer.save, items, self._clock.now_ns())
+        commit, now_ns = self._waiting.items_taken(), self._clock.now_ns()
+        failure = await self._telemetry_lane.call(self._telemetry_writer.save, items, now_ns)
+        if failure is None:
+            self._waiting.items_saved(commit)
+            self._telemetry_kept = Kept(now_ns, self._telemetry_writer.messages_saved)
+            self._dropped.end(self._notices.append)
+        self._homes.follow(TELEMETRY, failure, self._telemetry_kept)
         self._tell_progress()
         if (failure is not None) != self._telemetry_failing:
             self._telemetry_failing = failure is not None
@@ -276,7 +373,8 @@ class Recorder:
                 self._notices.append(Notice("warning", "segment_given_up", series.troubles.popleft()))
         self._notices.extend(Notice("error", "frames_dropped", text) for text in self._losses.take())
         while self._notices:
-            self._hub.publish(Event(self._clock.now_ns(), *self._notices.popleft()))
+            notice = self._notices.popleft()
+            self._hub.publish(Event(self._clock.now_ns(), notice.level, notice.kind, notice.text, notice.data))
 
 
 def _telemetry_notice(failure: OSError | None) -> Notice:

@@ -36,6 +36,7 @@ from stand.recording.layout import (
     UNFINISHED,
     segment_metadata,
 )
+from stand.recording.locks import lock
 from stand.recording.opening import Opening, opening_of, segments_of
 from stand.recording.segment_check import check_segment
 from stand.recording.sink import sync_folder
@@ -98,8 +99,8 @@ def _remove_left_over(copy: Path) -> None:
 def _salvage_number(finished: Path, finished_too: bool) -> Iterator[Salvaged]:
     """The finished segment of a number first: the unfinished one beside it is compared with what it holds."""
     part = finished.with_name(finished.name.replace(FINISHED, UNFINISHED))
-    has_part = part.exists()
-    if finished.exists() and (finished_too or has_part) and not _is_sound(finished):
+    has_part = part.is_file()
+    if finished.is_file() and (finished_too or has_part) and not _is_sound(finished):
         yield _salvage_segment(finished)
     if has_part:
         yield _salvage_segment(part)
@@ -123,13 +124,13 @@ def _refusing(path: Path) -> Generator[None]:
 def _locked(path: Path) -> Generator[int | None]:
     """The file, opened and locked; None when somebody else has it, or has just given it another name."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe of that name is never waited for
     except FileNotFoundError:
         yield None
         return
     try:
         try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(fd)
             is_ours = os.path.samestat(os.fstat(fd), path.stat())
         except (BlockingIOError, FileNotFoundError):
             is_ours = False

@@ -80,6 +80,7 @@ class Segment:
 
     def __init__(self, folder: Path, number: int, form: SeriesForm, time_ns: int) -> None:
         self.begun_ns = time_ns
+        self.number = number
         self._form = form
         self._part = folder / f"{number:04d}{UNFINISHED}"
         self._finished = folder / f"{number:04d}{FINISHED}"

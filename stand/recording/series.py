@@ -5,19 +5,27 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
+from stand.recording.home import Home
+from stand.recording.layout import TEMPORARY
 from stand.recording.segment import Record, Segment, SeriesForm
-from stand.recording.sink import sync_folder
+from stand.recording.sink import CommitSink
 
 
 class Series:
-    """The segments of one folder, one open at a time. Blocking; used from one thread."""
+    """The segments of one folder, one open at a time. Blocking; used from one thread.
+
+    The folder is made when there is none, and never again but by `refound`: when it is removed or renamed, every write
+    raises FolderLost.
+    """
 
     def __init__(self, folder: Path, form: SeriesForm) -> None:
         self._folder = folder
         self._form = form
+        self._home = Home(folder)
+        self._used = -1  # the highest number that a message was committed under; it is never used again
         self._segment: Segment | None = None
         self._failed: Segment | None = None  # given up, but not yet cut back to what was acknowledged
         self.troubles: deque[str] = deque()  # errors that were overcome, as sentences; another thread may take them
@@ -39,30 +47,31 @@ class Series:
         None is begun while the one before still holds a block that was refused: it would be in both.
         """
         if self._segment is None:
+            self._home.check()
             self._let_go()
-            self._folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
-            sync_folder(self._folder.parent)
-            self._segment = Segment(self._folder, next_number(self._folder), self._form, time_ns)
+            number = max(next_number(self._folder), self._used + 1)
+            self._segment = Segment(self._folder, number, self._form, time_ns)
         return self._segment
 
     def commit(self, records: Sequence[Record], time_ns: int) -> None:
         """All of `records` on the disk when this returns, in a new segment when the present one is full or fails;
-        OSError when the new one fails, too. `time_ns` (now) decides whether a segment is old enough to be closed."""
+        OSError when the new one fails, too; FolderLost before anything is written. `time_ns` (now) decides whether a
+        segment is old enough to be closed."""
+        self._home.check()
         self.finish_full(time_ns)
         segment = self.open(time_ns)
         try:
-            segment.commit(records)
-        except OSError as error:
-            self._give_up(segment, error)
-            self._commit_anew(records, time_ns)
+            self._commit(segment, records)
+        except OSError:
+            self._commit(self.open(time_ns), records)
 
-    def _commit_anew(self, records: Sequence[Record], time_ns: int) -> None:
-        segment = self.open(time_ns)
+    def _commit(self, segment: Segment, records: Sequence[Record]) -> None:
         try:
             segment.commit(records)
         except OSError as error:
             self._give_up(segment, error)
             raise
+        self._used = max(self._used, segment.number)
 
     def _give_up(self, segment: Segment, error: OSError) -> None:
         if not segment.is_empty:  # else nothing is left behind that anybody would miss
@@ -76,6 +85,38 @@ class Series:
         if self._failed is not None:
             self._failed.abandon()
             self._failed = None
+
+    def check(self) -> None:
+        """FolderLost when the folder has been removed or renamed; any OSError when it cannot be asked."""
+        self._home.check()
+
+    def probe(self, size_bytes: int, time_ns: int) -> None:
+        """OSError while the disk would refuse a segment, or a block of that size; nothing of it stays."""
+        self._home.check()
+        path = self._folder / f"probe{TEMPORARY}"  # the next salvage removes it when this process is killed meanwhile
+        path.unlink(missing_ok=True)
+        try:
+            with closing(CommitSink(path)) as sink:
+                sink.append([bytes(size_bytes)])
+                segment = self.open(time_ns)
+                if segment.is_empty:
+                    self._segment = None
+                    segment.abandon()
+        finally:
+            path.unlink(missing_ok=True)
+
+    def refound(self) -> bool:
+        """After a FolderLost: whether the folder is back, and writing goes on where it was; else one is made at its
+        place, and the numbers go on. OSError when that cannot be done."""
+        if self._home.refound():
+            return True
+        segment, self._segment = self._segment, None
+        self._close(segment)
+        return False
+
+    def close(self) -> None:
+        """Let go of the folder, after `finish`."""
+        self._home.close()
 
     def finish_full(self, time_ns: int) -> None:
         """Close the open segment when it has its size or age."""

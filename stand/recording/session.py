@@ -46,6 +46,7 @@ from stand.recording.records import (
     read_head,
     telemetry_messages,
 )
+from stand.recording.utc_offsets import UtcOffsets, offsets_of
 
 T = TypeVar("T")
 
@@ -158,6 +159,11 @@ class Session:
         """Every event, in order of time."""
         found = self._decoded(lambda channel: channel.topic == messages.EVENT, event_of)
         return sorted(found, key=attrgetter("time_ns"))
+
+    @cached_property
+    def utc(self) -> UtcOffsets:
+        """From its instants to UTC as the host's system clock had it."""
+        return offsets_of(self.events())
 
     @property
     def frame_count(self) -> int:

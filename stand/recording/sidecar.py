@@ -13,6 +13,7 @@ from stand.recording.instants import utc_text
 from stand.recording.session import RecordedImage, Session
 from stand.recording.tables import Cell, Column
 from stand.recording.topics import recorded_devices
+from stand.recording.utc_offsets import UtcOffsets
 
 SIDECAR_COLUMNS = (
     Column("file", "text"),
@@ -29,15 +30,15 @@ SIDECAR_COLUMNS = (
 )
 
 
-def frame_facts(file: str, image: RecordedImage) -> tuple[Cell, ...]:
+def frame_facts(file: str, image: RecordedImage, utc: UtcOffsets) -> tuple[Cell, ...]:
     """The cells of SIDECAR_COLUMNS. Of a frame whose description is lost, numbers that are not known are NaN and the
     rest is empty; its block id is then the 32 bits that were recorded with the image."""
-    time_ns, meta = image.time_ns, image.meta
+    time_ns, utc_ns, meta = image.time_ns, utc.utc_ns(image.time_ns), image.meta
     if meta is None:
-        return (file, time_ns, time_ns, math.nan, math.nan, math.nan, None, image.sequence, None, None, None)
+        return (file, utc_ns, time_ns, math.nan, math.nan, math.nan, None, image.sequence, None, None, None)
     return (
         file,
-        time_ns,
+        utc_ns,
         time_ns,
         meta.camera_degC,
         meta.exposure_s,

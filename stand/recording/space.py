@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
@@ -22,12 +23,14 @@ def disk_space(folder: Path) -> Space:
     return Space(found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize)
 
 
-class Notice(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Notice:
     """An event that has no time yet; see stand.hub.Event."""
 
     level: str
     kind: str
     text: str
+    data: Mapping[str, object] = field(default_factory=dict[str, object])
 
 
 class SpaceWatch:
@@ -54,6 +57,7 @@ class SpaceWatch:
         self._lock = Lock()
         self._alerted = False
         self.frames_stopped = False
+        self.free_bytes = 0  # when it was looked at last
         self.stop_reason = f"less than {stop_below_bytes / 1e9:.1f} GB free on the disk"
 
     def check(self) -> None:
@@ -64,6 +68,7 @@ class SpaceWatch:
                 space = disk_space(self._folder)
             except OSError:
                 return
+            self.free_bytes = space.free_bytes
             self._judge(space.free_bytes + reserved_bytes, space.total_bytes)
 
     def _judge(self, free_bytes: int, total_bytes: int) -> None:

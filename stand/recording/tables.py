@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -16,6 +17,8 @@ Cell = int | float | str | None
 
 # Rows of a Parquet row group: what is held in memory per table.
 GROUP_ROWS = 8192
+
+_FORMULA = ("=", "+", "-", "@")
 
 
 class Column(NamedTuple):
@@ -40,7 +43,7 @@ class Table(Protocol):
 
 class CsvTable:
     """RFC 4180 in UTF-8 with a header line. A float is the shortest text that reads back as the same float, NaN is
-    `nan`; instants are ISO 8601."""
+    `nan`; instants are ISO 8601. Texts are such as no spreadsheet takes for a formula (`plain_text`)."""
 
     def __init__(self, path: Path, columns: Sequence[Column]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
@@ -53,11 +56,24 @@ class CsvTable:
         cells = list(row)
         for index in self._instants:
             cells[index] = utc_text(int(row[index] or 0))
-        self._writer.writerow(cells)
+        self._writer.writerow([plain_text(cell) if isinstance(cell, str) else cell for cell in cells])
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def plain_text(text: str) -> str:
+    """The text of a cell with an apostrophe before what a spreadsheet would take for a formula (= + - @ at its
+    beginning, spaces aside), and without control characters (tab and line feed become spaces): a session may come from
+    anybody."""
+    plain = "".join(" " if char in "\t\n\r" else char for char in text if char in "\t\n\r" or not _is_control(char))
+    return f"'{plain}" if plain.lstrip().startswith(_FORMULA) else plain
+
+
+def _is_control(char: str) -> bool:
+    """Whether it is not shown, or changes how what follows is shown: such as ESC, or one that turns the direction."""
+    return unicodedata.category(char) in ("Cc", "Cf", "Cs")
 
 
 class ParquetTable:

@@ -1,7 +1,8 @@
 """A part of a recorded session as a session of its own.
 
-Messages are copied as they are, images undecoded, in the order of the recording. Two things are added at the start, so
-that the part stands alone: an event that says where it was cut from, and the mark of the step that was under way.
+Messages are copied as they are, images undecoded, in the order of the recording. What is added at the start makes
+the part stand alone: an event that says where it was cut from, the mark of the step that was under way, and the offset
+of the stand's clock to UTC when there was one.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from stand.hub import Event, StepMark, StepState
 from stand.recording import messages
 from stand.recording.folder import new_folder
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
-from stand.recording.instants import utc_text
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.recorder import RecordingSettings
 from stand.recording.records import FramePlace, frame_places, read_frame, telemetry_messages
@@ -27,6 +27,7 @@ from stand.recording.segment import Record, SeriesForm, Topic
 from stand.recording.series import Series
 from stand.recording.session import Session
 from stand.recording.topics import recorded_topics
+from stand.recording.utc_offsets import offset_event
 
 TRIMMED = "session.trimmed"  # kind of the event that says where a session was cut from
 # Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
@@ -38,8 +39,9 @@ def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     """What was recorded in [begin_ns, end_ns) as the new session `out`, which must not exist; returns `out`.
 
     Metadata, attachments, channels, sequence numbers, instants and order stay. The first messages are an event of kind
-    TRIMMED and, when a step had started and not ended before `begin_ns`, its mark again, both at the instant of the
-    first message kept: a frame's step can be looked up, and nothing lies before the part. SessionError when nothing
+    TRIMMED, when a step had started and not ended before `begin_ns` its mark again, and when UTC was not the stand's
+    time an event that says so, all at the instant of the first message kept: a frame's step can be looked up, and
+    nothing lies before the part. SessionError when nothing
     was recorded in the range, or when reading or writing fails; `out` then does not appear.
     """
     places = [place for place in _places(session) if begin_ns <= place.time_ns < end_ns]
@@ -47,7 +49,8 @@ def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     first = next(kept, None)
     if first is None and not places:
         raise SessionError(
-            f"{session.path}: has nothing from {utc_text(begin_ns)} to {utc_text(end_ns)}; {_range(session)}"
+            f"{session.path}: has nothing from {session.utc.utc_text(begin_ns)} to {session.utc.utc_text(end_ns)}; "
+            f"{_range(session)}"
         )
     first_ns = first.time_ns if first is not None else places[0].time_ns
     telemetry = chain(_opening(session, first_ns, begin_ns, end_ns), [] if first is None else [first], kept)
@@ -75,21 +78,25 @@ def _kept(session: Session, begin_ns: int, end_ns: int) -> Iterator[Record]:
 
 def _range(session: Session) -> str:
     times_ns = [record.time_ns for record in _telemetry(session)] + [place.time_ns for place in _places(session)]
-    return f"it goes from {utc_text(min(times_ns))} to {utc_text(max(times_ns))}" if times_ns else "it is empty"
+    if not times_ns:
+        return "it is empty"
+    return f"it goes from {session.utc.utc_text(min(times_ns))} to {session.utc.utc_text(max(times_ns))}"
 
 
 def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[Record]:
     """Where the part comes from, and the mark of the step under way."""
-    name = session.metadata.get("session_id", session.path.name)
-    text = f"trimmed from session {name}: {utc_text(begin_ns)} up to {utc_text(end_ns)}, the end not included"
+    name, utc = session.metadata.get("session_id", session.path.name), session.utc
+    text = f"trimmed from session {name}: {utc.utc_text(begin_ns)} up to {utc.utc_text(end_ns)}, the end not included"
     mark = _step_under_way(session, begin_ns)
     if mark is not None:
-        text += f"; the mark of step {mark.step_id}, started {utc_text(mark.time_ns)}, is repeated at the start"
+        text += f"; the mark of step {mark.step_id}, started {utc.utc_text(mark.time_ns)}, is repeated at the start"
     event = Event(first_ns, "info", TRIMMED, text)
     yield Record(messages.EVENT, first_ns, messages.encode_event(event))
     yield Record(messages.LOG, first_ns, messages.encode_log(event))
     if mark is not None:
         yield Record(messages.STEP, first_ns, messages.encode_step(mark))
+    if offset_ns := utc.at(first_ns):
+        yield Record(messages.EVENT, first_ns, messages.encode_event(offset_event(first_ns, offset_ns)))
 
 
 def _step_under_way(session: Session, begin_ns: int) -> StepMark | None:

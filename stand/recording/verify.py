@@ -23,7 +23,6 @@ from stand.recording.contents import RUN_END, Contents, FrameKey
 from stand.recording.damage import DAMAGE
 from stand.recording.gaps import FRAMES_DROPPED, silences, told_blocks
 from stand.recording.images import CAMERA_IMAGE
-from stand.recording.instants import date_time
 from stand.recording.inventory import SegmentFile, State, inventory
 from stand.recording.layout import (
     FINISHED,
@@ -37,6 +36,7 @@ from stand.recording.layout import (
 from stand.recording.records import Message
 from stand.recording.salvage import SALVAGE_METADATA
 from stand.recording.segment_check import Damage, SegmentCheck, check_segment
+from stand.recording.utc_offsets import UtcOffsets, offsets_of
 
 # Between the middle of a frame's exposure and its description being on the disk, or the frame itself.
 TORN_NS = 5 * NS_PER_S
@@ -280,17 +280,17 @@ def _frames_against_descriptions(read: _Read) -> Iterator[Finding]:
     """Every image has its description in the telemetry and the other way round; what was not read may have it."""
     described = Counter(key for key, _ in read.contents.metas)
     block_ids = {key: meta.block_id for key, meta in read.contents.metas}
-    told = told_blocks(read.contents.events)
+    told, utc = told_blocks(read.contents.events), offsets_of(read.contents.events)
     bare = _without_a_reason(read.images - described, TELEMETRY, read)
     gone = _without_a_reason(described - read.images, FRAMES, read)
     bare_torn = [key for key in bare if read.is_torn_at(TELEMETRY, key[0])]
     gone_told = [key for key in gone if any(block_ids[key] in blocks for blocks in told)]
     gone_torn = [key for key in gone if key not in gone_told and read.is_torn_at(FRAMES, key[0])]
-    yield from _frames(_error, set(bare) - {*bare_torn}, "without a description in the telemetry")
-    yield from _frames(_error, set(gone) - {*gone_told, *gone_torn}, "missing, though described in the telemetry")
-    yield from _frames(_note, gone_told, "described but lost by the recorder, as its events say")
-    yield from _frames(_note, bare_torn, "without a description, which was lost when the recorder was killed")
-    yield from _frames(_note, gone_torn, "described but lost when the recorder was killed")
+    yield from _frames(_error, set(bare) - {*bare_torn}, "without a description in the telemetry", utc)
+    yield from _frames(_error, set(gone) - {*gone_told, *gone_torn}, "missing, though described in the telemetry", utc)
+    yield from _frames(_note, gone_told, "described but lost by the recorder, as its events say", utc)
+    yield from _frames(_note, bare_torn, "without a description, which was lost when the recorder was killed", utc)
+    yield from _frames(_note, gone_torn, "described but lost when the recorder was killed", utc)
 
 
 def _without_a_reason(keys: Iterable[FrameKey], series: str, read: _Read) -> list[FrameKey]:
@@ -303,24 +303,27 @@ def _without_a_reason(keys: Iterable[FrameKey], series: str, read: _Read) -> lis
     ]
 
 
-def _frames(kind: Callable[[str], Finding], keys: Collection[FrameKey], what: str) -> Iterator[Finding]:
+def _frames(
+    kind: Callable[[str], Finding], keys: Collection[FrameKey], what: str, utc: UtcOffsets
+) -> Iterator[Finding]:
     """One finding for all frames of a kind."""
     if keys:
         times_ns, blocks = sorted(time_ns for time_ns, _ in keys), sorted(block for _, block in keys)
         if len(keys) == 1:
-            yield kind(f"1 frame is {what}: block {blocks[0]}, {date_time(times_ns[0])} UTC")
+            yield kind(f"1 frame is {what}: block {blocks[0]}, {utc.date_time(times_ns[0])} UTC")
             return
         yield kind(
             f"{len(keys)} frames are {what}: blocks {blocks[0]} to {blocks[-1]}, "
-            f"{date_time(times_ns[0])} to {date_time(times_ns[-1])} UTC"
+            f"{utc.date_time(times_ns[0])} to {utc.date_time(times_ns[-1])} UTC"
         )
 
 
 def _frames_lost(contents: Contents) -> Iterator[Finding]:
     """What the recorder, and what camera and wire lost, as recorded."""
+    utc = offsets_of(contents.events)
     for event in contents.events:
         if event.kind == FRAMES_DROPPED:
-            yield _note(f"{date_time(event.time_ns)} UTC: {event.text}")
+            yield _note(f"{utc.date_time(event.time_ns)} UTC: {event.text}")
     dropped: Counter[str] = Counter()
     for _, meta in contents.metas:
         dropped[meta.step_id] += meta.dropped
@@ -332,5 +335,6 @@ def _frames_lost(contents: Contents) -> Iterator[Finding]:
 
 
 def _silences(contents: Contents) -> Iterator[Finding]:
+    utc = offsets_of(contents.events)
     for silence in silences({name: channel.sorted_times_ns() for name, channel in contents.channels.items()}):
-        yield _note(str(silence))
+        yield _note(silence.text(utc))

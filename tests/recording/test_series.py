@@ -1,15 +1,19 @@
 """Segments on real disks: what a telemetry segment looks like when it is finished, and what becomes of a failed one."""
 
+import fcntl
 import os
 import random
+import shutil
 from contextlib import suppress
 
 import pytest
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 
+from stand.recording.home import FolderLost
 from stand.recording.layout import segment_metadata
 from stand.recording.messages import CLASSES, EVENT, LOG
 from stand.recording.segment import Record, SeriesForm, Topic
@@ -163,16 +167,75 @@ def test_no_next_segment_is_begun_while_a_refused_block_may_still_be_in_the_last
         assert [text.startswith("a segment of telemetry was given up") for text in series.troubles] == [True]
 
 
-def test_a_folder_that_was_removed_is_made_again(tmp_path):
+def test_a_folder_that_was_removed_is_made_anew_only_when_told_and_its_numbers_go_on(tmp_path):
     folder = tmp_path / "s"
-    folder.mkdir()
+    series = Series(folder, form())
+    for commit in range(2):
+        series.commit(records(commit), 0)
+        series.finish()
+    shutil.rmtree(folder)
+    for _ in range(2):
+        with pytest.raises(FolderLost, match="was removed while it was recorded into"):
+            series.commit(records(2), 0)
+        assert not folder.exists()
+    assert not series.refound()
+    series.commit(records(2), 0)
+    assert series.finish()
+    assert [path.name for path in folder.iterdir()] == ["0002.mcap"]
+    assert messages(folder / "0002.mcap") == records(2)
+
+
+def test_a_folder_that_was_renamed_is_written_into_again_when_it_is_back(tmp_path):
+    folder, other = tmp_path / "s", tmp_path / "other"
     series = Series(folder, form())
     series.commit(records(0), 0)
-    (folder / "0000.mcap.part").unlink()
+    folder.rename(other)
+    with pytest.raises(FolderLost, match=f"was renamed while it was recorded into: it is {other} now"):
+        series.commit(records(1), 0)
+    folder.mkdir()  # of the same name, and not the same
+    with pytest.raises(FolderLost):
+        series.commit(records(1), 0)
     folder.rmdir()
+    other.rename(folder)
+    assert series.refound()
     series.commit(records(1), 0)
     assert series.finish()
-    assert messages(folder / "0000.mcap") == records(1)
+    assert messages(folder / "0000.mcap") == records(0) + records(1)
+
+
+def test_a_new_folder_leaves_the_renamed_one_to_a_salvage(tmp_path):
+    """What was being written in the old one is unlocked, and whole up to the last commit."""
+    folder, other = tmp_path / "s", tmp_path / "other"
+    series = Series(folder, form(reserve_bytes=1_000_000))
+    series.commit(records(0), 0)
+    folder.rename(other)
+    assert not series.refound()
+    series.commit(records(1), 0)
+    assert series.finish()
+    assert [path.name for path in folder.iterdir()] == ["0001.mcap"]
+    with (other / "0000.mcap.part").open("rb") as part:
+        fcntl.flock(part, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    found = []
+    with suppress(EndOfFile):  # it was not finished
+        collect_messages(other / "0000.mcap.part", found)
+    assert found == records(0)
+
+
+def test_a_probe_tells_what_the_disk_would_do_and_leaves_nothing(tmp_path, limited):
+    series = Series(tmp_path / "s", form())
+    series.probe(50_000, 0)
+    limited(40_000)
+    with pytest.raises(OSError, match="too large"):
+        series.probe(50_000, 0)
+    limited()
+    assert list((tmp_path / "s").iterdir()) == []
+    series.commit(records(0), 0)
+    series.probe(50_000, 0)
+    assert series.finish()
+    assert [path.name for path in (tmp_path / "s").iterdir()] == ["0000.mcap"]
+    (tmp_path / "s").rename(tmp_path / "t")
+    with pytest.raises(FolderLost):
+        series.probe(1, 0)
 
 
 def test_a_segment_whose_name_is_taken_by_a_folder_stays_unfinished_and_whole(tmp_path):

@@ -225,7 +225,7 @@ def segment_of_another_session(directory):
         (magic_only, "ends in the middle"),
         (cut_short, "ends in the middle"),
         (foreign_mcap, "not a segment of a thermostand session"),
-        (folder_in_place_of_a_file, "damaged or not readable"),
+        (folder_in_place_of_a_file, "is no file; no session has a folder"),
         (segment_of_another_session, "belongs to another session"),
     ],
 )
