@@ -6,20 +6,29 @@ climate chambers: that holds the air steady, where cycling at full stroke would 
 regulator heats hard against it.
 
 What it did last is kept in a small file, so that a daemon that restarts, or crashes again and again, spares it as one
-that goes on: `restored` and `keep`.
+that goes on: `restored` and `keep`. The file counts in the host's boot time and names the boot, so that a system clock
+that is stepped between two daemons neither shortens nor lengthens the rest. In virtual time, which has no boot, it
+counts in instants of the stand's clock.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
-from dataclasses import asdict, dataclass, replace
+import threading
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from drivers.clock import seconds_ns
+from drivers.clock import Boot, seconds_ns
 from stand.recording.sink import sync_folder
+
+# Calls of `keep`, and of which of them the file at a path is.
+_calls = itertools.count(1)
+_placed: dict[Path, int] = {}
+_placing = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,18 +71,25 @@ def decide(
 
 
 class _Kept(BaseModel):
-    """The file's content."""
+    """The file's content. boot_id: since_ns and starts_ns are boot time of that start of the host; without it (virtual
+    time, and files of before 2026-11-22) they are instants of the stand's clock."""
 
     model_config = ConfigDict(strict=True)
 
     running: bool
     since_ns: int
     starts_ns: list[int]
+    boot_id: str | None = None
+
+    def counts_in(self, boot: Boot | None) -> bool:
+        """Whether its times can be understood now."""
+        return self.boot_id is None if boot is None else boot.id != "" and self.boot_id == boot.id
 
 
-def restored(path: Path | None, now_ns: int) -> CompressorState:
+def restored(path: Path | None, now_ns: int, boot: Boot | None) -> CompressorState:
     """What `path` keeps, for a compressor that is off now. When it was switched off is unknown, and so taken for just
-    now, when the file is missing or damaged, ends with a running compressor, or tells of the future."""
+    now, when the file is missing or damaged, is of another boot, ends with a running compressor, or tells of the
+    future. Starts of another boot are forgotten."""
     unknown = CompressorState(running=False, since_ns=now_ns)
     if path is None:
         return unknown
@@ -81,20 +97,40 @@ def restored(path: Path | None, now_ns: int) -> CompressorState:
         kept = _Kept.model_validate_json(path.read_bytes())
     except (OSError, ValidationError):
         return unknown
-    starts_ns = tuple(start_ns for start_ns in kept.starts_ns if start_ns <= now_ns)
-    is_known = not kept.running and kept.since_ns <= now_ns
-    return CompressorState(False, kept.since_ns if is_known else now_ns, starts_ns)
+    if not kept.counts_in(boot):
+        return unknown
+    began_ns = 0 if boot is None else boot.began_ns
+    starts_ns = tuple(start_ns + began_ns for start_ns in kept.starts_ns if start_ns + began_ns <= now_ns)
+    since_ns = kept.since_ns + began_ns
+    return CompressorState(False, now_ns if kept.running or since_ns > now_ns else since_ns, starts_ns)
 
 
-def keep(path: Path | None, state: CompressorState) -> None:
-    """Write `state` to `path`, whole or not at all; it blocks for the disk. Raises OSError."""
+def keep(path: Path | None, state: CompressorState, boot: Boot | None) -> None:
+    """Write `state` to `path`, whole or not at all; it blocks for the disk. Raises OSError.
+
+    Several threads may keep at once: each has a temporary file of its own, and the state of the latest call stays.
+    """
     if path is None:
         return
+    number = next(_calls)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
-        json.dump(asdict(state), file)
+    part = path.with_name(f".{path.name}.{os.getpid()}-{number}.part")
+    try:
+        _write(part, state, boot)
+        with _placing:
+            if number > _placed.get(path, 0):
+                part.replace(path)
+                _placed[path] = number
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def _write(path: Path, state: CompressorState, boot: Boot | None) -> None:
+    began_ns = 0 if boot is None else boot.began_ns
+    starts_ns = [start_ns - began_ns for start_ns in state.starts_ns]
+    kept = {"running": state.running, "since_ns": state.since_ns - began_ns, "starts_ns": starts_ns}
+    with path.open("w", encoding="utf-8") as file:
+        json.dump(kept if boot is None else {**kept, "boot_id": boot.id}, file)
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)
-    sync_folder(path.parent)

@@ -7,6 +7,14 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from drivers.documents import Document
+from stand.guarding.config_looks import (
+    CameraFeelsConfig,
+    FirstHeatConfig,
+    FrozenConfig,
+    GraniteFeelsConfig,
+    HeatFeltConfig,
+    NeededOutputConfig,
+)
 
 
 class HeatingConfig(Document):
@@ -67,8 +75,12 @@ class GuardConfig(Document):
     """When the guard makes the stand safe. The upper bounds are what the chamber survives: no file may lift them.
 
     keys_s: how long the unit and we may differ about running, permits and the set-point. flap_open_s: how long the flap
-    may be open outside captures, flap_capture_s in all. disk_low_s: how long the recorder may refuse frames. notify:
-    a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may take.
+    may be open outside captures, flap_capture_s in all. disk_low_s: how long the recorder may refuse frames.
+    pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
+    hours. notify: a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may
+    take. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
+    safe_limit_s: how long, at the end of a run, it is tried to have every actuator confirm that it is safe.
+    heat_max_Wh_per_h: within any hour; good nights took up to 900.
     """
 
     period_s: float = Field(default=1.0, gt=0, le=10)
@@ -82,12 +94,22 @@ class GuardConfig(Document):
     heater_off: HeaterOffConfig = HeaterOffConfig()
     cooling: CoolingConfig = CoolingConfig()
     sensors: SensorsConfig = SensorsConfig()
+    heat_max_Wh_per_h: float = Field(default=1400.0, gt=0, le=20_000)
+    heat_felt: HeatFeltConfig = HeatFeltConfig()
+    granite_feels: GraniteFeelsConfig = GraniteFeelsConfig()
+    camera_feels: CameraFeelsConfig = CameraFeelsConfig()
+    needed_output: NeededOutputConfig = NeededOutputConfig()
+    frozen: FrozenConfig = FrozenConfig()
+    first_heat: FirstHeatConfig = FirstHeatConfig()
     keys_s: float = Field(default=30.0, ge=1, le=600)
     flap_open_s: float = Field(default=300.0, gt=0, le=36000)
     flap_capture_s: float = Field(default=2700.0, gt=0, le=36000)
     disk_low_s: float = Field(default=900.0, ge=0, le=36000)
     notify: tuple[Annotated[str, Field(min_length=1)], ...] = Field(default=(), max_length=100)
     notify_limit_s: float = Field(default=10.0, gt=0, le=60)
+    accept: tuple[str, ...] = ()
+    pause_limit_h: float = Field(default=12.0, gt=0, le=24)
+    safe_limit_s: float = Field(default=600.0, ge=1, le=3600)
 
     @model_validator(mode="after")
     def _renewed_in_time(self) -> Self:

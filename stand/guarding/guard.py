@@ -1,4 +1,8 @@
-"""Watches the rules; while they hold it keeps heat and cold permitted, and when one objects it makes the stand safe."""
+"""Watches the rules, and waits for nothing but the time: no disk, no bus, no client.
+
+Each look judges the latest readings. While all is well it allows the permits to be renewed (stand.guarding.keeper does
+that); when a rule objects it latches the stand and demands that it is made safe (stand.guarding.safety does that).
+"""
 
 from __future__ import annotations
 
@@ -7,53 +11,68 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.clock import NS_PER_S, Clock, seconds_ns
-from drivers.interface import DeviceError
 from stand.guarding.interlocks import Fault, Watch
 from stand.guarding.notify import Notifier
+from stand.guarding.safety import Safety
 from stand.hub import Event, Hub
-from stand.stand import Stand
 
-_SAFE_AGAIN_S = 60.0  # between tries, while it is not confirmed: a jammed flap's motor must not be worn
+_LATE_PERIODS = 2
+_STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stopped is read within this after it goes on
+_ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more often needs somebody to look
 
 
 @dataclass
 class Guard:
-    """Every `period_s` the rules, every `renew_s` the permits.
+    """Every `period_s` the rules.
 
-    On a fault, in this order: `stop(fault)` latches the stand and cancels the run where it waits, or `hold(fault)`
-    latches it and lets the run wait; the trip is recorded, the actuators are made safe, somebody is told. A hold stays
-    until `clear`; only a fault that aborts acts meanwhile, and what is not confirmed safe is tried again. Without a
-    `hold` every trip aborts. A permit that cannot be renewed is not a fault by itself: the relay then drops, which is
-    its safe state, and the event says so. A guard that fails aborts.
+    On a fault `stop(fault)` ends the run, or `hold(fault)` lets it wait; the trip is recorded, the stand is made safe,
+    somebody is told. A hold stays until `clear`, but for one that ends by itself: `release()` is then called when no
+    rule objects any more and the stand has confirmed that it is safe, at most three times an hour. Without a `hold`
+    every trip aborts. A guard that fails aborts.
+
+    A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
+    wait for a GOOD reading of each of `vital`, the channels without which nobody may heat, taken since.
     """
 
-    stand: Stand
+    safety: Safety
     watches: tuple[Watch, ...]
     hub: Hub
     clock: Clock
     period_s: float
-    renew_s: float
     stop: Callable[[Fault], None]
     hold: Callable[[Fault], None] | None = None
+    release: Callable[[], None] | None = None
+    cut_camera: Callable[[], None] | None = None
     notifier: Notifier | None = None
+    vital: tuple[str, ...] = ()
     held: Fault | None = None  # why the run waits
+    _ended: bool = False
+    _looked_ns: int | None = None
+    _fresh_after_ns: int = 0
+    _endings_ns: list[int] = field(default_factory=list[int])
     _warned: set[int] = field(default_factory=set[int])  # watches whose warning stands
-    _to_make_safe: bool = False  # the hold is new
-    _made_safe_ns: int = 0
+    _telling: set[asyncio.Task[None]] = field(default_factory=set[asyncio.Task[None]])
 
-    async def check(self) -> bool:
-        """Whether the guard goes on; False when the run was aborted and the stand has been made safe."""
+    def look(self) -> bool:
+        """Whether the guard goes on; False when the run is being aborted."""
+        self._note_time()
         faults = self._faults()
         fault = next((each for each in faults if each.action == "abort" or self.hold is None), None)
         if fault is not None:
-            self.stop(fault)
-            await self._make_safe(fault)
+            self._abort(fault)
             return False
-        if faults and self.held is None:
-            self._hold(faults[0])
-        if self.held is not None:
-            await self._keep_safe(self.held)
+        self._follow_hold(faults)
         return True
+
+    def may_permit(self) -> bool:
+        """Whether heat and cold may be permitted for another while: the guard looks, finds all well, and has fresh
+        readings."""
+        if self._ended or self.held is not None or self._looked_ns is None:
+            return False
+        if self.clock.now_ns() - self._looked_ns > _LATE_PERIODS * seconds_ns(self.period_s):
+            return False
+        good_ns = [self.hub.last_good_ns(channel) for channel in self.vital]
+        return all(time_ns is not None and time_ns >= self._fresh_after_ns for time_ns in good_ns)
 
     def clear(self) -> Fault | None:
         """An operator has looked: the hold, which is returned, is forgotten, and every rule has its grace time anew.
@@ -62,45 +81,79 @@ class Guard:
         fault, self.held = self.held, None
         for watch in self.watches:
             watch.since_ns = None
-        if fault is not None and (still := self._faults()):
-            self._hold(still[0])
+        if fault is not None:
+            self._follow_hold(self._faults())
         return fault
 
     async def run(self) -> None:
         """Watch until cancelled or aborted."""
         self._tell_deafness()
         try:
-            await self._watch()
+            due_ns = self.clock.now_ns()
+            while self.look():
+                due_ns = max(due_ns + seconds_ns(self.period_s), self.clock.now_ns())
+                await self.clock.sleep_until(due_ns)
         except Exception as error:
-            fault = Fault("guard_failed", f"the guard failed ({type(error).__name__}: {error})")
-            self.stop(fault)
-            await self._make_safe(fault)
+            self._abort(Fault("guard_failed", f"the guard failed ({type(error).__name__}: {error})"))
             raise
 
-    async def _watch(self) -> None:
-        renew_ns = due_ns = self.clock.now_ns()
-        while await self.check():
-            if self.clock.now_ns() >= renew_ns and self.held is None:
-                renew_ns = self.clock.now_ns() + seconds_ns(self.renew_s)
-                await self._renew()
-            due_ns = max(due_ns + seconds_ns(self.period_s), self.clock.now_ns())
-            await self.clock.sleep_until(due_ns)
-            self._tell_lateness(due_ns)
+    async def told(self) -> None:
+        """Return when everybody who is being told of a trip has been, or could not be."""
+        while self._telling:
+            await asyncio.wait(self._telling)
 
-    def _hold(self, fault: Fault) -> None:
-        """From now on the run waits; the next look makes safe. Nothing without a way to hold."""
-        if self.hold is not None:
-            self.held, self._to_make_safe = fault, True
-            self.hold(fault)
+    def _abort(self, fault: Fault) -> None:
+        self._ended = True
+        self.stop(fault)
+        self._make_safe(fault)
 
-    async def _keep_safe(self, fault: Fault) -> None:
-        """Make safe at the begin of a hold, and while that is not confirmed again and again."""
-        if self._to_make_safe:
-            self._to_make_safe, self._made_safe_ns = False, self.clock.now_ns()
-            await self._make_safe(fault)
-        elif self.stand.unconfirmed and self.clock.now_ns() >= self._made_safe_ns + seconds_ns(_SAFE_AGAIN_S):
-            self._made_safe_ns = self.clock.now_ns()
-            await self.stand.make_safe()
+    def _follow_hold(self, faults: list[Fault]) -> None:
+        """Begin a hold, replace one that would end by itself by one that does not, or end it."""
+        lasting = next((fault for fault in faults if not fault.ends_itself), None)
+        if self.held is None and faults:
+            self._begin_hold(lasting or faults[0])
+        elif self.held is not None and self.held.ends_itself:
+            if lasting is not None:
+                self._begin_hold(lasting)
+            elif not faults and self.safety.is_confirmed:
+                self._end_hold(self.held)
+
+    def _begin_hold(self, fault: Fault) -> None:
+        if self.hold is None:
+            return
+        self.held = fault
+        self.hold(fault)
+        self._make_safe(fault)
+
+    def _end_hold(self, fault: Fault) -> None:
+        now_ns = self.clock.now_ns()
+        self._endings_ns = [time_ns for time_ns in self._endings_ns if now_ns - time_ns < seconds_ns(3600)]
+        data: dict[str, object] = {"rule": fault.rule, "endings_in_last_h": len(self._endings_ns)}
+        if self.release is None or len(self._endings_ns) >= _ENDINGS_PER_H:
+            text = (
+                f"{fault.rule} has held the run more than {_ENDINGS_PER_H} times within an hour; `stand clear` goes on"
+            )
+            self.held = Fault(fault.rule, f"{fault.text}; {text}", fault.action)
+            self.hub.publish(Event(now_ns, "error", "hold_stays", text, data))
+            self._notify(text)
+            return
+        self._endings_ns.append(now_ns)
+        self.held = None
+        text = f"{fault.rule} is over; the run goes on"
+        self.hub.publish(Event(now_ns, "warning", "hold_ended", text, data))
+        self.release()
+
+    def _note_time(self) -> None:
+        """Lateness counts from the last look: whatever kept the guard from it counts, a stopped process as well."""
+        now_ns = self.clock.now_ns()
+        looked_ns, self._looked_ns = self._looked_ns, now_ns
+        if looked_ns is None or now_ns - looked_ns <= _LATE_PERIODS * seconds_ns(self.period_s):
+            return
+        self._fresh_after_ns = now_ns + seconds_ns(_STRADDLING_S)
+        gap_s = (now_ns - looked_ns) / NS_PER_S
+        text = f"the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up"
+        data: dict[str, object] = {"gap_s": gap_s, "from_ns": looked_ns, "to_ns": now_ns}
+        self.hub.publish(Event(now_ns, "warning", "guard_late", text, data))
 
     def _faults(self) -> list[Fault]:
         """Those that trip; those that only warn are published when they begin. Every rule is asked: some remember."""
@@ -115,28 +168,31 @@ class Guard:
                 self._warned.discard(index)
             elif index not in self._warned:
                 self._warned.add(index)
-                self.hub.publish(Event(now_ns, "warning", f"guard.{fault.rule}", fault.text))
+                data: dict[str, object] = {"rule": fault.rule, "action": "warn"}
+                self.hub.publish(Event(now_ns, "warning", f"guard.{fault.rule}", fault.text, data))
         return faults
 
-    async def _make_safe(self, fault: Fault) -> None:
-        self.hub.publish(Event(self.clock.now_ns(), "error", f"guard.{fault.rule}", fault.text))
-        try:
-            await self.stand.make_safe()
-        finally:  # also when the run that waits for this look has just been cancelled
-            unsafe = self.stand.unconfirmed
-            await self._notify(f"{fault.text}; NOT SAFE: {'; '.join(unsafe)}" if unsafe else fault.text)
+    def _make_safe(self, fault: Fault) -> None:
+        """Demanded before anybody is told: who listens may fail."""
+        self.safety.demand()
+        if fault.cuts_camera and self.cut_camera is not None:
+            self.cut_camera()
+        data: dict[str, object] = {"rule": fault.rule, "action": fault.action}
+        self.hub.publish(Event(self.clock.now_ns(), "error", f"guard.{fault.rule}", fault.text, data))
+        self._notify(fault.text)
 
-    async def _notify(self, text: str) -> None:
-        """Tell, to its end also when the guard is cancelled meanwhile: an aborted run does that at once."""
-        telling = asyncio.ensure_future(self._tell(text))
-        try:
-            await asyncio.shield(telling)
-        except asyncio.CancelledError:
-            await asyncio.wait([telling])
-            raise
+    def _notify(self, text: str) -> None:
+        if self.notifier is None:
+            return
+        task = asyncio.create_task(self._tell(text, self.notifier))
+        self._telling.add(task)
+        task.add_done_callback(self._telling.discard)
 
-    async def _tell(self, text: str) -> None:
-        failure = "" if self.notifier is None else await self.notifier.tell(text)
+    async def _tell(self, text: str, notifier: Notifier) -> None:
+        """With what could not be made safe, when there is such; that is known after the first try."""
+        await self.safety.tried()
+        unsafe = self.safety.unconfirmed
+        failure = await notifier.tell(f"{text}; NOT SAFE: {'; '.join(unsafe)}" if unsafe else text)
         if failure:
             self.hub.publish(Event(self.clock.now_ns(), "warning", "notify_failed", failure))
 
@@ -145,17 +201,3 @@ class Guard:
         missing = "" if self.notifier is None else self.notifier.missing()
         if missing:
             self.hub.publish(Event(self.clock.now_ns(), "warning", "notify_failed", missing))
-
-    def _tell_lateness(self, due_ns: int) -> None:
-        """Whoever keeps the event loop from its turn keeps the guard from looking; the permits have dropped then."""
-        late_s = (self.clock.now_ns() - due_ns) / NS_PER_S
-        if late_s > self.renew_s:
-            text = f"the guard looked {late_s:.1f} s late: the daemon was held up"
-            self.hub.publish(Event(self.clock.now_ns(), "warning", "guard_late", text))
-
-    async def _renew(self) -> None:
-        try:
-            await self.stand.renew_permits()
-        except DeviceError as error:
-            text = f"heating and cooling permits not renewed: {error}"
-            self.hub.publish(Event(self.clock.now_ns(), "warning", "permit_not_renewed", text))

@@ -21,6 +21,10 @@ class Readings(Protocol):
         """The last reading, whatever its quality."""
         ...
 
+    def known(self, channel: str) -> Reading | None:
+        """The last reading that is not BAD by the wire."""
+        ...
+
     def last_good_ns(self, channel: str) -> int | None:
         """When the channel last gave a GOOD reading."""
         ...
@@ -32,11 +36,17 @@ Action = Literal["abort", "hold", "warn"]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What a rule objects to, and what has to be done about it."""
+    """What a rule objects to, and what has to be done about it.
+
+    ends_itself: the hold is over when the rule objects no more; else an operator has to clear it. cuts_camera: the
+    camera's supply is switched off as well.
+    """
 
     rule: str
     text: str
     action: Action = "abort"
+    ends_itself: bool = False
+    cuts_camera: bool = False
 
 
 Rule = Callable[[Readings, int], Fault | None]
@@ -50,6 +60,7 @@ class Watch:
     grace_s: float = 0.0
     action: Action = "abort"
     since_ns: int | None = None
+    ends_itself: bool = False
 
     def check(self, readings: Readings, now_ns: int) -> Fault | None:
         """The rule's fault once it has stood for the grace time."""
@@ -62,40 +73,58 @@ class Watch:
         if now_ns - self.since_ns < seconds_ns(self.grace_s):
             return None
         lasting = f", for {self.grace_s:g} s" if self.grace_s > 0 else ""
-        return replace(fault, text=fault.text + lasting, action=self.action)
+        return replace(fault, text=fault.text + lasting, action=self.action, ends_itself=self.ends_itself)
 
 
 def value_of(readings: Readings, channel: str) -> float:
-    """The last value; NaN when it is BAD or was never read, and every comparison with that is false."""
-    reading = readings.latest(channel)
+    """The last known value, over polls that failed on the wire: whether it is too old is the business of `trustworthy`.
+    NaN when the device says itself that it has none, or it was never read, and every comparison with that is false."""
+    reading = readings.known(channel)
     return math.nan if reading is None else reading.value
 
 
-def over_temperature(channel: str, max_degC: float) -> Rule:
-    """`channel` reads above `max_degC`; a BAD or missing value is another rule's business."""
+def over_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False) -> Rule:
+    """`channel` reads above `max_degC`; a BAD or missing value is another rule's business. cuts_camera: it is the
+    camera itself that is too warm."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         value_degC = value_of(readings, channel)
         if value_degC > max_degC:
-            return Fault("over_temperature", f"{channel} is {value_degC:.2f} degC, above the limit of {max_degC} degC")
+            text = f"{channel} is {value_degC:.2f} degC, above the limit of {max_degC} degC"
+            return Fault("over_temperature", text, cuts_camera=cuts_camera)
         return None
 
     return rule
 
 
 def trustworthy(channel: str, stale_after_s: float) -> Rule:
-    """`channel` was never read, is BAD, or was last GOOD more than `stale_after_s` ago: a poll or two may be STALE."""
+    """`channel` was never read, was last GOOD more than `stale_after_s` ago, or the device itself has said for the
+    second poll that it has no measurement: sensor break, converter error, out of range.
+
+    A poll or two may be STALE, or BAD by the wire: a reply that is late or garbled is asked for again.
+    """
+    declined_ns: int | None = None  # the first of the polls in a row in which the device had no measurement
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        reading = readings.latest(channel)
+        nonlocal declined_ns
+        reading, good_ns = readings.latest(channel), readings.last_good_ns(channel)
         if reading is None:
             return Fault("sensor_missing", f"{channel} has never been read")
-        if reading.quality is Quality.BAD:
-            return Fault("sensor_bad", f"{channel} is BAD: {reading.reason}")
-        good_ns = readings.last_good_ns(channel)
+        is_bad = reading.quality is Quality.BAD
+        if declined_ns is not None and good_ns is not None and good_ns > declined_ns:
+            declined_ns = None
+        if is_bad and reading.cause != "wire":
+            if declined_ns is not None and reading.time_ns > declined_ns:
+                return Fault("sensor_bad", f"{channel} is BAD: {reading.reason}")
+            declined_ns = reading.time_ns
         age_s = math.inf if good_ns is None else (now_ns - good_ns) / NS_PER_S
         if age_s > stale_after_s:
-            return Fault("sensor_stale", f"{channel} was last good {age_s:.1f} s ago, limit {stale_after_s} s")
+            text = f"{channel} was last good {age_s:.1f} s ago, limit {stale_after_s} s"
+            return (
+                Fault("sensor_bad", f"{channel} is BAD: {reading.reason}; {text}")
+                if is_bad
+                else Fault("sensor_stale", text)
+            )
         return None
 
     return rule
@@ -122,7 +151,7 @@ def reported_fault(channel: str) -> Rule:
     """
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        reading = readings.latest(channel)
+        reading = readings.known(channel)
         if reading is not None and reading.value > 0:
             return Fault("device_fault", f"{channel}: {reading.reason}")
         return None
@@ -156,7 +185,7 @@ def stage_alarm(position: str) -> Rule:
     """An axis' controller has an alarm; not homed or without current, as before the first move, is none."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        reading = readings.latest(position)
+        reading = readings.known(position)
         if reading is not None and reading.reason.startswith(_AXIS_ALARM):
             return Fault("stage_alarm", f"{position}: {reading.reason}")
         return None
@@ -176,10 +205,69 @@ def flap_open(position: str, is_excused: Callable[[], bool] = lambda: False) -> 
     return rule
 
 
+def paused(is_paused: Callable[[], bool]) -> Rule:
+    """An operator's pause stands; how long it may is the watch's grace time."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        return Fault("paused_too_long", "an operator has paused the run and not continued it") if is_paused() else None
+
+    return rule
+
+
 def frames_stopped(reason: Callable[[], str]) -> Rule:
     """The recorder takes no more frames; `reason()` says why, "" while it does."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         return Fault("disk_low", reason()) if reason() else None
+
+    return rule
+
+
+def intrusion(times: Callable[[], int]) -> Rule:
+    """Heat, cold or the regulator were switched on, twice since the permission was withdrawn, by somebody else. Once
+    is put right and told; who does it again does not stop by himself."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        if times() < 2:
+            return None
+        text = f"heat, cold or the regulator were switched on {times()} times without permission: by whom?"
+        return Fault("switched_on_without_permission", text)
+
+    return rule
+
+
+class Recording(Protocol):
+    """What a rule may ask of the recorder; it never asks the disk."""
+
+    @property
+    def waiting_since_ns(self) -> int | None:
+        """When the oldest item was published that is not yet durable in the session's own folder; None: nothing due."""
+        ...
+
+    @property
+    def folder_lost(self) -> str:
+        """Why the session's folder is not there any more; "" while it is."""
+        ...
+
+
+def not_recorded(recording: Recording, durable_within_s: float) -> Rule:
+    """Readings, frames or events are not on the disk in time: nobody will know what the heat was for."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        since_ns = recording.waiting_since_ns
+        if since_ns is None or now_ns - since_ns <= seconds_ns(durable_within_s):
+            return None
+        age_s = (now_ns - since_ns) / NS_PER_S
+        text = f"what was measured {age_s:.0f} s ago is not on the disk yet, limit {durable_within_s:g} s"
+        return Fault("not_recorded", text)
+
+    return rule
+
+
+def folder_lost(recording: Recording) -> Rule:
+    """The session's folder was removed or renamed while it is being recorded."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        return Fault("folder_lost", recording.folder_lost) if recording.folder_lost else None
 
     return rule

@@ -28,7 +28,10 @@ class Notifier:
         """Why the command cannot be run, "" when it can."""
         if not self._command or shutil.which(self._command[0]) is not None:
             return ""
-        return f"guard.notify: {self._command[0]} is no program that can be run here; nobody will be told of a trip"
+        return (
+            f"guard.notify: {self._command[0]} is no program that can be run here, nobody would be told of a trip; "
+            "install it, give its whole path, or take the line out"
+        )
 
     async def tell(self, text: str) -> str:
         """Why it failed, "" when it did not; off the loop, but virtual time stands still meanwhile."""

@@ -4,18 +4,27 @@ from __future__ import annotations
 
 from experiments.steps import Capture
 from stand.config import StandConfig
+from stand.guarding.felt_air import CameraLimits, FeltLimits, GraniteLimits, camera_feels, granite_feels
+from stand.guarding.first_heat import FirstHeatLimits, first_heat
+from stand.guarding.frozen import frozen, stale_by_air
+from stand.guarding.heat_given import HeatFeltLimits, heat_not_felt, too_much_heat
 from stand.guarding.interlocks import (
+    Recording,
     Watch,
     disagreement,
     flap_open,
+    folder_lost,
     frames_stopped,
+    not_recorded,
     over_temperature,
+    paused,
     permit_missing,
     reported_fault,
     stage_alarm,
     stopped_while_permitted,
     trustworthy,
 )
+from stand.guarding.needed_output import NeededLimits, output_not_as_needed
 from stand.guarding.plausibility import (
     HeatingLimits,
     OffLimits,
@@ -27,6 +36,7 @@ from stand.guarding.plausibility import (
     warming_while_off,
 )
 from stand.hub import Event, Item, StepMark, StepState
+from stand.running.gate import OPERATOR
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",
@@ -35,18 +45,21 @@ PV, AIR, GRANITE, LABORATORY = (
     "thermometers.laboratory",
 )
 RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
-FLAP = "flap.position"
+FLAP, CAMERA = "flap.position", "camera.temperature"
+VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these nobody may heat
 
 
 class Announcements:
     """What is said on the hub besides readings and matters to a rule: subscribe `receive`.
 
     is_capturing: a Capture has begun and not ended. frames_stopped: why the recorder takes no frames, "" while it does.
+    is_paused: an operator has paused the run, or has not answered a prompt.
     """
 
     def __init__(self) -> None:
         self.is_capturing = False
         self.frames_stopped = ""
+        self.is_paused = False
 
     def receive(self, item: Item) -> None:
         """The hub's subscriber."""
@@ -54,12 +67,20 @@ class Announcements:
             self.is_capturing = item.state is StepState.STARTED
         elif isinstance(item, Event) and item.kind in ("frames_stopped", "frames_resumed"):
             self.frames_stopped = item.text if item.kind == "frames_stopped" else ""
+        elif isinstance(item, Event) and item.kind in ("held", "released") and item.data.get("reason") == OPERATOR:
+            self.is_paused = item.kind == "held"
 
 
 def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
     """Every rule with the configured limits. Abort where the stand's temperature is not known or not controlled: that
     ends a night. Hold where an operator can put it right and the night is worth going on with."""
-    return (*_temperatures(config), *_heat(config), *_sensors(config), *_operations(config, announced))
+    return (
+        *_temperatures(config),
+        *_heat(config),
+        *_sensors(config),
+        *_independent(config),
+        *_operations(config, announced),
+    )
 
 
 def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
@@ -70,8 +91,8 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
         Watch(over_temperature(PV, limits.max_air_degC)),
         Watch(over_temperature(AIR, limits.max_air_degC)),
         Watch(over_temperature(GRANITE, limits.max_granite_degC)),
-        Watch(over_temperature("camera.temperature", limits.max_camera_degC)),
-        *(Watch(trustworthy(channel, limits.stale_after_s)) for channel in (PV, AIR, GRANITE)),
+        Watch(over_temperature(CAMERA, limits.max_camera_degC, cuts_camera=True)),
+        *(Watch(trustworthy(channel, limits.stale_after_s)) for channel in VITAL),
     )
 
 
@@ -86,7 +107,7 @@ def _heat(config: StandConfig) -> tuple[Watch, ...]:
         Watch(warming_while_off(heater_off, AIR, "regulator", PERMIT, (LABORATORY, GRANITE))),
         Watch(cooling_in_vain(vain, AIR, "regulator", COMPRESSOR, (LABORATORY, GRANITE)), action="hold"),
         Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
-        Watch(trustworthy(PERMIT, limits.keys_s), 2 * limits.keys_s, "hold"),
+        Watch(trustworthy(PERMIT, limits.keys_s), limits.keys_s, "hold"),
     )
 
 
@@ -104,6 +125,44 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
     )
 
 
+def _independent(config: StandConfig) -> tuple[Watch, ...]:
+    """Looks that hold when both probes are wrong alike: heat that was given, and what else stands in that air. Abort,
+    for how warm it is nobody knows; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
+    found before anything is warm. The camera's own temperature is not required: one that is stale is told."""
+    limits, chamber = config.guard, config.chamber
+    felt = HeatFeltLimits(
+        **limits.heat_felt.model_dump(), heater_W=chamber.heater_W, heat_capacity_Wh_K=chamber.heat_capacity_Wh_K
+    )
+    needed, frost = NeededLimits(**limits.needed_output.model_dump()), limits.frozen
+    module = tuple(f"thermometers.{name}" for name in config.thermometers.channels)
+    return (
+        Watch(too_much_heat(limits.heat_max_Wh_per_h, chamber.heater_W, "regulator", PERMIT)),
+        *(Watch(heat_not_felt(felt, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
+        *(Watch(granite_feels(_granite_limits(config), GRANITE, probe)) for probe in (PV, AIR)),
+        Watch(camera_feels(_camera_limits(config), CAMERA, AIR)),
+        Watch(camera_feels(_camera_limits(config), CAMERA, PV)),
+        Watch(output_not_as_needed(needed, "regulator", PERMIT, COMPRESSOR, FLAP)),
+        *(
+            Watch(frozen(channel, module, frost.step_K, frost.after_s, "regulator"), action="hold")
+            for channel in (AIR, GRANITE)
+        ),
+        Watch(stale_by_air(CAMERA, AIR, frost.air_moves_K, frost.camera_after_s), action="warn"),
+        Watch(first_heat(FirstHeatLimits(**limits.first_heat.model_dump()), AIR, "regulator", PERMIT), action="hold"),
+    )
+
+
+def _granite_limits(config: StandConfig) -> GraniteLimits:
+    limits = config.guard.granite_feels
+    felt = FeltLimits(config.chamber.granite_lag_s, limits.window_s, limits.limit_K, limits.share)
+    return GraniteLimits(felt, limits.change_K, limits.change_s)
+
+
+def _camera_limits(config: StandConfig) -> CameraLimits:
+    limits = config.guard.camera_feels
+    felt = FeltLimits(config.chamber.camera_lag_s, limits.window_s, limits.limit_K, limits.share)
+    return CameraLimits(felt, limits.settle_s, limits.window_s, limits.still_air_K)
+
+
 def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
     """Hands on the regulator's keys, a stage's alarm, a flap that is open or cannot be asked, a full disk: an operator
     has to come.
@@ -117,6 +176,16 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
         *(Watch(stage_alarm(f"{name}.position"), action="hold") for name in config.axes),
         Watch(flap_open(FLAP, lambda: announced.is_capturing), limits.flap_open_s, "hold"),
         Watch(flap_open(FLAP), limits.flap_capture_s, "hold"),
-        Watch(trustworthy(FLAP, limits.flap_open_s), limits.flap_open_s, "hold"),
+        Watch(trustworthy(FLAP, limits.flap_open_s / 2), limits.flap_open_s / 2, "hold"),
         Watch(frames_stopped(lambda: announced.frames_stopped), limits.disk_low_s, "hold"),
+        Watch(paused(lambda: announced.is_paused), 3600.0 * limits.pause_limit_h, "hold"),
+    )
+
+
+def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
+    """Heat only while it is recorded. A disk that hangs or refuses may work again by itself; a folder that somebody has
+    moved does not come back by itself."""
+    return (
+        Watch(folder_lost(recording), action="hold"),
+        Watch(not_recorded(recording, config.recording.durable_within_s), action="hold", ends_itself=True),
     )

@@ -1,12 +1,13 @@
 import math
 import os
+import threading
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import seconds_ns
+from drivers.clock import Boot, seconds_ns
 from stand.guarding.compressor import CompressorLimits, CompressorState, decide, keep, restored
 
 LIMITS = CompressorLimits(
@@ -52,27 +53,86 @@ def test_whatever_the_regulator_wants_the_compressor_is_spared(outputs: list[tup
 
 
 NOW_NS = seconds_ns(1_800_000_000)
+BOOT = Boot("one", NOW_NS - seconds_ns(100_000))
+BOOTS = pytest.mark.parametrize("boot", [None, BOOT], ids=["virtual", "real"])
 STARTS_NS = (NOW_NS - seconds_ns(2000), NOW_NS - seconds_ns(700))
 
 
-def test_what_is_kept_is_restored(tmp_path: Path):
+@BOOTS
+def test_what_is_kept_is_restored(tmp_path: Path, boot: Boot | None):
     path = tmp_path / "sessions" / "compressor.json"
     state = CompressorState(False, NOW_NS - seconds_ns(400), STARTS_NS)
-    keep(path, CompressorState(True, NOW_NS - seconds_ns(700), STARTS_NS))
-    keep(path, state)
-    assert restored(path, NOW_NS) == state
+    keep(path, CompressorState(True, NOW_NS - seconds_ns(700), STARTS_NS), boot)
+    keep(path, state, boot)
+    assert restored(path, NOW_NS, boot) == state
     assert os.listdir(path.parent) == ["compressor.json"]
 
 
-def test_one_that_was_running_was_switched_off_just_now_for_all_that_is_known(tmp_path: Path):
-    keep(tmp_path / "file", CompressorState(True, NOW_NS - seconds_ns(700), STARTS_NS))
-    assert restored(tmp_path / "file", NOW_NS) == CompressorState(False, NOW_NS, STARTS_NS)
+@BOOTS
+def test_one_that_was_running_was_switched_off_just_now_for_all_that_is_known(tmp_path: Path, boot: Boot | None):
+    keep(tmp_path / "file", CompressorState(True, NOW_NS - seconds_ns(700), STARTS_NS), boot)
+    assert restored(tmp_path / "file", NOW_NS, boot) == CompressorState(False, NOW_NS, STARTS_NS)
 
 
-def test_the_future_is_ignored(tmp_path: Path):
-    """The host's clock was wrong then, or is now."""
-    keep(tmp_path / "file", CompressorState(False, NOW_NS + 1, (*STARTS_NS, NOW_NS + 1)))
-    assert restored(tmp_path / "file", NOW_NS) == CompressorState(False, NOW_NS, STARTS_NS)
+@BOOTS
+def test_the_future_is_ignored(tmp_path: Path, boot: Boot | None):
+    keep(tmp_path / "file", CompressorState(False, NOW_NS + 1, (*STARTS_NS, NOW_NS + 1)), boot)
+    assert restored(tmp_path / "file", NOW_NS, boot) == CompressorState(False, NOW_NS, STARTS_NS)
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600, 1e9])
+def test_a_step_of_the_system_clock_between_two_daemons_changes_neither_rest_nor_starts(tmp_path: Path, step_s: float):
+    """It stepped +1 h, and the compressor started again after 23 s."""
+    keep(tmp_path / "file", CompressorState(False, NOW_NS, STARTS_NS), BOOT)
+    step_ns = seconds_ns(step_s)
+    later_ns, after = NOW_NS + seconds_ns(23) + step_ns, Boot(BOOT.id, BOOT.began_ns + step_ns)
+    found = restored(tmp_path / "file", later_ns, after)
+    assert later_ns - found.since_ns == seconds_ns(23)
+    assert [later_ns - start_ns for start_ns in found.starts_ns] == [seconds_ns(2023), seconds_ns(723)]
+    assert not decide(found, LIMITS, 0.0, 100.0, later_ns + seconds_ns(276.9)).running
+    assert decide(found, LIMITS, 0.0, 100.0, later_ns + seconds_ns(277)).running
+
+
+@pytest.mark.parametrize(
+    ("kept_by", "read_by"),
+    [
+        (BOOT, Boot("two", BOOT.began_ns)),
+        (BOOT, Boot("", BOOT.began_ns)),
+        (Boot("", BOOT.began_ns), Boot("", BOOT.began_ns)),
+        (None, BOOT),  # as files of before boot times were kept
+        (BOOT, None),
+    ],
+    ids=["another boot", "a boot without a name", "neither has a name", "an old file", "virtual time"],
+)
+def test_a_file_of_another_boot_means_switched_off_just_now(tmp_path: Path, kept_by: Boot | None, read_by: Boot | None):
+    keep(tmp_path / "file", CompressorState(False, NOW_NS - seconds_ns(7200), STARTS_NS), kept_by)
+    assert restored(tmp_path / "file", NOW_NS, read_by) == CompressorState(False, NOW_NS)
+
+
+def test_virtual_time_keeps_no_boot_and_a_daemon_of_before_could_read_it(tmp_path: Path):
+    keep(tmp_path / "file", CompressorState(False, 7, (3, 5)), None)
+    assert (tmp_path / "file").read_text() == '{"running": false, "since_ns": 7, "starts_ns": [3, 5]}'
+
+
+def test_writers_at_once_do_not_meet_and_the_latest_call_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The disk hangs under the first; the second is done before it."""
+    path, hangs, goes_on, sync = tmp_path / "file", threading.Event(), threading.Event(), os.fsync
+
+    def hanging(fd: int) -> None:
+        if threading.current_thread() is not threading.main_thread():
+            hangs.set()
+            assert goes_on.wait(60)
+        sync(fd)
+
+    monkeypatch.setattr("stand.guarding.compressor.os.fsync", hanging)
+    first = threading.Thread(target=keep, args=(path, CompressorState(True, NOW_NS - 2), BOOT))
+    first.start()
+    assert hangs.wait(60)
+    keep(path, CompressorState(False, NOW_NS - 1), BOOT)
+    goes_on.set()
+    first.join()
+    assert restored(path, NOW_NS, BOOT) == CompressorState(False, NOW_NS - 1)
+    assert os.listdir(tmp_path) == ["file"]
 
 
 @pytest.mark.parametrize(
@@ -85,22 +145,26 @@ def test_the_future_is_ignored(tmp_path: Path):
         b"[]",
         b'{"running": false}',
         b'{"running": 0, "since_ns": "x", "starts_ns": []}',
+        b'{"running": false, "since_ns": 1, "starts_ns": [], "boot_id": 5}',
         b"\xff",
     ],
 )
-def test_a_missing_or_damaged_file_means_switched_off_just_now(tmp_path: Path, content: bytes | None):
+@BOOTS
+def test_a_missing_or_damaged_file_means_switched_off_just_now(
+    tmp_path: Path, content: bytes | None, boot: Boot | None
+):
     path = tmp_path / "compressor.json"
     if content is not None:
         path.write_bytes(content)
-    assert restored(path, NOW_NS) == CompressorState(False, NOW_NS)
+    assert restored(path, NOW_NS, boot) == CompressorState(False, NOW_NS)
 
 
 def test_without_a_file_nothing_is_kept():
-    keep(None, CompressorState(False, 5))
-    assert restored(None, NOW_NS) == CompressorState(False, NOW_NS)
+    keep(None, CompressorState(False, 5), BOOT)
+    assert restored(None, NOW_NS, BOOT) == CompressorState(False, NOW_NS)
 
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OSError, match="file"):
-        keep(tmp_path / "file" / "compressor.json", CompressorState(False, 5))
+        keep(tmp_path / "file" / "compressor.json", CompressorState(False, 5), BOOT)

@@ -10,29 +10,28 @@ from pathlib import Path
 import pytest
 
 from drivers.clock import Clock, VirtualClock, WallClock, block_until, seconds_ns
-from drivers.interface import Unreachable
+from drivers.interface import DeviceFault, Reading
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Fault, Readings, Rule, Watch
 from stand.guarding.notify import Notifier, run_command
-from stand.hub import Event, Hub
+from stand.guarding.safety import Safety
+from stand.hub import Batch, Event, Hub
 
 
-class PlainStand:
-    """Only what a guard asks of a stand: it writes down what it was told, and when."""
+class PlainActuator:
+    """Writes down that it was made safe, or does not confirm it."""
+
+    name = "relays"
 
     def __init__(self, log: list[str]) -> None:
         self.log = log
-        self.renews: Exception | None = None
-        self.unconfirmed: tuple[str, ...] = ()
+        self.failure = ""
 
     async def make_safe(self) -> None:
         await asyncio.sleep(0)
         self.log.append("safe")
-
-    async def renew_permits(self) -> None:
-        self.log.append("renew")
-        if isinstance(self.renews, Exception):
-            raise self.renews
+        if self.failure:
+            raise DeviceFault(self.name, self.failure)
 
 
 class Bench:
@@ -51,13 +50,25 @@ class Bench:
         self.clock = clock or VirtualClock(0)
         self.broken: Exception | None = None  # what the rules raise
         self.objecting: set[int] = set()
-        self.stand = PlainStand(self.log)
-        hub = Hub()
+        self.actuator = PlainActuator(self.log)
+        self.hub = hub = Hub()
+        self.safety = Safety(lambda: self.log.append("revoke"), hub, self.clock)
+        self.safety.take(self.actuator, 60.0)
         hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
         watches = tuple(Watch(self._rule(index), 0.0, action) for index, action in enumerate(actions))
         stop, hold = (lambda fault, name=name: self.log.append(f"{name} {fault.rule}") for name in ("stop", "hold"))
         notifier = Notifier(command, limit_s, self.clock)
-        self.guard = Guard(self.stand, watches, hub, self.clock, 1.0, 5.0, stop, hold if can_hold else None, notifier)
+        self.guard = Guard(
+            self.safety,
+            watches,
+            hub,
+            self.clock,
+            1.0,
+            stop,
+            hold if can_hold else None,
+            lambda: self.log.append("release"),
+            notifier=notifier,
+        )
 
     def _rule(self, index: int) -> Rule:
         def rule(readings: Readings, now_ns: int) -> Fault | None:
@@ -73,23 +84,29 @@ class Bench:
         watching = asyncio.create_task(self.guard.run())
         await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
         still = not watching.done()
+        await self.guard.told()
         for task in (watching, time):
             task.cancel()
         await asyncio.gather(watching, time, return_exceptions=True)
         return still
 
 
-async def test_permits_are_renewed_while_every_rule_holds():
+async def test_permits_may_be_renewed_while_every_rule_holds_and_the_guard_looks():
     bench = Bench("abort", "hold", "warn")
+    assert not bench.guard.may_permit()
     assert await bench.run_for(11.5)
-    assert bench.log == ["renew"] * 3
+    assert bench.guard.may_permit()
+    bench.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(2.1))
+    bench.guard.clock = bench.clock
+    assert not bench.guard.may_permit()  # nobody has looked for more than two periods
+    assert bench.log == []
 
 
 async def test_an_abort_latches_then_makes_safe_and_ends_the_watch():
     bench = Bench("hold", "abort")
     bench.objecting = {0, 1}
     assert not await bench.run_for(3)
-    assert bench.log == ["stop rule1", "safe"]
+    assert bench.log == ["stop rule1", "revoke", "safe"]
     assert [(event.level, event.kind, event.text) for event in bench.events] == [("error", "guard.rule1", "it is so")]
 
 
@@ -97,7 +114,7 @@ async def test_a_hold_latches_then_makes_safe_once_and_renews_nothing():
     bench = Bench("hold", "hold")
     bench.objecting = {1}
     assert await bench.run_for(20)
-    assert bench.log == ["hold rule1", "safe"]
+    assert bench.log == ["hold rule1", "revoke", "safe"]
     assert bench.guard.held == Fault("rule1", "it is so", "hold")
 
 
@@ -107,35 +124,33 @@ async def test_what_is_still_wrong_when_it_is_cleared_holds_before_anything_can_
     await bench.run_for(2)
     bench.guard.clear()
     assert bench.guard.held == Fault("rule0", "it is so", "hold")
-    assert bench.log == ["hold rule0", "safe", "hold rule0"]
+    assert bench.log == ["hold rule0", "revoke", "safe", "hold rule0", "revoke"]
     await bench.run_for(2)
-    assert bench.log[3:] == ["safe"]
+    assert bench.log[5:] == ["safe"]
 
 
 async def test_a_hold_that_is_not_confirmed_safe_is_made_safe_again_every_minute_until_it_is():
     bench = Bench("hold")
-    bench.stand.unconfirmed = ("relays did not answer",)
+    bench.actuator.failure = "no answer"
     bench.objecting = {0}
     await bench.run_for(130)
-    assert bench.log == ["hold rule0"] + ["safe"] * 3
-    bench.stand.unconfirmed = ()
+    assert bench.log == ["hold rule0", "revoke"] + ["safe"] * 3
+    bench.actuator.failure = ""
     await bench.run_for(130)
-    assert bench.log == ["hold rule0"] + ["safe"] * 3
+    assert bench.log == ["hold rule0", "revoke"] + ["safe"] * 4
+    assert [event.kind for event in bench.events] == ["guard.rule0", "not_confirmed_safe", "confirmed_safe"]
 
 
-@pytest.mark.parametrize("where", ["a rule", "the permits"])
-async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, script: Callable[[str], str], where: str):
+async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, script: Callable[[str], str]):
     told = tmp_path / "told"
     bench = Bench("hold", command=(script(f'printf "%s" "$1" > {told}'),))
-    if where == "a rule":
-        bench.broken = KeyError("channel")
-    else:
-        bench.stand.renews = KeyError("channel")
+    bench.broken = KeyError("channel")
     time = asyncio.create_task(bench.clock.run())
     with pytest.raises(KeyError):
         await bench.guard.run()
+    await bench.guard.told()
     time.cancel()
-    assert [line for line in bench.log if line != "renew"] == ["stop guard_failed", "safe"]
+    assert bench.log == ["stop guard_failed", "revoke", "safe"]
     text = "the guard failed (KeyError: 'channel')"
     assert [(event.level, event.kind, event.text) for event in bench.events] == [("error", "guard.guard_failed", text)]
     assert told.read_text() == text
@@ -144,17 +159,83 @@ async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, sc
 async def test_a_guard_that_was_kept_from_looking_says_so():
     """Real time goes on while somebody computes in the event loop."""
     bench = Bench("hold", clock=WallClock())
-    bench.guard.period_s, bench.guard.renew_s = 0.01, 0.05
+    bench.guard.period_s = 0.5
     watching = asyncio.create_task(bench.guard.run())
-    while not bench.log:
+    while not bench.guard.may_permit():
         await asyncio.sleep(0)
-    block_until(bench.clock, bench.clock.now_ns() + seconds_ns(0.1))
+    block_until(bench.clock, bench.clock.now_ns() + seconds_ns(1.2))
+    assert not bench.guard.may_permit()
     while not bench.events:
         await asyncio.sleep(0)
     watching.cancel()
     await asyncio.wait([watching])
     assert [(event.level, event.kind) for event in bench.events] == [("warning", "guard_late")]
-    assert bench.events[0].text.startswith("the guard looked 0.")
+    assert bench.events[0].text.startswith("the guard has not looked for 1.")
+    assert bench.events[0].data["gap_s"] > 1.2
+
+
+async def test_after_a_late_look_permits_wait_for_readings_taken_since():
+    """A reading whose reply lay in a buffer meanwhile does not count either."""
+    bench = Bench("hold")
+    bench.guard.vital = ("regulator.pv", "thermometers.air")
+
+    def read(*channels: str) -> None:
+        now_ns = bench.clock.now_ns()
+        for channel in channels:
+            bench.hub.publish(Batch("device", now_ns, (Reading(channel, 24.0, "degC", now_ns),)))
+
+    read("regulator.pv", "thermometers.air")
+    await bench.run_for(3)
+    assert bench.guard.may_permit()
+    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(13))
+    assert bench.guard.look()
+    assert [event.kind for event in bench.events] == ["guard_late"]
+    read("regulator.pv", "thermometers.air")
+    assert not bench.guard.may_permit()
+    await bench.run_for(1.5)
+    assert not bench.guard.may_permit()
+    read("regulator.pv")
+    assert not bench.guard.may_permit()
+    read("thermometers.air")
+    assert bench.guard.may_permit()
+
+
+async def test_a_hold_that_ends_by_itself_ends_when_the_stand_is_safe_and_nothing_is_wrong_three_times_an_hour():
+    bench = Bench("hold")
+    bench.guard.watches[0].ends_itself = True
+    bench.actuator.failure = "no answer"
+    bench.objecting = {0}
+    await bench.run_for(2)
+    bench.objecting = set()
+    await bench.run_for(30)
+    assert bench.guard.held is not None  # not confirmed safe
+    bench.actuator.failure = ""
+    await bench.run_for(60)
+    assert bench.log == ["hold rule0", "revoke", "safe", "safe", "release"]
+    for _ in range(3):
+        bench.objecting = {0}
+        await bench.run_for(2)
+        bench.objecting = set()
+        await bench.run_for(2)
+    assert bench.log.count("release") == 3
+    assert bench.guard.held is not None
+    assert [event.kind for event in bench.events][-1] == "hold_stays"
+    await bench.run_for(7200)
+    assert bench.log.count("release") == 3
+    bench.guard.clear()
+    assert bench.guard.held is None
+
+
+async def test_a_fault_that_needs_an_operator_replaces_a_hold_that_would_end_by_itself():
+    bench = Bench("hold", "hold")
+    bench.guard.watches[0].ends_itself = True
+    bench.objecting = {0}
+    await bench.run_for(2)
+    bench.objecting = {1}
+    await bench.run_for(2)
+    bench.objecting = set()
+    await bench.run_for(10)
+    assert bench.guard.held == Fault("rule1", "it is so", "hold")
 
 
 async def test_only_an_operator_clears_a_hold_and_what_is_still_wrong_trips_again():
@@ -164,15 +245,16 @@ async def test_only_an_operator_clears_a_hold_and_what_is_still_wrong_trips_agai
     bench.objecting = set()
     await bench.run_for(10)
     assert bench.guard.held is not None
-    assert bench.log == ["hold rule0", "safe"]
+    assert not bench.guard.may_permit()
+    assert bench.log == ["hold rule0", "revoke", "safe"]
     assert bench.guard.clear() == Fault("rule0", "it is so", "hold")
     await bench.run_for(1)
-    assert bench.log == ["hold rule0", "safe", "renew"]
+    assert bench.guard.may_permit()
     bench.objecting = {0}
     await bench.run_for(2)
     bench.guard.clear()
     await bench.run_for(2)
-    assert bench.log[3:] == ["hold rule0", "safe"] * 2
+    assert bench.log == ["hold rule0", "revoke", "safe"] * 3
     assert [event.kind for event in bench.events] == ["guard.rule0"] * 3
 
 
@@ -195,30 +277,23 @@ async def test_a_fault_that_aborts_does_so_during_a_hold():
     await bench.run_for(2)
     bench.objecting = {0, 1}
     assert not await bench.run_for(2)
-    assert bench.log == ["hold rule0", "safe", "stop rule1", "safe"]
+    assert bench.log == ["hold rule0", "revoke", "safe", "stop rule1", "revoke", "safe"]
 
 
 async def test_without_a_way_to_hold_every_trip_aborts():
     bench = Bench("hold", can_hold=False)
     bench.objecting = {0}
     assert not await bench.run_for(2)
-    assert bench.log == ["stop rule0", "safe"]
+    assert bench.log == ["stop rule0", "revoke", "safe"]
 
 
 async def test_a_warning_is_told_when_it_begins_and_changes_nothing():
     bench = Bench("warn")
     for objecting in ({0}, {0}, set[int](), {0}):
         bench.objecting = objecting
-        assert await bench.guard.check()
+        assert bench.guard.look()
     assert bench.log == []
     assert [(event.level, event.kind) for event in bench.events] == [("warning", "guard.rule0")] * 2
-
-
-async def test_a_permit_that_cannot_be_renewed_is_told():
-    bench = Bench("abort")
-    bench.stand.renews = Unreachable("relays", "no answer")
-    assert await bench.run_for(2)
-    assert [event.kind for event in bench.events] == ["permit_not_renewed"]
 
 
 @pytest.fixture
@@ -244,18 +319,16 @@ async def test_a_trip_is_told_to_a_command_as_one_argument(tmp_path: Path, scrip
 
 
 async def test_a_run_that_is_taken_down_waits_until_somebody_was_told(tmp_path: Path, script: Callable[[str], str]):
-    """The guard is cancelled as soon as the stand is safe, while the command still runs: it only can in real time."""
+    """The guard ends at once, while the command still runs: it only can in real time."""
     told = tmp_path / "told"
     bench = Bench("abort", command=(script(f"sleep 0.3; touch {told}; exit 3"),), clock=WallClock())
     bench.objecting = {0}
     watching = asyncio.create_task(bench.guard.run())
     while bench.log[-1:] != ["safe"]:
         await asyncio.sleep(0)
-    await asyncio.sleep(0)
-    assert not told.exists()
-    watching.cancel()
     await asyncio.wait([watching])
-    assert watching.cancelled()
+    assert not told.exists()
+    await bench.guard.told()
     assert told.exists()
     assert [event.kind for event in bench.events] == ["guard.rule0", "notify_failed"]
 
@@ -263,10 +336,13 @@ async def test_a_run_that_is_taken_down_waits_until_somebody_was_told(tmp_path: 
 async def test_what_is_not_safe_is_told_with_the_trip(tmp_path: Path, script: Callable[[str], str]):
     told = tmp_path / "told"
     bench = Bench("abort", command=(script(f'printf "%s" "$1" > {told}'),))
-    bench.stand.unconfirmed = ("flap: jammed", "relays: no answer")
+    bench.actuator.failure = "no answer"
     bench.objecting = {0}
-    assert not await bench.guard.check()
-    assert told.read_text() == "it is so; NOT SAFE: flap: jammed; relays: no answer"
+    assert not bench.guard.look()
+    await bench.guard.told()
+    unsafe = "relays did not confirm its safe state: relays: no answer"
+    assert told.read_text() == f"it is so; NOT SAFE: {unsafe}"
+    await bench.safety.close()
 
 
 async def test_a_command_that_hangs_is_killed_and_an_event_while_the_hold_stands(script: Callable[[str], str]):
@@ -289,7 +365,8 @@ async def test_a_command_that_cannot_be_run_is_told_when_the_watch_begins(comman
 async def test_a_command_that_fails_is_an_event_and_no_more(script: Callable[[str], str]):
     bench = Bench("abort", command=(script("exit 7"),))
     bench.objecting = {0}
-    assert not await bench.guard.check()
+    assert not bench.guard.look()
+    await bench.guard.told()
     assert [(event.level, event.kind) for event in bench.events[1:]] == [("warning", "notify_failed")]
     assert bench.events[1].text.endswith("notify ended with status 7")
 

@@ -3,7 +3,7 @@ import math
 import pytest
 
 from drivers.clock import seconds_ns
-from drivers.interface import Quality, Reading, bad_reading
+from drivers.interface import Cause, Quality, Reading, bad_reading
 from stand.guarding.interlocks import (
     Fault,
     Rule,
@@ -68,17 +68,83 @@ STALE = Quality.STALE
     ("readings", "rule"),
     [
         ([], "sensor_missing"),
-        ([reading(24.0, 99.0), bad_reading(AIR, "degC", seconds_ns(100), "open wire")], "sensor_bad"),
+        ([reading(24.0, 99.0), bad_reading(AIR, "degC", seconds_ns(100), "open wire")], None),
+        ([bad_reading(AIR, "degC", seconds_ns(100), "open wire")], "sensor_bad"),
+        ([reading(24.0, 86.0), bad_reading(AIR, "degC", seconds_ns(100), "late", "wire")], None),
+        ([reading(24.0, 84.0), bad_reading(AIR, "degC", seconds_ns(100), "late", "wire")], "sensor_bad"),
         ([reading(24.0, 84.0)], "sensor_stale"),
         ([reading(24.0, 86.0)], None),
         ([reading(24.0, 90.0), reading(24.0, 100.0, STALE)], None),
         ([reading(24.0, 80.0), reading(24.0, 90.0, STALE), reading(24.0, 100.0, STALE)], "sensor_stale"),
         ([reading(24.0, 100.0, STALE)], "sensor_stale"),
     ],
-    ids=["never read", "bad", "old", "fresh", "one stale poll", "stale for long", "never good"],
+    ids=[
+        "never read",
+        "once bad",
+        "bad from the start",
+        "lost for short",
+        "lost for long",
+        "old",
+        "fresh",
+        "one stale poll",
+        "stale for long",
+        "never good",
+    ],
 )
 def test_a_safety_sensor_must_be_there_good_and_fresh(readings: list[Reading], rule: str | None):
     assert rule_of(trustworthy(AIR, 15.0)(hub_of(*readings), seconds_ns(100))) == rule
+
+
+@pytest.mark.parametrize(
+    ("polls", "trips_at"),
+    [
+        ("gdd", 2),
+        ("gdgdgd", None),
+        ("gwgwgwgg", None),
+        ("g" + 17 * "w", 15),  # at 1 s each, the limit being 15 s
+        ("gdwwd", 4),
+        ("gwdwd", 4),
+        ("gdwwg", None),
+        ("gdsd", 3),
+        ("gdww" + 15 * "w", 15),
+        ("guu", 2),
+    ],
+)
+def test_bad_by_the_device_counts_at_the_second_poll_and_bad_by_the_wire_when_it_lasts(
+    polls: str, trips_at: int | None
+):
+    """One letter a poll: good, stale, bad by the wire, by the device, or by nobody knows whom; looked at twice each."""
+    hub, rule, trips = Hub(), trustworthy(AIR, 15.0), list[int]()
+    causes: dict[str, Cause] = {"w": "wire", "d": "device", "u": ""}
+    for index, letter in enumerate(polls):
+        now_ns = seconds_ns(100 + index)
+        if letter in causes:
+            polled = bad_reading(AIR, "degC", now_ns, "no sense", causes[letter])
+        else:
+            polled = Reading(AIR, 24.0, "degC", now_ns, Quality.GOOD if letter == "g" else Quality.STALE)
+        hub.publish(Batch("thermometers", now_ns, (polled,)))
+        if [rule_of(rule(hub, now_ns)), rule_of(rule(hub, now_ns + 1))] != [None, None]:
+            trips.append(index)
+    assert (trips[0] if trips else None) == trips_at
+
+
+def test_a_device_that_was_good_between_two_looks_begins_anew():
+    hub, rule = hub_of(reading(24.0, 99.0)), trustworthy(AIR, 15.0)
+    for time_s in (100, 101, 102, 103):
+        bad = bad_reading(AIR, "degC", seconds_ns(time_s), "open wire")
+        hub.publish(Batch("thermometers", bad.time_ns, (bad,)))
+        assert rule(hub, bad.time_ns) is None
+        good = reading(24.0, time_s + 0.5)
+        hub.publish(Batch("thermometers", good.time_ns, (good,)))
+
+
+def test_rules_know_the_last_value_over_a_poll_that_was_lost_on_the_wire():
+    """Else a line that loses a reply now and then would let each rule that needs time begin anew."""
+    hub = hub_of(reading(70.0, 99.0), bad_reading(AIR, "degC", seconds_ns(100), "late", "wire"))
+    assert rule_of(over_temperature(AIR, 65.0)(hub, seconds_ns(100))) == "over_temperature"
+    reported = Reading("regulator.fault", 1.0, "1", 0, reason="manual")
+    hub = hub_of(reported, bad_reading("regulator.fault", "1", seconds_ns(1), "late", "wire"))
+    assert rule_of(reported_fault("regulator.fault")(hub, seconds_ns(1))) == "device_fault"
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,8 @@ class Table:
         for channel, value in values.items():
             noisy = value + (time_s % 7) * 1e-3 * (channel in noise)
             lost = math.isnan(value)
-            reading = bad_reading(channel, "1", time_ns, "lost") if lost else Reading(channel, noisy, "1", time_ns)
+            bad = bad_reading(channel, "1", time_ns, "lost", "wire")
+            reading = bad if lost else Reading(channel, noisy, "1", time_ns)
             self.hub.publish(Batch("device", time_ns, (reading,)))
         return [fault for watch in self.watches if (fault := watch.check(self.hub, time_ns)) is not None]
 
@@ -87,9 +88,12 @@ def test_an_open_flap_holds_after_five_minutes_unless_a_capture_is_under_way():
     assert (found[0], found[1].rule) == (2700, "flap_open")
 
 
-@pytest.mark.parametrize(("channel", "after_s"), [("flap_position", 300), ("relays_heater_enable", 60)])
+@pytest.mark.parametrize(("channel", "after_s"), [("flap_position", 310), ("relays_heater_enable", 70)])
 def test_a_flap_or_relay_board_that_cannot_be_asked_holds_after_its_time(channel: str, after_s: int):
-    found = Table().first_s(4000, **{channel: math.nan})
+    """300 s and 60 s after the first look that finds the last good reading too old by half of that."""
+    table = Table()
+    table.look(0)
+    found = table.first_s(4000, **{channel: math.nan})
     assert found is not None
     assert (found[0], found[1].rule, found[1].action) == (after_s, "sensor_bad", "hold")
 
@@ -109,7 +113,8 @@ def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_pat
     notices: list[Notice] = []
     SpaceWatch(tmp_path, 10**18, 0.0, lambda: 0, notices.append).check()
     table = Table()
-    table.hub.publish(Event(0, *notices[0]))
+    notice = notices[0]
+    table.hub.publish(Event(0, notice.level, notice.kind, notice.text))
     found = table.first_s(4000)
     assert found is not None
     assert (found[0], found[1].rule, found[1].action) == (900, "disk_low", "hold")
@@ -123,3 +128,19 @@ def test_all_other_events_and_steps_are_no_business_of_the_rules():
     table.hub.publish(Event(0, "error", "frames_dropped", "the disk is too slow"))
     table.hub.publish(mark("Soak", StepState.STARTED))
     assert (table.announced.is_capturing, table.announced.frames_stopped) == (False, "")
+
+
+def test_a_pause_of_twelve_hours_holds_the_stand_and_a_shorter_one_does_not():
+    table = Table()
+    held = Event(0, "warning", "held", "operator", {"reason": "operator"})
+    released = Event(0, "info", "released", "operator", {"reason": "operator"})
+    table.hub.publish(held)
+    found = table.first_s(13 * 3600)
+    assert found is not None
+    time_s, fault = found
+    assert (time_s, fault.rule, fault.action) == (12 * 3600, "paused_too_long", "hold")
+    table = Table()
+    table.hub.publish(held)
+    assert table.first_s(3600) is None
+    table.hub.publish(released)
+    assert table.first_s(13 * 3600) is None

@@ -1,0 +1,72 @@
+"""Beside the pollers in real time: tells when the host's system clock parts from the stand's, and of a suspend."""
+
+from __future__ import annotations
+
+from drivers.clock import NS_PER_S, PIECE_S, WallClock, seconds_ns
+from stand.hub import Event, Hub
+from stand.recording.instants import duration
+from stand.recording.utc_offsets import CLOCK_STEP, REPEATED_NS, offset_event
+
+HOST_SUSPENDED = "host_suspended"  # kind of the event with the length of a suspend
+_PERIOD_S = PIECE_S
+_LIMIT_NS = seconds_ns(1.0)
+
+
+class ClockWatch:
+    """Looks every second. An offset to UTC that is more than 1 s from the one recorded last is an event `clock_step`,
+    whether the system clock was stepped or has drifted so far; more than 1 s of suspend is one `host_suspended`.
+
+    `recorded_ns`: the offset that the session has so far, of a run that goes on in it.
+    """
+
+    def __init__(self, hub: Hub, clock: WallClock, recorded_ns: int = 0) -> None:
+        self._hub = hub
+        self._clock = clock
+        self._recorded_ns = recorded_ns
+        self._told_ns = 0  # when the offset was recorded last
+        self._seen_ns = clock.now_ns()
+        self._suspended_ns = clock.suspended_ns()
+
+    async def run(self) -> None:
+        """Look until cancelled."""
+        while True:
+            self.look()
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_PERIOD_S))
+
+    def look(self) -> None:
+        """Once, now."""
+        now_ns, offset_ns, suspended_ns = (
+            self._clock.now_ns(),
+            self._clock.utc_offset_ns(),
+            self._clock.suspended_ns(),
+        )
+        if suspended_ns - self._suspended_ns > _LIMIT_NS:
+            self._tell_suspend(now_ns, suspended_ns - self._suspended_ns)
+            self._suspended_ns = suspended_ns
+        if abs(offset_ns - self._recorded_ns) > _LIMIT_NS:
+            self._tell_step(now_ns, offset_ns)
+        elif self._recorded_ns and now_ns - self._told_ns >= REPEATED_NS:
+            self._told_ns = now_ns
+            self._hub.publish(offset_event(now_ns, self._recorded_ns))
+        self._seen_ns = now_ns
+
+    def _tell_suspend(self, now_ns: int, length_ns: int) -> None:
+        text = f"the host was suspended for {duration(length_ns)}: nothing was watched or recorded meanwhile"
+        data = {"length_s": length_ns / NS_PER_S, "seen_ns": self._seen_ns, "stand_ns": now_ns}
+        self._hub.publish(Event(now_ns, "warning", HOST_SUSPENDED, text, data))
+
+    def _tell_step(self, now_ns: int, offset_ns: int) -> None:
+        by_s, utc_s = (offset_ns - self._recorded_ns) / NS_PER_S, offset_ns / NS_PER_S
+        text = (
+            f"the system clock went {by_s:+.3f} s against the stand's clock, which goes on as it was; UTC is now "
+            f"{utc_s:+.3f} s from recorded instants"
+        )
+        data = {
+            "offset_before_ns": self._recorded_ns,
+            "offset_after_ns": offset_ns,
+            "seen_ns": self._seen_ns,
+            "stand_ns": now_ns,
+            "utc_ns": now_ns + offset_ns,
+        }
+        self._recorded_ns, self._told_ns = offset_ns, now_ns
+        self._hub.publish(Event(now_ns, "warning", CLOCK_STEP, text, data))

@@ -1,0 +1,80 @@
+"""The first heat of a daemon: do the regulator's probe, its heater and the chamber's air belong together?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from drivers.clock import seconds_ns
+from stand.guarding.heat_given import heat_percent
+from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from stand.guarding.plausibility import remembering
+
+_LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds
+
+
+@dataclass(frozen=True, slots=True)
+class FirstHeatLimits:
+    """within_s: after so long with an output of output_percent on average, both must have risen by rise_K."""
+
+    within_s: float
+    output_percent: float
+    rise_K: float
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """Heating since `since_ns`, from what `shown_degC` (PV, air) were; the most that each has risen. is_passed: both
+    have risen, and nothing is looked at any more."""
+
+    since_ns: int
+    shown_degC: tuple[float, float]
+    risen_K: tuple[float, float] = (0.0, 0.0)
+    sum_percent: float = 0.0
+    count: int = 0
+    is_passed: bool = False
+
+
+def first_heat(limits: FirstHeatLimits, air: str, regulator: str, permit: str) -> Rule:
+    """The regulator heats for the first time, and its value or the chamber's air does not rise: two identical
+    regulators with exchanged addresses pass every other probe."""
+    pv = f"{regulator}.pv"
+
+    def begins(readings: Readings) -> bool:
+        lacking_K = value_of(readings, f"{regulator}.sp") - value_of(readings, pv)
+        return lacking_K > _LACKING_K and heat_percent(readings, regulator, permit) >= limits.output_percent
+
+    def step(last: Begin | None, readings: Readings, now_ns: int) -> tuple[Begin | None, Fault | None]:
+        if last is not None and last.is_passed:
+            return last, None
+        shown_degC = value_of(readings, pv), value_of(readings, air)
+        if math.isnan(sum(shown_degC)):
+            return None, None
+        if last is None:
+            return (Begin(now_ns, shown_degC) if begins(readings) else None), None
+        return _judged(_looked(last, shown_degC, heat_percent(readings, regulator, permit)), readings, now_ns)
+
+    def _judged(state: Begin, readings: Readings, now_ns: int) -> tuple[Begin | None, Fault | None]:
+        if min(state.risen_K) >= limits.rise_K:
+            return replace(state, is_passed=True), None
+        if now_ns - state.since_ns < seconds_ns(limits.within_s):
+            return state, None
+        if state.sum_percent / state.count < limits.output_percent:
+            return None, None  # too little heat to tell
+        rises = " and ".join(
+            f"{name} by {risen_K:.1f} K" for name, risen_K in zip((pv, air), state.risen_K, strict=True)
+        )
+        text = f"in the first {limits.within_s:g} s of heat {rises}; both should rise by {limits.rise_K:g} K"
+        return None, Fault("first_heat", f"{text}: is this regulator the one of this chamber?")
+
+    return remembering(step)
+
+
+def _looked(state: Begin, shown_degC: tuple[float, float], percent: float) -> Begin:
+    risen_K = tuple(
+        max(most_K, shown - begun)
+        for most_K, shown, begun in zip(state.risen_K, shown_degC, state.shown_degC, strict=True)
+    )
+    return replace(
+        state, risen_K=(risen_K[0], risen_K[1]), sum_percent=state.sum_percent + percent, count=state.count + 1
+    )

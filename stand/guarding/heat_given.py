@@ -1,0 +1,144 @@
+"""How much heat was given, from the regulator's output and the heater's power, and whether the probes show it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from drivers.clock import NS_PER_S, seconds_ns
+from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from stand.guarding.plausibility import remembering
+
+_LONGEST_LOOK_S = 60.0  # between two looks; what was given in a longer gap is not known
+_BEFORE_S = 30.0  # a stretch of heat begins: from here on a fall counts
+_MINUTE_S = 60.0
+
+
+def heat_percent(readings: Readings, regulator: str, permit: str) -> float:
+    """What of the heater's power is given, %: none only where it is known that the permit is off; 0 when unknown."""
+    output = value_of(readings, f"{regulator}.mv_heat")
+    return 0.0 if math.isnan(output) or value_of(readings, permit) == 0 else output
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Heat of the minutes that are over, Wh, oldest first, and of the one since `begun_ns`."""
+
+    begun_ns: int
+    looked_ns: int
+    running_Wh: float = 0.0
+    minutes_Wh: tuple[float, ...] = ()
+
+
+def too_much_heat(max_Wh_per_h: float, heater_W: float, regulator: str, permit: str) -> Rule:
+    """More heat within an hour than the chamber ever needs, whatever any sensor says."""
+
+    def step(last: Given | None, readings: Readings, now_ns: int) -> tuple[Given | None, Fault | None]:
+        if last is None:
+            return Given(now_ns, now_ns), None
+        looked_s = min((now_ns - last.looked_ns) / NS_PER_S, _LONGEST_LOOK_S)
+        running_Wh = last.running_Wh + heat_percent(readings, regulator, permit) / 100 * heater_W * looked_s / 3600
+        if now_ns - last.begun_ns < seconds_ns(_MINUTE_S):
+            return Given(last.begun_ns, now_ns, running_Wh, last.minutes_Wh), None
+        minutes_Wh = (*last.minutes_Wh, running_Wh)[-60:]
+        given_Wh = sum(minutes_Wh)
+        state = Given(now_ns, now_ns, 0.0, minutes_Wh)
+        if given_Wh <= max_Wh_per_h:
+            return state, None
+        text = f"{given_Wh:.0f} Wh of heat were given within an hour, above the limit of {max_Wh_per_h:g} Wh"
+        return state, Fault("too_much_heat", text)
+
+    return remembering(step)
+
+
+@dataclass(frozen=True, slots=True)
+class HeatFeltLimits:
+    """output_percent: from here on the regulator heats. fall_K: what a probe may fall meanwhile. rise_share: what it
+    must rise in each window_s, once heat was given for settle_s, of what the heat makes of heat_capacity_Wh_K."""
+
+    output_percent: float
+    fall_K: float
+    rise_share: float
+    window_s: float
+    settle_s: float
+    heater_W: float
+    heat_capacity_Wh_K: float
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One look at heat and probe."""
+
+    time_ns: int
+    percent: float
+    probe_degC: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """What was seen lately; while the regulator heats, since when, and the highest that the probe showed."""
+
+    moments: tuple[Moment, ...]
+    since_ns: int | None = None
+    highest_degC: float = -math.inf
+
+
+def heat_not_felt(limits: HeatFeltLimits, probe: str, regulator: str, permit: str) -> Rule:
+    """The regulator heats hard, and yet `probe` falls, or does not rise as that heat makes it: it hangs outside, or is
+    stuck. Near the set-point, where the heat only keeps what is there, a rise is not asked for."""
+    kept_ns = seconds_ns(max(limits.window_s, _BEFORE_S))
+
+    def step(last: Stretch | None, readings: Readings, now_ns: int) -> tuple[Stretch | None, Fault | None]:
+        reading = readings.known(probe)
+        if reading is None or math.isnan(reading.value):
+            return None, None
+        moments = last.moments if last else ()
+        if last and moments and reading.time_ns <= moments[-1].time_ns:
+            return last, None
+        now = Moment(reading.time_ns, heat_percent(readings, regulator, permit), reading.value)
+        moments = (*(each for each in moments if each.time_ns >= now.time_ns - kept_ns), now)
+        stretch = _stretch(last, moments, limits)
+        if stretch.since_ns is None:
+            return stretch, None
+        return stretch, _fallen(stretch, limits, probe) or _not_risen(stretch, limits, probe, readings, regulator)
+
+    return remembering(step)
+
+
+def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatFeltLimits) -> Stretch:
+    now = moments[-1]
+    if now.percent < limits.output_percent:
+        return Stretch(moments)
+    if last is None or last.since_ns is None:
+        begun_ns = now.time_ns - seconds_ns(_BEFORE_S)
+        return Stretch(moments, now.time_ns, max(each.probe_degC for each in moments if each.time_ns >= begun_ns))
+    return Stretch(moments, last.since_ns, max(last.highest_degC, now.probe_degC))
+
+
+def _fallen(stretch: Stretch, limits: HeatFeltLimits, probe: str) -> Fault | None:
+    now = stretch.moments[-1]
+    if stretch.highest_degC - now.probe_degC < limits.fall_K:
+        return None
+    text = f"{probe} falls from {stretch.highest_degC:.1f} to {now.probe_degC:.1f} degC while the regulator heats"
+    return Fault("heat_not_felt", f"{text} by {now.percent:.0f} %")
+
+
+def _not_risen(
+    stretch: Stretch, limits: HeatFeltLimits, probe: str, readings: Readings, regulator: str
+) -> Fault | None:
+    first, now = stretch.moments[0], stretch.moments[-1]
+    lasted_s = (now.time_ns - first.time_ns) / NS_PER_S
+    settled_ns = (stretch.since_ns or 0) + seconds_ns(limits.settle_s)
+    if lasted_s < 0.9 * limits.window_s or first.time_ns < settled_ns:
+        return None
+    lacking_K = value_of(readings, f"{regulator}.sp") - value_of(readings, f"{regulator}.pv")
+    if not lacking_K > 1.0:
+        return None
+    percent = sum(each.percent for each in stretch.moments) / len(stretch.moments)
+    given_Wh = percent / 100 * limits.heater_W * lasted_s / 3600
+    needed_K = limits.rise_share * given_Wh / limits.heat_capacity_Wh_K
+    risen_K = now.probe_degC - first.probe_degC
+    if risen_K >= needed_K:
+        return None
+    text = f"{probe} has risen by {risen_K:.2f} K in {lasted_s:.0f} s in which {given_Wh:.0f} Wh of heat were given"
+    return Fault("heat_not_felt", f"{text}; at least {needed_K:.2f} K are expected")

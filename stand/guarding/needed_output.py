@@ -1,0 +1,102 @@
+"""The output that a chamber at rest needs at its set-point, learned in the night: far from it, something is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from drivers.clock import seconds_ns
+from stand.guarding.heat_given import heat_percent
+from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from stand.guarding.plausibility import remembering
+
+_FLAP_OPEN_ABOVE = 0.05
+_LEARNING = 0.25  # share of a new mean; the first is taken whole
+
+
+@dataclass(frozen=True, slots=True)
+class NeededLimits:
+    """settle_s: at rest for so long before it is looked at. mean_s: of a mean. limit_percent: how far it may be from
+    what was learned at a set-point up to near_K away. band_K: at rest is a value that near to the set-point."""
+
+    settle_s: float
+    mean_s: float
+    limit_percent: float
+    band_K: float
+    near_K: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """What the chamber rests at."""
+
+    set_point_degC: float
+    compressor: float
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """At rest since `since_ns`, the output summed over `count` looks since `begun_ns`; what was learned, %."""
+
+    rest: Rest | None = None
+    since_ns: int = 0
+    begun_ns: int = 0
+    sum_percent: float = 0.0
+    count: int = 0
+    learned: Mapping[Rest, float] = field(default_factory=dict[Rest, float])
+
+
+def nearest(learned: Mapping[Rest, float], rest: Rest, near_K: float) -> float | None:
+    """What was needed at the nearest set-point with the compressor alike; None where nothing near was learned."""
+    found = [
+        (abs(other.set_point_degC - rest.set_point_degC), percent)
+        for other, percent in learned.items()
+        if other.compressor == rest.compressor and abs(other.set_point_degC - rest.set_point_degC) <= near_K
+    ]
+    return min(found)[1] if found else None
+
+
+def output_not_as_needed(limits: NeededLimits, regulator: str, permit: str, compressor: str, flap: str) -> Rule:
+    """The chamber needs far more, or far less, than it did at about this set-point: a probe that shows too little, or
+    holds still, makes the regulator heat on."""
+
+    def rest_of(readings: Readings) -> Rest | None:
+        set_point_degC = value_of(readings, f"{regulator}.sp")
+        off_K = abs(value_of(readings, f"{regulator}.pv") - set_point_degC)
+        is_controlled = value_of(readings, f"{regulator}.running") == 1 and value_of(readings, permit) == 1
+        is_open = value_of(readings, flap) > _FLAP_OPEN_ABOVE
+        if not (is_controlled and off_K <= limits.band_K) or is_open:
+            return None
+        on = value_of(readings, compressor)
+        return None if math.isnan(on) else Rest(set_point_degC, on)
+
+    def step(last: Needs | None, readings: Readings, now_ns: int) -> tuple[Needs | None, Fault | None]:
+        last = last or Needs()
+        rest = rest_of(readings)
+        if rest is None or rest != last.rest:
+            return Needs(rest, since_ns=now_ns, learned=last.learned), None
+        if now_ns - last.since_ns < seconds_ns(limits.settle_s):
+            return last, None
+        if last.count == 0:
+            last = replace(last, begun_ns=now_ns)
+        summed = replace(
+            last, sum_percent=last.sum_percent + heat_percent(readings, regulator, permit), count=last.count + 1
+        )
+        if now_ns - summed.begun_ns < seconds_ns(limits.mean_s):
+            return summed, None
+        return _judged(summed, rest, limits, regulator)
+
+    return remembering(step)
+
+
+def _judged(needs: Needs, rest: Rest, limits: NeededLimits, regulator: str) -> tuple[Needs, Fault | None]:
+    mean_percent = needs.sum_percent / needs.count
+    needed_percent = nearest(needs.learned, rest, limits.near_K)
+    state = replace(needs, sum_percent=0.0, count=0)
+    if needed_percent is not None and abs(mean_percent - needed_percent) > limits.limit_percent:
+        text = f"{regulator} heats by {mean_percent:.0f} % at {rest.set_point_degC:.1f} degC, where the chamber needed"
+        return state, Fault("output_not_as_needed", f"{text} {needed_percent:.0f} % before")
+    was_percent = needs.learned.get(rest)
+    now_percent = mean_percent if was_percent is None else was_percent + _LEARNING * (mean_percent - was_percent)
+    return replace(state, learned={**needs.learned, rest: now_percent}), None
