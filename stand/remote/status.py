@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
-from drivers.clock import Clock, seconds_ns
+from drivers.clock import Clock, seconds_ns, utc_offset_ns
 from drivers.interface import Quality
 from stand.estimating.estimate import PricedStep
 from stand.estimating.eta import Eta
 from stand.estimating.follow import parameters_text
+from stand.guarding.interlocks import Fault
 from stand.hub import Batch, Event, Item, StepMark
 from stand.recording.recorder import Recorder
-from stand.recording.space import disk_space
 from stand.remote.control import RunStatus
 from stand.running.gate import Gate, Phase
 from stand.running.scheduler import Progress
-from stand.running.stop import Stop
+from stand.running.stop import OPERATOR, Stop
 
 State = Literal["running", "held", "stopping"]
 _STATES: dict[Phase, State] = {
@@ -29,7 +29,7 @@ _STATES: dict[Phase, State] = {
 
 
 class StatusBoard:
-    """A subscriber of the hub that remembers what an operator asks for."""
+    """A subscriber of the hub that remembers what an operator asks for. `held` gives why the guard holds the run."""
 
     def __init__(
         self,
@@ -38,6 +38,7 @@ class StatusBoard:
         progress: Progress,
         gate: Gate,
         stop: Stop,
+        held: Callable[[], Fault | None],
         recorder: Recorder,
         clock: Clock,
     ) -> None:
@@ -46,14 +47,16 @@ class StatusBoard:
         self._eta = Eta(steps, progress.done, progress.earned_s)
         self._gate = gate
         self._stop = stop
+        self._held = held
         self._recorder = recorder
         self._clock = clock
         self._step = 0
         self._doing = ""
         self._state: State = _STATES[stop.phase]
         self._since_ns = clock.now_ns()
+        self._since_utc_offset_ns = self._warning_utc_offset_ns = utc_offset_ns(clock)
         self._temperatures_degC: dict[str, float | None] = {}
-        self._warning = ""
+        self._warning: Event | None = None
 
     def __call__(self, item: Item) -> None:
         """Follow one item."""
@@ -65,7 +68,8 @@ class StatusBoard:
                 self._doing = f"{item.kind} {parameters_text(item.parameters)}".rstrip()
             case Event():
                 self._eta.event(item)
-                self._warning = self._warning if item.level == "info" else item.text
+                if item.level != "info":
+                    self._warning, self._warning_utc_offset_ns = item, utc_offset_ns(self._clock)
             case Batch():
                 for reading in item.readings:
                     if reading.unit == "degC":
@@ -78,6 +82,7 @@ class StatusBoard:
         """As it is now."""
         self._follow_state()
         now_ns, saved = self._clock.now_ns(), self._recorder.saved
+        warning, fault = self._warning, self._fault()
         return RunStatus(
             recipe=self._recipe,
             step=self._step,
@@ -91,19 +96,24 @@ class StatusBoard:
             temperatures_degC=self._temperatures_degC,
             frames_saved=saved.frames,
             frames_lost=saved.frames_lost,
-            disk_free_bytes=_free_bytes(self._recorder),
-            warning=self._warning,
+            disk_free_bytes=self._recorder.disk_free_bytes,
+            warning="" if warning is None else warning.text,
+            warning_level="" if warning is None else "error" if warning.level == "error" else "warning",
+            warning_ns=None if warning is None else warning.time_ns,
+            utc_offset_ns=utc_offset_ns(self._clock),
+            since_utc_offset_ns=self._since_utc_offset_ns,
+            warning_utc_offset_ns=self._warning_utc_offset_ns,
+            fault_rule="" if fault is None else fault.rule,
+            fault="" if fault is None else fault.text,
         )
+
+    def _fault(self) -> Fault | None:
+        """What has tripped; an operator who stops the run is no fault."""
+        fault = self._stop.fault or self._held()
+        return None if fault is None or fault.rule == OPERATOR else fault
 
     def _follow_state(self) -> None:
         state = _STATES[self._stop.phase]
         if state != self._state:
             self._state, self._since_ns = state, self._clock.now_ns()
-
-
-def _free_bytes(recorder: Recorder) -> int:
-    """0 when the disk cannot be asked."""
-    try:
-        return disk_space(recorder.directory).free_bytes
-    except OSError:
-        return 0
+            self._since_utc_offset_ns = utc_offset_ns(self._clock)

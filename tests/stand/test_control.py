@@ -4,8 +4,8 @@ import asyncio
 import contextlib
 import json
 import os
+import shutil
 import signal
-import socket
 import stat
 import subprocess
 import sys
@@ -15,8 +15,11 @@ from pathlib import Path
 import pytest
 
 from drivers.interface import SessionError
-from stand.remote.control import LINE_LIMIT_BYTES, SOCKET_NAME, RunStatus, handlers, serve
+from stand import runtime
+from stand.remote.control import RunStatus, handlers, serve
 from stand.remote.control_client import ask, ask_status, running_sessions
+from stand.remote.door import LINE_LIMIT_BYTES, MOST_CLIENTS
+from stand.remote.presence import Entry, Presence, address_in, living, opened_folder
 from stand.running.gate import Gate
 
 STATUS = RunStatus(
@@ -59,9 +62,24 @@ def refuse(_: Mapping[str, object]) -> dict[str, object]:
 HANDLERS = {"echo": echo, "slow_echo": slow_echo, "refuse": refuse}
 
 
+STAND = "a stand"
+
+
+def entries_of(session: Path) -> list[Entry]:
+    """What the daemons that run `session` say of themselves; on this machine there may be others."""
+    return [each.entry for each in living() if each.entry.session == str(session)]
+
+
+async def connect(session: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """To the daemon that runs `session`, over the few characters that a socket's path may have."""
+    (daemon,) = [each for each in living() if each.entry.session == str(session)]
+    with opened_folder(daemon.socket.parent) as folder:
+        return await asyncio.open_unix_connection(address_in(folder, daemon.socket.name))
+
+
 async def answers(session: Path, sent: bytes) -> list[dict[str, object]]:
     """Everything that comes back for these bytes, the sender's end closed behind them."""
-    reader, writer = await asyncio.open_unix_connection(session / SOCKET_NAME)
+    reader, writer = await connect(session)
     with contextlib.suppress(OSError):  # it may hang up before it has read everything
         writer.write(sent)
         await writer.drain()
@@ -76,7 +94,7 @@ async def answers(session: Path, sent: bytes) -> list[dict[str, object]]:
 
 
 async def test_a_request_is_answered_by_its_handler_whether_it_waits_or_not(tmp_path: Path):
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS):
+    async with serve(tmp_path, STAND, HANDLERS):
         for do in ("echo", "slow_echo"):
             answer = await asyncio.to_thread(ask, tmp_path, {"do": do, "text": "ü\n°"})
             assert answer == {"text": "ü\n°"}
@@ -102,7 +120,7 @@ async def test_a_request_is_answered_by_its_handler_whether_it_waits_or_not(tmp_
     ],
 )
 async def test_garbage_is_answered_with_a_sentence_and_hurts_nobody(tmp_path: Path, sent: bytes, sentence: str):
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS):
+    async with serve(tmp_path, STAND, HANDLERS):
         got = await answers(tmp_path, sent)
         if got:  # the kernel drops what it has for a sender that is cut off while it still sends
             assert got[0]["ok"] is False
@@ -114,13 +132,13 @@ async def test_garbage_is_answered_with_a_sentence_and_hurts_nobody(tmp_path: Pa
 
 async def test_requests_arrive_whole_byte_by_byte_and_many_at_once(tmp_path: Path):
     line = b'{"do": "slow_echo", "text": 1}\n'
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS):
+    async with serve(tmp_path, STAND, HANDLERS):
         assert await answers(tmp_path, line * 3 + b"nonsense\n" + line) == [
             *[{"ok": True, "text": 1}] * 3,
             {"ok": False, "error": 'expected a JSON object such as {"do": "status"}'},
             {"ok": True, "text": 1},
         ]
-        reader, writer = await asyncio.open_unix_connection(tmp_path / SOCKET_NAME)
+        reader, writer = await connect(tmp_path)
         for byte in line:
             writer.write(bytes([byte]))
             await writer.drain()
@@ -131,29 +149,30 @@ async def test_requests_arrive_whole_byte_by_byte_and_many_at_once(tmp_path: Pat
 
 
 async def test_a_client_that_hangs_up_half_way_harms_nobody(tmp_path: Path):
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS):
+    async with serve(tmp_path, STAND, HANDLERS):
         for sent in (b"", b'{"do"', b'{"do": "echo"}\n' * 1000):
-            _, writer = await asyncio.open_unix_connection(tmp_path / SOCKET_NAME)
+            _, writer = await connect(tmp_path)
             writer.write(sent)
             writer.transport.abort()
         assert await asyncio.to_thread(ask, tmp_path, {"do": "echo", "text": 1}) == {"text": 1}
 
 
-async def test_many_clients_are_served_side_by_side_and_too_many_are_told_so(tmp_path: Path):
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS), contextlib.AsyncExitStack() as stack:
+async def test_many_clients_are_served_side_by_side_and_the_most_silent_makes_room(tmp_path: Path):
+    async with serve(tmp_path, STAND, HANDLERS), contextlib.AsyncExitStack() as stack:
         clients = []
-        for number in range(64):
-            client = await asyncio.open_unix_connection(tmp_path / SOCKET_NAME)
+        for number in range(MOST_CLIENTS):
+            client = await connect(tmp_path)
             stack.callback(client[1].close)
             client[1].write(json.dumps({"do": "echo", "text": number}).encode() + b"\n")
             clients.append(client)
-        for number, (reader, _) in enumerate(clients):
-            assert json.loads(await reader.readline())["text"] == number
-        with pytest.raises(SessionError, match="64 clients are connected already"):
-            await asyncio.to_thread(ask, tmp_path, {"do": "echo"})
-        clients[0][1].write_eof()
-        assert await clients[0][0].read() == b""
-        assert await asyncio.to_thread(ask, tmp_path, {"do": "echo"}) == {"text": None}
+            assert json.loads(await client[0].readline())["text"] == number
+        clients[0][1].write(b'{"do": "echo", "text": "not silent"}\n')
+        assert json.loads(await clients[0][0].readline())["text"] == "not silent"
+        assert await asyncio.to_thread(ask, tmp_path, {"do": "echo", "text": 1}) == {"text": 1}
+        assert "you were silent longest" in json.loads(await clients[1][0].readline())["error"]
+        assert await clients[1][0].read() == b""
+        clients[0][1].write(b'{"do": "echo", "text": "still there"}\n')
+        assert json.loads(await clients[0][0].readline())["text"] == "still there"
 
 
 async def test_a_request_that_ends_the_daemon_is_still_answered(tmp_path: Path):
@@ -164,53 +183,117 @@ async def test_a_request_that_ends_the_daemon_is_still_answered(tmp_path: Path):
         return {"said": "goodbye"}
 
     async def daemon() -> None:
-        async with serve(tmp_path / SOCKET_NAME, {"stop": end}):
+        async with serve(tmp_path, STAND, {"stop": end}):
             await ended.wait()
 
     running = asyncio.create_task(daemon())
     await asyncio.sleep(0)
     assert await answers(tmp_path, b'{"do": "stop"}\n') == [{"ok": True, "said": "goodbye"}]
     await running
-    assert not (tmp_path / SOCKET_NAME).exists()
+    assert entries_of(tmp_path) == []
 
 
 async def test_ending_does_not_wait_for_a_client_that_neither_asks_nor_reads(tmp_path: Path):
     async with asyncio.timeout(5):
-        async with serve(tmp_path / SOCKET_NAME, HANDLERS):
-            reader, writer = await asyncio.open_unix_connection(tmp_path / SOCKET_NAME)
+        async with serve(tmp_path, STAND, HANDLERS):
+            reader, writer = await connect(tmp_path)
             await answers(tmp_path, b'{"do": "echo"}\n')
         assert await reader.read() == b""
     writer.close()
     await writer.wait_closed()
 
 
-async def test_only_its_user_may_reach_the_socket_whatever_the_umask(tmp_path: Path):
+async def test_only_its_user_may_reach_the_socket_whatever_the_umask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     before = os.umask(0)
     try:
-        async with serve(tmp_path / SOCKET_NAME, HANDLERS):
-            mode = (tmp_path / SOCKET_NAME).stat().st_mode
+        async with serve(tmp_path, STAND, HANDLERS):
+            (daemon,) = [each for each in living() if each.entry.session == str(tmp_path)]
+            modes = [
+                stat.S_IMODE(path.stat().st_mode) for path in (daemon.socket.parent, *daemon.socket.parent.iterdir())
+            ]
     finally:
         os.umask(before)
-    assert stat.S_IMODE(mode) == 0o600
+    assert modes == [0o700, 0o600, 0o600]
 
 
-async def test_a_path_longer_than_the_kernel_takes_is_served(tmp_path: Path):
-    session = tmp_path / ("a" * 200) / ("b" * 200)
+async def test_paths_longer_than_the_kernel_takes_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    session, runtime = (tmp_path / name / ("a" * 200) / ("b" * 200) for name in ("sessions", "runtime"))
     session.mkdir(parents=True)
-    async with serve(session / SOCKET_NAME, HANDLERS):
+    runtime.mkdir(parents=True)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    async with serve(session, STAND, HANDLERS):
         assert await asyncio.to_thread(ask, session, {"do": "echo", "text": 1}) == {"text": 1}
         assert await asyncio.to_thread(running_sessions, session.parent) == [session]
     assert list(session.iterdir()) == []
+    assert list((runtime / "thermostand").iterdir()) == []
 
 
-async def test_a_second_daemon_is_refused_and_leaves_the_first_alone(tmp_path: Path):
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS):
-        with pytest.raises(SessionError, match="another daemon is running this session"):
-            async with serve(tmp_path / SOCKET_NAME, HANDLERS):
-                pass
-        assert await asyncio.to_thread(ask, tmp_path, {"do": "echo", "text": 1}) == {"text": 1}
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS):
-        pass
+async def told_its_folder(session: Path) -> None:
+    """Return when the daemon has said which folder it is, whatever its name."""
+    while not any(entry.identity for entry in entries_of(session)):
+        await asyncio.sleep(0.01)
+
+
+async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tmp_path: Path):
+    old, new = tmp_path / "sessions" / "old", tmp_path / "elsewhere" / "new"
+    old.mkdir(parents=True)
+    new.parent.mkdir()
+    (tmp_path / "link").symlink_to(old.parent)
+    async with serve(old, STAND, HANDLERS):
+        await told_its_folder(old)
+
+        async def reached() -> list[object]:
+            """By which of the names it is reached, and what it is called in each folder."""
+            names = [old, new, tmp_path / "link" / "old", Path(os.path.relpath(old))]
+            found = [name for name in names if await asyncio.to_thread(_answers, name)]
+            roots = (old.parent, new.parent, tmp_path / "link")
+            return [found == names, *[await asyncio.to_thread(running_sessions, root) for root in roots]]
+
+        assert await reached() == [False, [old], [], [tmp_path / "link" / "old"]]
+        old.rename(new)
+        assert await reached() == [True, [old], [new], [tmp_path / "link" / "old"]]
+        new.rename(new.with_name("newer"))
+        assert await asyncio.to_thread(running_sessions, new.with_name("newer")) == [new.with_name("newer")]
+        shutil.rmtree(new.parent)
+        assert await asyncio.to_thread(_answers, old)
+        assert not await asyncio.to_thread(_answers, new)
+
+
+def _answers(session: Path) -> bool:
+    try:
+        return ask(session, {"do": "echo", "text": 1}) == {"text": 1}
+    except SessionError:
+        return False
+
+
+async def test_two_daemons_with_one_name_are_told_apart_by_the_folder(tmp_path: Path):
+    """The first one's session was renamed, and the next run took its name."""
+    session, away = tmp_path / "night", tmp_path / "renamed"
+    session.mkdir()
+    async with serve(session, STAND, {"who": lambda _: {"is": "first"}}):
+        await told_its_folder(session)
+        session.rename(away)
+        session.mkdir()
+        async with serve(session, STAND, {"who": lambda _: {"is": "second"}}):
+            while len([entry for entry in entries_of(session) if entry.identity]) < 2:
+                await asyncio.sleep(0.01)
+            assert await asyncio.to_thread(ask, away, {"do": "who"}) == {"is": "first"}
+            assert await asyncio.to_thread(ask, session, {"do": "who"}) == {"is": "second"}
+
+
+async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As a logout does with $XDG_RUNTIME_DIR and all that is in it."""
+    runtime = tmp_path / "runtime"
+    runtime.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    async with serve(tmp_path, STAND, HANDLERS), asyncio.timeout(30):
+        shutil.rmtree(runtime / "thermostand")
+        with pytest.raises(SessionError, match="no daemon is running"):
+            await asyncio.to_thread(ask, tmp_path, {"do": "echo"})
+        while not await asyncio.to_thread(_answers, tmp_path):
+            await asyncio.sleep(0.05)
+    assert list((runtime / "thermostand").iterdir()) == []
 
 
 DAEMON = """
@@ -219,7 +302,7 @@ from pathlib import Path
 from stand.remote.control import serve
 
 async def run():
-    async with serve(Path(sys.argv[1]), {"echo": lambda request: {}}):
+    async with serve(Path(sys.argv[1]), "a stand", {"echo": lambda request: {}}):
         print("ready", flush=True)
         await asyncio.Event().wait()
 
@@ -232,9 +315,7 @@ def daemon() -> Iterator[Callable[[Path], "subprocess.Popen[str]"]]:
     started = []
 
     def start(session: Path) -> "subprocess.Popen[str]":
-        process = subprocess.Popen(
-            [sys.executable, "-c", DAEMON, str(session / SOCKET_NAME)], stdout=subprocess.PIPE, text=True
-        )
+        process = subprocess.Popen([sys.executable, "-c", DAEMON, str(session)], stdout=subprocess.PIPE, text=True)
         started.append(process)
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
@@ -247,21 +328,23 @@ def daemon() -> Iterator[Callable[[Path], "subprocess.Popen[str]"]]:
         process.stdout.close()
 
 
-async def test_the_socket_of_a_killed_daemon_is_nobodys_and_is_replaced(
-    tmp_path: Path, daemon: Callable[[Path], "subprocess.Popen[str]"]
+async def test_what_a_killed_daemon_left_is_nobodys_and_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, daemon: Callable[[Path], "subprocess.Popen[str]"]
 ):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    runtime_folder = tmp_path / "thermostand"
     process = daemon(tmp_path)
     assert ask(tmp_path, {"do": "echo"}) == {}
-    with pytest.raises(SessionError, match="another daemon is running this session"):
-        async with serve(tmp_path / SOCKET_NAME, HANDLERS):
-            pass
+    (entry,) = entries_of(tmp_path)
+    assert (entry.session, entry.pid, entry.stand) == (str(tmp_path), process.pid, "a stand")
     process.kill()
     process.wait()
-    assert (tmp_path / SOCKET_NAME).is_socket()
+    assert len(list(runtime_folder.iterdir())) == 2
     with pytest.raises(SessionError, match="no daemon is running this session"):
         ask(tmp_path, {"do": "echo"})
+    assert list(runtime_folder.iterdir()) == []
     assert running_sessions(tmp_path.parent) == []
-    async with serve(tmp_path / SOCKET_NAME, HANDLERS):
+    async with serve(tmp_path, STAND, HANDLERS):
         assert await asyncio.to_thread(ask, tmp_path, {"do": "echo", "text": 1}) == {"text": 1}
 
 
@@ -273,21 +356,37 @@ def test_a_daemon_that_hangs_is_told_from_one_that_is_not_there(
         ask(tmp_path, {"do": "echo"}, timeout_s=0.2)
 
 
-async def test_a_file_of_the_sockets_name_is_not_removed(tmp_path: Path):
-    (tmp_path / SOCKET_NAME).write_text("mine")
-    with pytest.raises(SessionError, match="is in the way of the control socket"):
-        async with serve(tmp_path / SOCKET_NAME, HANDLERS):
+async def test_a_runtime_folder_of_somebody_else_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "thermostand").symlink_to(tmp_path)
+    with pytest.raises(SessionError, match="is not a folder of this user; set XDG_RUNTIME_DIR"):
+        async with serve(tmp_path, STAND, HANDLERS):
             pass
-    assert (tmp_path / SOCKET_NAME).read_text() == "mine"
-    with pytest.raises(SessionError, match="no daemon is running this session"):
-        ask(tmp_path, {"do": "echo"})
+    (tmp_path / "thermostand").unlink()
+    (tmp_path / "thermostand").write_text("mine")
+    with pytest.raises(SessionError, match="cannot be made"):
+        async with serve(tmp_path, STAND, HANDLERS):
+            pass
+    (tmp_path / "thermostand").unlink()
+    (tmp_path / "thermostand").mkdir(mode=0o755)
+    assert stat.S_IMODE(runtime.runtime_folder().stat().st_mode) == 0o700
 
 
-def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentences(tmp_path: Path):
-    with pytest.raises(SessionError, match="no daemon is running this session"):
-        ask(tmp_path, {"do": "status"})
-    with pytest.raises(SessionError, match="cannot be opened"):
-        ask(tmp_path / "nowhere", {"do": "status"})
+@pytest.mark.parametrize("named", ["", "relative", "/nonexistent"])
+def test_without_a_folder_of_the_login_the_systems_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str):
+    monkeypatch.setattr(runtime, "SYSTEM_FOLDER", tmp_path / "lock")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", named)
+    assert runtime.runtime_folder() == tmp_path / "lock"
+    assert (tmp_path / "lock").is_dir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert runtime.runtime_folder() == tmp_path / "thermostand"
+    assert runtime.runtime_folders() == (tmp_path / "thermostand", tmp_path / "lock")  # daemons of both are found
+
+
+def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentence(tmp_path: Path):
+    for session in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(SessionError, match="no daemon is running this session"):
+            ask(session, {"do": "status"})
 
 
 @pytest.mark.parametrize(
@@ -295,9 +394,9 @@ def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentences(tmp
     [
         (b"", "ended before it answered"),
         (b'{"ok": true', "ended before it answered"),
-        (b"hello\n", "answered what nobody understands"),
-        (b'{"ok": 1}\n', "answered what nobody understands"),
-        (b'{"ok": true, "status": {"recipe": 3}}\n', "as another version would"),
+        (b"hello\n", "sent an unknown reply"),
+        (b'{"ok": 1}\n', "sent an unknown reply"),
+        (b'{"ok": true, "status": {"recipe": 3}}\n', "sent an unknown status"),
     ],
 )
 async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: bytes, sentence: str):
@@ -306,21 +405,23 @@ async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: byt
         writer.write(said)
         writer.close()
 
-    listening = socket.socket(socket.AF_UNIX)
-    listening.bind(str(tmp_path / SOCKET_NAME))
-    async with await asyncio.start_unix_server(talk, sock=listening):
-        with pytest.raises(SessionError, match=sentence):
-            await asyncio.to_thread(ask_status, tmp_path)
+    presence = Presence(Entry(str(tmp_path), os.getpid(), STAND))
+    try:
+        async with await asyncio.start_unix_server(talk, sock=presence.appear()):
+            with pytest.raises(SessionError, match=sentence):
+                await asyncio.to_thread(ask_status, tmp_path)
+    finally:
+        presence.disappear()
 
 
 async def test_an_operator_holds_releases_clears_and_stops_the_run(tmp_path: Path):
     gate, stopped = gate_held_by("interlock"), asyncio.Event()
-    async with serve(tmp_path / SOCKET_NAME, handlers(gate, stopped.set, lambda: STATUS)):
+    async with serve(tmp_path, STAND, handlers(gate, stopped.set, lambda: STATUS)):
 
         async def do(what: str) -> dict[str, object]:
             return await asyncio.to_thread(ask, tmp_path, {"do": what})
 
-        assert await do("pause") == {"reasons": ["interlock", "operator"]}
+        assert await do("pause") == {"reasons": ["interlock", "operator"], "moving": []}
         assert await do("continue") == {"reasons": ["interlock"]}  # no reason takes another's place
         assert await do("clear") == {"reasons": []}
         with pytest.raises(SessionError, match="nothing to clear"):

@@ -3,15 +3,24 @@
 import asyncio
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import pytest
 import yaml
 from click.testing import Result
 from typer.testing import CliRunner
 
-from stand.commandline.control_cli import app
+from drivers.clock import NS_PER_S
+from stand.commandline.control_cli import app, status_lines
 from stand.config import packaged
-from stand.remote.control import SOCKET_NAME, RunStatus, handlers, serve
+from stand.hub import Event
+from stand.remote.control import RunStatus, handlers, serve
+from stand.remote.control_client import ask
+from stand.remote.status import StatusBoard
 from stand.running.gate import Gate
+from stand.running.scheduler import Progress
+from stand.running.stop import Stop
+from tests.host import Host
 
 runner = CliRunner()
 
@@ -52,7 +61,7 @@ def session(root: Path, name: str) -> Path:
 
 async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
     path = session(tmp_path, "night")
-    async with serve(path / SOCKET_NAME, handlers(Gate(), lambda: None, lambda: STATUS)):
+    async with serve(path, "a stand", handlers(Gate(), lambda: None, lambda: STATUS)):
         lines = (await invoke("status", tmp_path)).stdout.splitlines()
         told = json.loads((await invoke("status", path, "--json")).stdout)
     assert lines == [
@@ -71,9 +80,35 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
     assert told["session"] == str(path)
 
 
+def test_status_tells_utc_when_the_system_clock_was_stepped_after_the_present_state_began():
+    hour_ns = 3600 * NS_PER_S
+    stepped = STATUS.model_copy(
+        update={"utc_offset_ns": hour_ns, "warning_ns": STATUS.since_ns, "warning_utc_offset_ns": -hour_ns}
+    )
+    lines = [line for line in status_lines(Path("night"), stepped) if " UTC" in line]
+    assert lines == [
+        "state         held: disk_low, operator, since 2026-01-01 17:59:00 UTC (0:01:00)",
+        "ends          2026-01-01 20:00:00 UTC (in 1:00:00)",
+        "last warning  2026-01-01 16:59:00 UTC: a line\\nand another",
+    ]
+
+
+def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_its_warning_came():
+    host, gate = Host(), Gate()
+    clock = host.clock()
+    recorder = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
+    board = StatusBoard("night", (), Progress(), gate, Stop(), lambda: None, recorder, clock)
+    host.step(3600)
+    board(Event(clock.now_ns(), "warning", "odd", "it is so"))
+    host.step(-60)
+    told = board.status()
+    offsets_ns = (told.since_utc_offset_ns, told.warning_utc_offset_ns, told.utc_offset_ns)
+    assert offsets_ns == (0, 3600 * NS_PER_S, 3540 * NS_PER_S)
+
+
 async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_path: Path):
     path, gate, stopped = session(tmp_path, "night"), gate_held_by("interlock"), asyncio.Event()
-    async with serve(path / SOCKET_NAME, handlers(gate, stopped.set, lambda: STATUS)):
+    async with serve(path, "a stand", handlers(gate, stopped.set, lambda: STATUS)):
         assert "paused" in (await invoke("pause", tmp_path)).stdout
         assert gate.reasons == {"operator", "interlock"}
         held = (await invoke("continue", tmp_path)).stdout
@@ -87,15 +122,25 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         assert stopped.is_set()
 
 
+@pytest.mark.parametrize(("moving", "said"), [(["linear to 250 mm", "flap opening"], "still moving"), ([], "nothing")])
+async def test_a_pause_says_what_still_moves(tmp_path: Path, moving: list[str], said: str):
+    path, gate = session(tmp_path, "night"), Gate()
+    async with serve(path, "a stand", handlers(gate, lambda: None, lambda: STATUS, lambda: moving)):
+        text = (await invoke("pause", tmp_path)).stdout
+        assert said in text
+        assert all(each in text for each in moving)
+        assert (await asyncio.to_thread(ask, path, {"do": "pause"}))["moving"] == moving
+
+
 async def test_without_a_name_the_only_running_session_is_meant(tmp_path: Path):
     first, second = session(tmp_path, "first"), session(tmp_path, "second")
     table = handlers(Gate(), lambda: None, lambda: STATUS)
     nobody = await invoke("status", tmp_path)
     assert nobody.exit_code == 1
     assert nobody.stderr == f"error: {tmp_path}: no daemon is running a session there\n"
-    async with serve(second / SOCKET_NAME, table):
+    async with serve(second, "a stand", table):
         assert str(second) in (await invoke("status", tmp_path)).stdout
-        async with serve(first / SOCKET_NAME, table):
+        async with serve(first, "a stand", table):
             both = await invoke("pause", tmp_path)
     assert both.exit_code == 2
     assert both.stderr == f"error: {tmp_path}: several sessions are running, name one: {first}, {second}\n"
@@ -108,7 +153,7 @@ async def test_the_recording_directory_of_the_configuration_is_searched(tmp_path
     config.write_text(yaml.safe_dump(data))
     (tmp_path / "recordings").mkdir()
     path = session(tmp_path / "recordings", "night")
-    async with serve(path / SOCKET_NAME, handlers(Gate(), lambda: None, lambda: STATUS)):
+    async with serve(path, "a stand", handlers(Gate(), lambda: None, lambda: STATUS)):
         found = await invoke("status", "--config", config)
     assert str(path) in found.stdout
 

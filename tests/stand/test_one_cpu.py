@@ -5,10 +5,11 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
-from stand.simulator import one_cpu
+from stand.one_cpu import one_cpu
 
 CPUS = "import os; print(sorted(os.sched_getaffinity(0)))"
 
@@ -43,3 +44,34 @@ def test_the_cpus_are_given_back_also_after_an_error():
     with pytest.raises(ValueError, match="half-way"), one_cpu():
         raise ValueError("half-way")
     assert os.sched_getaffinity(0) == usable
+
+
+HOLD = """
+import os, sys
+from stand import one_cpu
+
+one_cpu._CPU_FOLDER = sys.argv[1]  # those of the machine may be taken by others just now
+with one_cpu.one_cpu():
+    print(sorted(os.sched_getaffinity(0)), flush=True)
+    input()
+"""
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="there is one CPU only")
+def test_runs_side_by_side_take_different_cpus_and_a_killed_one_gives_its_own_back(tmp_path: Path):
+    """Whatever the numbers of their processes: as many at once as there are CPUs, and as many again."""
+    usable = os.sched_getaffinity(0)
+    for cpu in usable:
+        (tmp_path / f"cpu{cpu}").mkdir()
+    command = [sys.executable, "-c", HOLD, str(tmp_path / "cpu{}")]
+    for _ in range(2):
+        runs = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in usable]
+        taken = {run.stdout.readline() for run in runs if run.stdout is not None}
+        for run in runs:
+            run.kill()
+            run.communicate()
+        assert len(taken) == len(usable)
+
+
+def test_the_kernel_has_the_folders_by_which_cpus_are_taken():
+    assert all(Path(f"/sys/devices/system/cpu/cpu{cpu}").is_dir() for cpu in os.sched_getaffinity(0))

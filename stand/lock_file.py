@@ -1,0 +1,54 @@
+"""A file that is locked (flock) as long as the process that took it lives, and says who that is."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from contextlib import suppress
+from pathlib import Path
+
+
+def take(path: Path, content: bytes) -> int | None:
+    """The descriptor of the file at `path`, locked and with this content; None when a living process has it locked.
+    What a dead one left is taken over. Raises OSError."""
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            if not try_lock(file):
+                os.close(file)
+                return None
+            if is_at(file, path):
+                os.ftruncate(file, 0)
+                os.pwrite(file, content, 0)
+                return file
+        except BaseException:
+            os.close(file)
+            raise
+        os.close(file)  # somebody removed it between opening and locking
+
+
+def remove(path: Path, file: int) -> None:
+    """Remove and unlock what `take` has given, unless somebody else has the name by now."""
+    with suppress(OSError):
+        if is_at(file, path):
+            path.unlink()
+    os.close(file)
+
+
+def try_lock(file: int, *, shared: bool = False) -> bool:
+    """Whether the lock was to be had; nobody is waited for. Raises OSError."""
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def is_at(file: int, path: Path) -> bool:
+    """Whether `path` is still a name of the opened file."""
+    try:
+        named = os.lstat(path)
+    except FileNotFoundError:
+        return False
+    opened = os.fstat(file)
+    return (named.st_dev, named.st_ino) == (opened.st_dev, opened.st_ino)
