@@ -22,11 +22,13 @@ from drivers.thermometers import ThermometerChannel, Thermometers
 from stand.config import CameraConfig, StandConfig, packaged
 from stand.guarding.compressor import CompressorLimits
 from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Fault
+from stand.guarding.interlocks import Fault, Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
-from stand.guarding.rules import Announcements, watches
+from stand.guarding.permits import PermitLimits
+from stand.guarding.rules import VITAL, Announcements, recorded, watches
 from stand.hub import Hub
 from stand.poller import Poller
+from stand.running.equilibrium import EquilibriumLimits
 from stand.stand import Devices, Limits, Stand
 
 
@@ -54,12 +56,37 @@ class Assembly:
         ]
         return tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
 
-    def guard(self, stop: Callable[[Fault], None], hold: Callable[[Fault], None] | None = None) -> Guard:
-        """The guard with the configured rules; on a fault it calls `stop`, or `hold` where waiting is enough."""
-        limits, announced = self.config.guard, Announcements()
+    def guard(
+        self,
+        stop: Callable[[Fault], None],
+        hold: Callable[[Fault], None] | None = None,
+        release: Callable[[], None] | None = None,
+        recording: Recording | None = None,
+    ) -> Guard:
+        """The guard with the configured rules, those of `recording` among them; on a fault it calls `stop`, or `hold`
+        where waiting is enough, and `release` when a hold has ended by itself. From now on nothing is permitted without
+        it."""
+        announced, stand = Announcements(), self.stand
         self.hub.subscribe(announced.receive)
-        rules, renew_s = watches(self.config, announced), limits.heater_renew_s
-        return Guard(self.stand, rules, self.hub, self.clock, limits.period_s, renew_s, stop, hold, self.notifier())
+        guard = Guard(
+            stand.safety,
+            (
+                *watches(self.config, announced),
+                Watch(intrusion(lambda: stand.permits.intrusions), action="hold"),
+                *(recorded(self.config, recording) if recording is not None else ()),
+            ),
+            self.hub,
+            self.clock,
+            self.config.guard.period_s,
+            stop,
+            hold,
+            release,
+            stand.cut_camera,
+            self.notifier(),
+            VITAL,
+        )
+        stand.permits.allowed = guard.may_permit
+        return guard
 
     def notifier(self) -> Notifier:
         """Whoever is to be told when nobody is there."""
@@ -67,7 +94,10 @@ class Assembly:
 
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
-    """Make every device the configuration names; nothing is opened. ConfigError when a named file is missing."""
+    """Make every device the configuration names; nothing is opened. ConfigError when a named file, or the program of
+    guard.notify, is missing: a plan of the same configuration can be made elsewhere."""
+    if missing := Notifier(config.guard.notify, config.guard.notify_limit_s, clock).missing():
+        raise ConfigError(missing)
     line = LineSettings(config.bus.baud, config.bus.parity, config.bus.stopbits)
     bus = Bus("bus", config.bus.address, clock, line, config.bus.timeout_s, config.bus.gap_s)
     devices = Devices(
@@ -95,8 +125,10 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     state_file = config.compressor.state_file
     if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces
         state_file = config.recording.directory / "compressor.json"
+    permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, compressor)
+    equilibrium = EquilibriumLimits(**config.camera.equilibrium.model_dump())
     limits = Limits(
-        config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor, state_file
+        config.limits.chamber_degC, permits, config.guard.heater_renew_s, config.camera.boot_s, equilibrium, state_file
     )
     return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock))
 

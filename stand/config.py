@@ -17,6 +17,8 @@ from drivers.documents import Document, load_document
 from drivers.interface import ConfigError
 from experiments.parameters import Chamber_degC
 from stand.guarding.config_guard import GuardConfig
+from stand.guarding.config_looks import ChamberConfig
+from stand.guarding.safe_ranges import check, outside
 
 
 def _tcp_address(address: str) -> str:
@@ -91,12 +93,14 @@ class RegulatorConfig(Document):
 
 
 class RelaysConfig(Document):
-    """The relay board: which relay does what (0 is the first)."""
+    """The relay board: which relay does what (0 is the first). self_test_s: of the timed-on with which the board's
+    timer is tested, once at the start of each run; the test takes 2.2 times as long."""
 
     registers: str
     unit: Unit
     channels: dict[RelayName, Annotated[int, Field(ge=0, le=31)]]
     poll_s: PollPeriod_s = 5.0
+    self_test_s: float = Field(default=3.0, ge=0.6, le=10)
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -202,6 +206,16 @@ class CameraTemperatureConfig(Document):
         return self
 
 
+class EquilibriumConfig(Document):
+    """When a camera that was or may have been off is in thermal equilibrium again: its own temperature has moved by
+    less than rate_K_per_min for duration_s; without a temperature, 5 x time_constant_s (of its slowest part) are
+    over."""
+
+    rate_K_per_min: float = Field(default=0.2, gt=0, le=5)
+    duration_s: float = Field(default=600.0, ge=60, le=7200)
+    time_constant_s: float = Field(default=1500.0, ge=10, le=36000)
+
+
 class CameraConfig(Document):
     """The GigE Vision camera, by IP address. boot_s: from its supply being switched on until it answers."""
 
@@ -218,6 +232,7 @@ class CameraConfig(Document):
     heartbeat_s: float = Field(default=3.0, ge=1.5, le=60)  # Aravis asks once a second
     temperature: CameraTemperatureConfig | None = None
     boot_s: float = Field(default=8.0, ge=0, le=600)
+    equilibrium: EquilibriumConfig = EquilibriumConfig()
     poll_s: PollPeriod_s = 1.0
 
 
@@ -245,25 +260,29 @@ class RecordingConfig(Document):
     """Where sessions go, how often telemetry is committed, and what is left of the disk.
 
     roi keeps the markers' surroundings and a whole frame every `whole_every_s`. With less than `stop_frames_below_GB`
-    free no frame is recorded, with less than `alert_below_percent` of the disk there is a warning.
+    free no frame is recorded, with less than `alert_below_percent` of the disk there is a warning. What is published is
+    on the disk within `durable_within_s`, or the stand is made safe.
     """
 
     directory: Annotated[Path, AfterValidator(_printable)] = Path("sessions")
     frame_encoding: Literal["png", "raw", "roi"] = "png"
     whole_every_s: float = Field(default=60.0, gt=0, le=86400)
     telemetry_commit_s: float = Field(default=1.0, gt=0, le=1)
+    durable_within_s: float = Field(default=60.0, ge=1, le=300)
     stop_frames_below_GB: float = Field(default=2.0, ge=0, le=1000)
     alert_below_percent: float = Field(default=10.0, ge=0, le=100)
 
 
 class SimulationConfig(Document):
-    """The simulated laboratory behind these addresses; a real laboratory has no such section."""
+    """The simulated laboratory behind these addresses; a real laboratory has no such section. chamber_seed: another
+    chamber than the standard one, its conductances, lags and powers drawn within +-30 %."""
 
     control: TcpAddress
     start: Annotated[AwareDatetime, AfterValidator(_of_this_century)] = datetime(2026, 1, 1, 18, tzinfo=UTC)
     seed: int = Field(default=1, ge=0)
     camera: Literal["modified", "unmodified"] = "modified"
     laboratory_degC: float = Field(default=24.0, ge=-10, le=40)
+    chamber_seed: int | None = Field(default=None, ge=0)
 
 
 class StandConfig(Document):
@@ -279,6 +298,7 @@ class StandConfig(Document):
     axes: dict[Literal["linear", "rotary"], AxisConfig] = Field(default_factory=dict)
     flap: FlapConfig
     camera: CameraConfig
+    chamber: ChamberConfig = ChamberConfig()
     limits: LimitsConfig = LimitsConfig()
     guard: GuardConfig = GuardConfig()
     compressor: CompressorConfig = CompressorConfig()
@@ -296,6 +316,11 @@ class StandConfig(Document):
             raise ValueError(f"bus and axes need addresses of their own, {twice} is given twice")
         if self.limits.chamber_degC[1] >= self.guard.max_air_degC:
             raise ValueError("guard.max_air_degC must be above the upper limits.chamber_degC, or a normal run trips it")
+        if self.guard.heat_max_Wh_per_h >= self.chamber.heater_W:
+            raise ValueError(
+                f"guard.heat_max_Wh_per_h {self.guard.heat_max_Wh_per_h:g} is never reached by a heater of "
+                f"{self.chamber.heater_W:g} W (chamber.heater_W); take about 0.7 of its power"
+            )
         for name in ("granite", "camera"):  # they follow the air
             limit_degC = getattr(self.guard, f"max_{name}_degC")
             if limit_degC < self.limits.chamber_degC[1]:
@@ -308,7 +333,15 @@ class StandConfig(Document):
         slowest_s = max(self.regulator.poll_s, self.relays.poll_s)
         if slowest_s * 2 > self.guard.keys_s:
             raise ValueError(f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)")
+        check(self, self._thermometers(), self.guard.accept)
         return self
+
+    def accepted(self) -> dict[str, float]:
+        """The values outside their safe ranges, which guard.accept names, by their paths."""
+        return outside(self, self._thermometers())
+
+    def _thermometers(self) -> dict[str, ThermometerConfig]:
+        return {str(name): entry for name, entry in self.thermometers.channels.items()}
 
 
 def load_config(path: Path) -> StandConfig:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -31,12 +31,16 @@ class StepMark:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something worth knowing later: a fault, a gap, a trip, the end of a run. level: info, warning or error."""
+    """Something worth knowing later: a fault, a gap, a trip, the end of a run. level: info, warning or error.
+
+    `text` is for people, `kind` and `data` (JSON-able fields) are for programs: nothing is read out of a sentence.
+    """
 
     time_ns: int
     level: str
     kind: str
     text: str
+    data: Mapping[str, object] = field(default_factory=dict[str, object])
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,7 @@ class Hub:
 
     def __init__(self) -> None:
         self._latest: dict[str, Reading] = {}
+        self._known: dict[str, Reading] = {}
         self._good_ns: dict[str, int] = {}
         self._subscribers: list[Subscriber] = []
 
@@ -72,6 +77,8 @@ class Hub:
         if isinstance(item, Batch):
             for reading in item.readings:
                 self._latest[reading.channel] = reading
+                if reading.cause != "wire":
+                    self._known[reading.channel] = reading
                 if reading.quality is Quality.GOOD:
                     self._good_ns[reading.channel] = reading.time_ns
         for subscriber in self._subscribers:
@@ -80,6 +87,11 @@ class Hub:
     def latest(self, channel: str) -> Reading | None:
         """The last reading of `channel`, or None when there was none yet."""
         return self._latest.get(channel)
+
+    def known(self, channel: str) -> Reading | None:
+        """The last reading but for those that are BAD by the wire, which say nothing of what is measured: a single lost
+        reply makes nobody forget. How old it may be is for the guard (trustworthy) to judge."""
+        return self._known.get(channel)
 
     def last_good_ns(self, channel: str) -> int | None:
         """When `channel` last gave a GOOD reading, or None when it never did."""

@@ -1,17 +1,22 @@
-"""Reads one device on its period and publishes what it gave; a failed read is a BAD reading, never an old value."""
+"""Reads one device on its period and publishes what it gave; a failed read is a BAD reading, never an old value.
+
+Whether the wire failed (it is asked again soon) or the device itself declines is in the readings' cause.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from drivers.clock import Clock, seconds_ns
-from drivers.interface import DeviceError, Reading, Sensor, bad_reading
+from drivers.interface import Cause, DeviceError, Reading, Sensor, bad_reading
 from stand.hub import Batch, Event, Hub
+
+_AGAIN_S = 1.0  # after a poll that failed on the wire
 
 
 @dataclass
 class Poller:
-    """Polls `sensor` every `period_s` (absolute deadlines) until cancelled.
+    """Polls `sensor` every `period_s` (absolute deadlines) until cancelled; 1 s after a poll that failed on the wire.
 
     `first()` must succeed before `run()`: what it returns tells which channels to declare BAD when a later read fails.
     """
@@ -24,6 +29,7 @@ class Poller:
     def __post_init__(self) -> None:
         self._known: tuple[Reading, ...] = ()
         self._failing = False
+        self._ask_again = False
 
     async def first(self) -> None:
         """The first read, published; raises DeviceError, because a stand that cannot read does not start."""
@@ -31,9 +37,9 @@ class Poller:
 
     async def run(self) -> None:
         """Poll until cancelled."""
-        period_ns = seconds_ns(self.period_s)
         due_ns = self.clock.now_ns()
         while True:
+            period_ns = seconds_ns(min(self.period_s, _AGAIN_S) if self._ask_again else self.period_s)
             due_ns = max(due_ns + period_ns, self.clock.now_ns())  # a late poll is not made up for by a burst
             await self.clock.sleep_until(due_ns)
             await self.poll()
@@ -43,8 +49,9 @@ class Poller:
         try:
             readings = await self.sensor.read()
         except DeviceError as error:
-            self._lost(str(error))
+            self._lost(error)
             return
+        self._ask_again = False
         if self._failing:
             self._failing = False
             self.hub.publish(Event(self.clock.now_ns(), "info", "device_back", f"{self.sensor.name} answers again"))
@@ -54,10 +61,12 @@ class Poller:
         self._known = readings
         self.hub.publish(Batch(self.sensor.name, self.clock.now_ns(), readings))
 
-    def _lost(self, reason: str) -> None:
-        now_ns = self.clock.now_ns()
+    def _lost(self, error: DeviceError) -> None:
+        now_ns, reason = self.clock.now_ns(), str(error)
+        self._ask_again = error.retryable
+        cause: Cause = "wire" if error.retryable else "device"
         if not self._failing:
             self._failing = True
             self.hub.publish(Event(now_ns, "warning", "device_lost", reason))
-        bad = tuple(bad_reading(reading.channel, reading.unit, now_ns, reason) for reading in self._known)
+        bad = tuple(bad_reading(reading.channel, reading.unit, now_ns, reason, cause) for reading in self._known)
         self.hub.publish(Batch(self.sensor.name, now_ns, bad))

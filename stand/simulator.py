@@ -7,68 +7,77 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 
 from drivers.clock import seconds_ns
 from drivers.interface import ConfigError, Unreachable
 from stand.config import StandConfig
 
-_READY = "ready"
 _STOP_LIMIT_S = 5.0
+_FREE_TCP, _FREE_SERIAL = "tcp:127.0.0.1:0", "serial:"
 
 
-def laboratory_of(config: StandConfig, *, virtual: bool, seed: int | None) -> dict[str, object]:
-    """What the simulator is told: which fake answers where. ConfigError when the stand is not a simulated one."""
+def laboratory_of(
+    config: StandConfig, *, virtual: bool, seed: int | None, start_ns: int | None = None, is_anywhere: bool = False
+) -> dict[str, object]:
+    """What the simulator is told: which fake answers where, or `is_anywhere`: each at a free address of the same kind.
+    ConfigError when the stand is not a simulated one.
+
+    start_ns: the first instant in virtual time, else the configured one.
+    """
     simulation = config.simulation
     if simulation is None:
         raise ConfigError(f"{config.name}: no `simulation` section; this is not a simulated laboratory")
+
+    def address_of(configured: str | None) -> str | None:
+        if not is_anywhere or configured is None:
+            return configured
+        return _FREE_SERIAL if configured.startswith(_FREE_SERIAL) else _FREE_TCP
+
     return {
         "virtual": virtual,
-        "control": simulation.control,
-        "start_ns": seconds_ns(simulation.start.timestamp()),
+        "control": address_of(simulation.control),
+        "start_ns": seconds_ns(simulation.start.timestamp()) if start_ns is None else start_ns,
         "seed": simulation.seed if seed is None else seed,
         "camera_kind": simulation.camera,
         "laboratory_degC": simulation.laboratory_degC,
-        "bus": config.bus.address,
+        "chamber_seed": simulation.chamber_seed,
+        "bus": address_of(config.bus.address),
         "regulator_unit": config.regulator.unit,
         "relays_unit": config.relays.unit,
         "relay_channels": dict(config.relays.channels),
         "thermometers_unit": config.thermometers.unit,
         "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.channels.items()},
         "axes": {
-            name: {"address": axis.address, "profile": axis.profile, "serial_number": axis.serial_number}
+            name: {"address": address_of(axis.address), "profile": axis.profile, "serial_number": axis.serial_number}
             for name, axis in config.axes.items()
         },
-        "flap": {"address": config.flap.backend_address, "serial_number": config.flap.serial_number},
-        "camera": {"address": config.camera.address, "serial_number": config.camera.serial_number},
+        "flap": {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
+        "camera": {
+            "address": None if is_anywhere else config.camera.address,
+            "serial_number": config.camera.serial_number,
+        },
     }
 
 
-@contextmanager
-def one_cpu() -> Generator[None]:
-    """Inside, this process and whatever it starts (the simulator) run on one of the CPUs they may use.
-
-    In virtual time daemon and simulator take turns, a dozen in each polled second, and never work at once. On one CPU a
-    turn is a switch of context; on two it is waking an idle CPU, which takes longer than the answer.
-    """
-    usable = os.sched_getaffinity(0)
-    _use({sorted(usable)[os.getpid() % len(usable)]})
-    try:
-        yield
-    finally:
-        _use(usable)
-
-
-def _use(cpus: set[int]) -> None:
-    """Every thread of this process: one that waits for work in a pool would start the simulator elsewhere."""
-    for thread in os.listdir("/proc/self/task"):
-        with suppress(ProcessLookupError):  # it has ended meanwhile
-            os.sched_setaffinity(int(thread), cpus)
+def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
+    """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses)."""
+    simulation = config.simulation
+    axes = {name: axis.model_copy(update={"address": addresses[name]}) for name, axis in config.axes.items()}
+    return config.model_copy(
+        update={
+            "bus": config.bus.model_copy(update={"address": addresses["bus"]}),
+            "axes": axes,
+            "flap": config.flap.model_copy(update={"backend_address": addresses["flap"]}),
+            "camera": config.camera.model_copy(update={"address": addresses["camera"]}),
+            "simulation": simulation and simulation.model_copy(update={"control": addresses["control"]}),
+        }
+    )
 
 
 class Simulator:
-    """A running simulator process."""
+    """A running simulator process; `addresses` says where each device and the control socket answers."""
 
     def __init__(self, laboratory: Mapping[str, object]) -> None:
         self._process = subprocess.Popen(
@@ -84,10 +93,12 @@ class Simulator:
             raise ValueError("the simulator was started without its pipes")
         self._process.stdin.write(json.dumps(laboratory))
         self._process.stdin.close()
-        if self._process.stdout.readline().strip() != _READY:
+        line = self._process.stdout.readline()
+        if not line:
             reason = self._process.stderr.read().strip().splitlines()
             self.stop()
             raise ConfigError(f"the simulator did not start: {reason[-1] if reason else 'it said nothing'}")
+        self.addresses: dict[str, str] = json.loads(line)
 
     def stop(self) -> None:
         """End the process; may be called twice."""

@@ -3,27 +3,44 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from drivers.camera import Camera
-from drivers.clock import Clock, seconds_ns
+from drivers.clock import Clock, boot_of, seconds_ns
 from drivers.flap import Flap
-from drivers.interface import Actuator, ConfigError, Frame, GarbledReply, StandTripped, Unreachable
+from drivers.interface import (
+    Actuator,
+    ConfigError,
+    DeviceError,
+    DeviceFault,
+    Frame,
+    Occupied,
+    StandTripped,
+    Unreachable,
+)
 from drivers.regulator import Regulator
-from drivers.relays import Relays
+from drivers.relays import CAMERA_POWER, Relays
 from drivers.stage import Axis
 from drivers.thermometers import Thermometers
-from stand.guarding.compressor import CompressorLimits, CompressorState, decide, keep, restored
+from stand.guarding.compressor import restored
+from stand.guarding.compressor_file import CompressorFile
 from stand.guarding.interlocks import Fault
+from stand.guarding.keeper import Keeper
+from stand.guarding.permits import PermitLimits, Permits
+from stand.guarding.safety import Safety
 from stand.hub import Event, Hub
 from stand.running.camera_cooling import Cooling, cool_down, last_word
+from stand.running.equilibrium import CameraEquilibrium, EquilibriumLimits
 from stand.running.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
+from stand.running.motions import Motions
 from stand.running.stage_care import check_home, ready
+from stand.running.tasks import cancelled
 
-# Real seconds for all actuators together to reach their safe state; the dead-man relay drops by itself after that.
-_SAFE_LIMIT_S = 10.0
+_JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor must not be worn
+_OCCUPIED_AGAIN_S = 5.0
 _CAMERA_BOOT_LIMIT_S = 60.0
 _CAMERA_LOST_LIMIT_S = 1800.0
 _CAMERA_RETRY_S, _CAMERA_LONGEST_RETRY_S = 1.0, 10.0
@@ -47,18 +64,32 @@ class Devices:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What no step may exceed, how long a permission to heat or cool lives, how long the camera takes to boot."""
+    """What no step may exceed, how long a permission to heat or cool lives and how often it is renewed (s), how long
+    the camera takes to boot (s)."""
 
     chamber_degC: tuple[float, float]
-    hold_s: float
+    permits: PermitLimits
+    renew_s: float
     camera_boot_s: float
-    compressor: CompressorLimits
+    equilibrium: EquilibriumLimits = field(default_factory=EquilibriumLimits)
     compressor_file: Path | None = None  # what the compressor did last, for the next daemon
 
 
+class _CameraSupply:
+    """The camera's supply as an actuator that is safe when it is off."""
+
+    def __init__(self, relays: Relays) -> None:
+        self.name = f"{relays.name}.{CAMERA_POWER}"
+        self._relays = relays
+
+    async def make_safe(self) -> None:
+        """Off, confirmed."""
+        await self._relays.switch(CAMERA_POWER, on=False)
+
+
 class Stand:
-    """One stand. After a latched fault every verb but close_flap and make_safe raises StandTripped, while an interlock
-    holds the gate Interlocked."""
+    """One stand. After a latched fault every verb but close_flap raises StandTripped, while an interlock holds the gate
+    Interlocked. `safety` is the one owner of making it safe, `permits` of heat and cold, `keeper` renews those."""
 
     def __init__(self, devices: Devices, limits: Limits, hub: Hub, clock: Clock) -> None:
         self.devices = devices
@@ -68,162 +99,175 @@ class Stand:
         self._limits = limits
         self._hub = hub
         self._clock = clock
-        self._permitted = False
-        self._compressor = restored(limits.compressor_file, clock.now_ns())
-        self._compressor_until_ns = 0  # when its timed-on relay drops unless renewed
-        self._making_safe = asyncio.Lock()
+        self.compressor_file = CompressorFile(limits.compressor_file, hub, clock)
+        compressor = restored(limits.compressor_file, clock.now_ns(), boot_of(clock))
+        self.permits = Permits(devices.relays, limits.permits, compressor, self.compressor_file.note, hub, clock)
+        self.safety = Safety(self.permits.revoke, hub, clock)
+        self.keeper = Keeper(
+            self.permits, devices.regulator, hub, clock, limits.renew_s, lambda: self._camera_supplied, self._dropped
+        )
+        self.camera_was_supplied: bool | None = None  # before this daemon switched it on
+        self._camera_supplied = False  # its supply is on, as far as we know
         self._commanded: dict[str, float] = {}  # axis -> mm or deg, where the plan put it last
+        self.motions = Motions()
+        self.equilibrium = CameraEquilibrium(limits.equilibrium, hub, clock)
+        self._moving_flap = asyncio.Lock()  # one after the other; making safe waits for nobody
+        self._without_camera_ns = 0  # how long a lost camera was waited for since its last frame
         self._cooling: Cooling | None = None  # the camera's last word before it was switched off
-        self.unconfirmed: tuple[str, ...] = ()  # what the last make_safe could not confirm
 
     def latch(self, fault: Fault) -> None:
         """Close the gate for good; the first fault stays. Nothing earns time while the stand is being made safe."""
         self.fault = self.fault or fault
         self.gate.hold(STOPPING)
-        self._permitted = False
+        self.permits.revoke()
+
+    def opened(self, actuator: Actuator) -> None:
+        """This actuator answers: from now on it is made safe whenever that is demanded."""
+        if actuator is self.devices.relays:
+            self.safety.take(self.permits)
+        elif actuator is self.devices.flap:
+            self.safety.take(actuator, _JAMMED_AGAIN_S)
+        else:
+            self.safety.take(actuator)
 
     async def start_chamber(self, chamber_degC: float) -> None:
         """Permit heating and cooling, set the set-point, run the regulator."""
-        self._check(chamber_degC)
-        await self.devices.regulator.set_temperature(chamber_degC)
+        await self.set_temperature(chamber_degC)
         self._check()  # after every wait: a fault may have closed the gate meanwhile
-        self._permitted = True
-        await self.renew_permits()
+        self.permits.grant()
+        await self.keeper.beat()
         self._check()
         await self.devices.regulator.run()
 
     async def set_temperature(self, chamber_degC: float) -> None:
-        """A new chamber set-point, degC; ConfigError outside the limits."""
-        self._check(chamber_degC)
-        await self.devices.regulator.set_temperature(chamber_degC)
+        """A new chamber set-point, degC; ConfigError outside the limits. While somebody has the regulator autotune,
+        which its readings tell as well, this waits until that ends or the guard holds the stand."""
+        told = False
+        while True:
+            self._check(chamber_degC)
+            try:
+                return await self.devices.regulator.set_temperature(chamber_degC)
+            except Occupied as error:
+                if not told:
+                    text = f"{error}; the run waits"
+                    self._hub.publish(Event(self._clock.now_ns(), "warning", "regulator_occupied", text))
+                told = True
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_OCCUPIED_AGAIN_S))
 
     async def withdraw_permits(self) -> None:
         """Before anything else: heater and compressor lose what permission another daemon, or somebody by hand, left
         them, which is told. A compressor that ran until now begins its rest now."""
-        left_on = {reading.channel for reading in await self.devices.relays.read() if reading.value == 1}
-        await self.devices.relays.make_safe()
-        for channel in sorted(left_on & {"relays.heater_enable", "relays.compressor"}):
-            self._hub.publish(Event(self._clock.now_ns(), "warning", "left_on", f"{channel} was on; switched off"))
-        if "relays.compressor" in left_on:
-            self._compressor = CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns)
+        await self.permits.withdraw_left_on()
+
+    async def test_dead_man(self) -> None:
+        """The relay board's timer, on the heater's relay, while the regulator is stopped and gives no output;
+        DeviceFault when it gives one, or when the board cannot be relied upon."""
+        output = {reading.channel: reading.value for reading in await self.devices.regulator.read()}
+        name = self.devices.regulator.name
+        if not output.get(f"{name}.mv_heat", 0.0) <= 0:
+            raise DeviceFault(name, f"is stopped and yet gives {output[f'{name}.mv_heat']:g} % heat; look at the unit")
+        await self.permits.test_dead_man()
 
     async def stop_chamber(self) -> None:
         """Stop the regulator; heating and cooling lose their permission at once."""
-        self._permitted = False
+        self.permits.revoke()
         await self.devices.regulator.stop()
-        await self.devices.relays.switch("heater_enable", on=False)
-        await self.devices.relays.switch("compressor", on=False)
-        await self._compressor_is_off()
+        await self.permits.make_safe()
 
-    async def renew_permits(self) -> None:
-        """Re-arm the timed-on relays of the heater and the compressor; only the guard calls this, while all is well.
-
-        Both drop by themselves `hold_s` after the last call: a dead daemon neither heats nor cools.
-        """
-        if self._permitted:
-            await self.devices.relays.hold_on("heater_enable", self._limits.hold_s)
-        if self._permitted:  # still, after the wait
-            await self._renew_compressor()
-
-    async def _renew_compressor(self) -> None:
-        now_ns = self._clock.now_ns()
-        if self._compressor.running and now_ns >= self._compressor_until_ns:
-            # It could not be renewed in time and has dropped by itself: its rest began there.
-            await self._keep(CompressorState(False, self._compressor_until_ns, self._compressor.starts_ns))
-        wanted = decide(
-            self._compressor,
-            self._limits.compressor,
-            self._latest("regulator.mv_heat"),
-            self._latest("regulator.mv_cool"),
-            now_ns,
-        )
-        if wanted.running:
-            await self.devices.relays.hold_on("compressor", self._limits.hold_s)
-            self._compressor_until_ns = now_ns + seconds_ns(self._limits.hold_s)
-        elif self._compressor.running:
-            await self.devices.relays.switch("compressor", on=False)
-        if wanted.running != self._compressor.running:
-            text = "compressor started" if wanted.running else "compressor stopped"
-            self._hub.publish(Event(self._clock.now_ns(), "info", "compressor", text))
-        await self._keep(wanted)
+    @property
+    def flap_open(self) -> bool:
+        """Whether the flap has not been confirmed shut since it was last opened."""
+        return not self.devices.flap.is_shut
 
     async def open_flap(self) -> None:
         """Open the flap and confirm it."""
-        self._check()
-        await self.devices.flap.move_open()
+        async with self._moving_flap:
+            self._check()
+            with self.motions.under_way("flap", "opening"):
+                await self.devices.flap.move_open()
 
     async def close_flap(self) -> None:
         """Close the flap and confirm it; allowed after a trip too."""
-        await self.devices.flap.move_closed()
+        async with self._moving_flap:
+            with self.motions.under_way("flap", "closing"):
+                await self.devices.flap.move_closed()
 
     async def approach_again(self) -> None:
         """Before frames: stages whose motors have been switched off meanwhile are approached anew, from below."""
         self._check()
-        await ready(self.devices.axes, self._commanded, self._hub, self._clock)
+        with self.motions.under_way("stages", "back to where the plan put them, should they stand elsewhere"):
+            await ready(self.devices.axes, self._commanded, self._hub, self._clock)
 
-    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0) -> None:
-        """One frame of the step, published; exposed at `due_ns` when that is still ahead. A camera lost meanwhile holds
-        the gate until it has answered again and given the frame; Unreachable after 30 min."""
+    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0) -> bool:
+        """One frame of the step, published; exposed at `due_ns` when that is still ahead. False when the camera was
+        lost: see `_regain`; the flap may have been shut meanwhile."""
         self._check()
-        deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_LOST_LIMIT_S)
         try:
-            frame = await self._grab(exposure_s, due_ns, deadline_ns)
-        finally:
-            self.gate.clear(CAMERA_LOST)
+            frame = await self.devices.camera.grab(exposure_s, due_ns)
+        except Unreachable as error:
+            await self._regain(error)
+            return False
+        self._without_camera_ns = 0
         self._hub.publish(replace(frame, step_id=step_id))
+        return True
 
     async def look(self, exposure_s: float, step_id: str) -> Frame | None:
         """One frame of the step through the flap, which is open for it only; published. None when the camera was lost:
-        it answers again then, or Unreachable after 30 min."""
+        see `_regain`."""
         await self.open_flap()
         try:
             frame = replace(await self.devices.camera.grab(exposure_s), step_id=step_id)
-            self._hub.publish(frame)
-            return frame
         except Unreachable as error:
             lost = error
+        else:
+            self._without_camera_ns = 0
+            self._hub.publish(frame)
+            return frame
         finally:
             await self.close_flap()
-        try:
-            await self._regain(lost, self._clock.now_ns() + seconds_ns(_CAMERA_LOST_LIMIT_S))
-        finally:
-            self.gate.clear(CAMERA_LOST)
+        await self._regain(lost)
         return None
 
-    async def _grab(self, exposure_s: float, due_ns: int, deadline_ns: int) -> Frame:
-        while True:
-            try:
-                return await self.devices.camera.grab(exposure_s, due_ns)
-            except Unreachable as error:
-                if self._clock.now_ns() >= deadline_ns:
-                    raise
-                lost = error
-            await self._regain(lost, deadline_ns)
-
-    async def _regain(self, lost: Unreachable, deadline_ns: int) -> None:
-        """Hold the gate until the camera, lost for that reason, is open again."""
-        self._hub.publish(Event(self._clock.now_ns(), "warning", "camera_lost", str(lost)))
+    async def _regain(self, lost: Unreachable) -> None:
+        """Hold the gate until the camera, lost for that reason, is open again, or is found to be without supply; `lost`
+        when there was no frame for 30 min of such waiting."""
+        begin_ns, limit_ns = self._clock.now_ns(), seconds_ns(_CAMERA_LOST_LIMIT_S)
+        if self._without_camera_ns >= limit_ns:
+            raise lost
+        self._hub.publish(Event(begin_ns, "warning", "camera_lost", str(lost)))
         self.gate.hold(CAMERA_LOST)
-        await self._open_camera(deadline_ns, _CAMERA_LONGEST_RETRY_S)
-        self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
+        deadline_ns = begin_ns + limit_ns - self._without_camera_ns
+        try:
+            is_open = await self._open_camera(deadline_ns, _CAMERA_LONGEST_RETRY_S, lambda: not self._camera_supplied)
+        finally:
+            self.gate.clear(CAMERA_LOST)
+            # One that opens at once and never gives a frame does not go on for ever either.
+            self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(_CAMERA_RETRY_S))
+        if is_open:
+            self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
 
     async def move_to(self, axis: str, position: float) -> None:
         """Move a stage (mm or deg), homing it first when it lost its scale."""
         stage = self._axis(axis)
         self._commanded.pop(axis, None)  # nobody knows where it stands when the move fails
-        if not await stage.homed():
-            await stage.home()
-            self._check()
-        await stage.move_to(position)
+        with self.motions.under_way(axis, f"to {position:g} {stage.profile.unit}"):
+            homed = await stage.homed()
+            self._check()  # after every wait: a fault may have closed the gate meanwhile
+            if not homed:
+                with self.motions.under_way(axis, f"homing, then to {position:g} {stage.profile.unit}"):
+                    await stage.home()
+                self._check()
+            await stage.move_to(position)
         self._commanded[axis] = position
 
     async def check_home(self, axis: str) -> None:
         """Home a stage again, record how far its scale had gone astray, and go back to where the plan had put it."""
         stage = self._axis(axis)
-        await check_home(stage, self._hub, self._clock)
-        self._check()
-        if axis in self._commanded:
-            await stage.move_to(self._commanded[axis])
+        with self.motions.under_way(axis, "homing"):
+            await check_home(stage, self._hub, self._clock)
+            self._check()
+            if axis in self._commanded:
+                await stage.move_to(self._commanded[axis])
 
     async def prompt(self, text: str) -> None:
         """Tell the operator what to do, and wait until it is done (a pause that the operator ends); when nobody attends
@@ -246,75 +290,107 @@ class Stand:
         self._check()
         if not on:
             # One that was off already has nothing new to say.
-            self._cooling = last_word(self._hub.latest("camera.temperature")) or self._cooling
+            self._cooling = last_word(self._hub.known("camera.temperature")) or self._cooling
+            self._camera_supplied = False
             await self.devices.camera.close()
-            await self.devices.relays.switch("camera_power", on=False)
+            await self.devices.relays.switch(CAMERA_POWER, on=False)
             return
         self._cooling = None
-        await self.devices.relays.switch("camera_power", on=True)
-        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.camera_boot_s))
-        await self._open_camera(self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S), _CAMERA_RETRY_S)
+        await self._supply_camera()
+        self._camera_supplied = True
+        self.equilibrium.begin()
+
+    def lose_equilibrium(self, reason: str) -> None:
+        """The camera's supply was or may have been off: whoever runs a plan calls `restore_camera` where it wants the
+        camera on, and soaks it anew."""
+        self.equilibrium.lose(reason)
+
+    async def restore_camera(self) -> None:
+        """After its equilibrium was lost: the camera's supply on again, should it be off, and the camera open; tried
+        for 30 min, the gate being held."""
+        if self._camera_supplied:
+            return
+        deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_LOST_LIMIT_S)
+        self.gate.hold(CAMERA_LOST)
+        try:
+            while not self._camera_supplied:
+                try:
+                    await self.power_camera(on=True)
+                except Unreachable:
+                    if self._clock.now_ns() >= deadline_ns:
+                        raise
+        finally:
+            self.gate.clear(CAMERA_LOST)
+
+    async def _supply_camera(self) -> None:
+        """Camera's supply on and the camera open. A relay that reads off is only held for some seconds at a time until
+        the camera has answered: it might be another one than the configuration says, such as the heater's."""
+        relays, hold_s = self.devices.relays, self._limits.permits.hold_s
+        is_on = any(
+            reading.channel == f"{relays.name}.{CAMERA_POWER}" and reading.value == 1 for reading in await relays.read()
+        )
+        self.camera_was_supplied = is_on if self.camera_was_supplied is None else self.camera_was_supplied
+        holding: asyncio.Task[None] | None = None
+        if is_on:
+            await relays.switch(CAMERA_POWER, on=True)  # for good, should it have been timed
+        else:
+            await relays.hold_on(CAMERA_POWER, hold_s)
+            holding = asyncio.create_task(self._hold_supply(hold_s))
+        try:
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.camera_boot_s))
+            await self._open_camera(self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S), _CAMERA_RETRY_S)
+        except BaseException:
+            if holding is not None:
+                await cancelled([holding])
+                await relays.switch(CAMERA_POWER, on=False)
+            raise
+        if holding is not None:
+            await cancelled([holding])
+            self._check()
+            await relays.switch(CAMERA_POWER, on=True)
+
+    async def _hold_supply(self, hold_s: float) -> None:
+        """Arm the camera's supply again until cancelled; a lost command is made up for by the next one."""
+        while True:
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(hold_s / 3))
+            with suppress(DeviceError):
+                await self.devices.relays.hold_on(CAMERA_POWER, hold_s)
+
+    def cut_camera(self) -> None:
+        """The camera itself is too warm: its supply goes off, too, whenever the stand is made safe from now on."""
+        self._camera_supplied = False
+        self.safety.take(_CameraSupply(self.devices.relays))
+        self.safety.demand()
 
     def camera_is_off(self, cooling: Cooling | None) -> None:
         """What an earlier daemon left: the camera is off, and this was its last word before it was switched off."""
         self._cooling = cooling
 
-    async def make_safe(self) -> None:
-        """Every actuator to its safe state, all at once, within a real-time limit; what failed is in `unconfirmed`."""
-        self._permitted = False
-        async with self._making_safe:
-            devices = self.devices
-            actuators = (devices.regulator, devices.relays, devices.flap, *devices.axes.values())
-            failures = await asyncio.gather(*(self._safely(actuator) for actuator in actuators))
-            unconfirmed, told = tuple(failure for failure in failures if failure), self.unconfirmed
-            self.unconfirmed = unconfirmed
-            for text in unconfirmed:
-                if text not in told:
-                    self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text))
-            if told and not unconfirmed:
-                self._hub.publish(Event(self._clock.now_ns(), "info", "confirmed_safe", "the stand is safe"))
-            await self._compressor_is_off()
-
-    async def _safely(self, actuator: Actuator) -> str:
-        """Why the actuator's safe state is not confirmed, "" when it is; a lost answer is worth a second try."""
-        try:
-            async with asyncio.timeout(_SAFE_LIMIT_S):
-                try:
-                    await actuator.make_safe()
-                except (Unreachable, GarbledReply):
-                    await actuator.make_safe()
-        except Exception as error:  # noqa: BLE001 - whatever one actuator does, the others must still be made safe
-            return f"{actuator.name} did not confirm its safe state: {str(error) or 'no answer in time'}"
-        return ""
-
-    async def _open_camera(self, deadline_ns: int, longest_retry_s: float) -> None:
-        """Open the camera, trying again after 1 s, 2 s, 4 s ... until `deadline_ns`; what the last try raised."""
+    async def _open_camera(
+        self, deadline_ns: int, longest_retry_s: float, is_vain: Callable[[], bool] = lambda: False
+    ) -> bool:
+        """Open the camera, trying again after 1 s, 2 s, 4 s ... until `deadline_ns`; what the last try raised. False
+        when it is in vain."""
         retry_s = _CAMERA_RETRY_S
-        while True:
+        while not is_vain():
             self._check()
             try:
-                return await self.devices.camera.open()
+                await self.devices.camera.open()
             except Unreachable:
                 if self._clock.now_ns() >= deadline_ns:
                     raise
+            else:
+                return True
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(retry_s))
             retry_s = min(2 * retry_s, longest_retry_s)
+        return False
 
-    async def _compressor_is_off(self) -> None:
-        if self._compressor.running:
-            await self._keep(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
-
-    async def _keep(self, compressor: CompressorState) -> None:
-        """From now on the compressor is in this state; that it was switched is kept for the next daemon."""
-        was, self._compressor = self._compressor, compressor
-        if compressor.running == was.running or self._limits.compressor_file is None:
-            return
-        try:
-            with self._clock.hold():
-                await asyncio.to_thread(keep, self._limits.compressor_file, compressor)
-        except OSError as error:
-            text = f"the next start will not know when the compressor last ran: {error}"
-            self._hub.publish(Event(self._clock.now_ns(), "warning", "compressor_not_kept", text))
+    def _dropped(self) -> None:
+        """The camera's supply reads off though it was switched on."""
+        self._camera_supplied = False
+        text = "the camera's supply is off though it was switched on: a brown-out of the relay board, or somebody else"
+        self._hub.publish(Event(self._clock.now_ns(), "error", "camera_supply_off", text))
+        self.lose_equilibrium(text)
 
     def _axis(self, axis: str) -> Axis:
         self._check()
@@ -332,7 +408,5 @@ class Stand:
         low, high = self._limits.chamber_degC
         if chamber_degC is not None and not low <= chamber_degC <= high:
             raise ConfigError(f"chamber set-point {chamber_degC} degC is outside limits.chamber_degC {low}..{high}")
-
-    def _latest(self, channel: str) -> float:
-        reading = self._hub.latest(channel)
-        return float("nan") if reading is None else reading.value
+        for mover in (self.devices.flap, *self.devices.axes.values()):
+            mover.allow()  # what making safe has barred, and bars again should it begin before the command is sent

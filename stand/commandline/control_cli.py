@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -15,8 +15,9 @@ from stand.config import load_config, packaged
 from stand.exit_codes import one_line_errors
 from stand.recording.instants import date_time, duration
 from stand.recording.inventory import inventory
-from stand.remote.control import SOCKET_NAME, Answer, RunStatus
+from stand.remote.control import RunStatus
 from stand.remote.control_client import ask, ask_status, running_sessions
+from stand.remote.door import Answer
 from stand.running.gate import INTERLOCK, OPERATOR
 from stand.usage import one_line
 
@@ -38,10 +39,12 @@ def status(
 ) -> None:
     """What the running session is doing: step, state, expected end, temperatures, frames, disk, last warning.
 
+    Without DIR, when none runs in recording.directory: the only one on this machine. The same for `stand stop`.
+
     Example: stand status /data/sessions
     """
     with one_line_errors():
-        session = _running(directory, config)
+        session = _running(directory, config, anywhere=True)
         found = ask_status(session)
         if as_json:
             typer.echo(json.dumps({"session": str(session), **found.model_dump(mode="json")}, indent=2))
@@ -54,11 +57,15 @@ def status(
 def pause(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
     """Hold the run before its next action; the chamber keeps its set-point, a dwell what it has earned.
 
+    What moves goes on to its place, and the answer says what that is; `stand stop` stops it. The flap is shut within a
+    minute. After guard.pause_limit_h the stand is made safe and held.
+
     Example: stand pause && stand continue
     """
     with one_line_errors():
-        session, _ = _ask(directory, config, "pause")
-        typer.echo(f"{session}: paused; `stand continue` goes on")
+        session, answer = _ask(directory, config, "pause")
+        moving = cast("list[str]", answer.get("moving", []))
+        typer.echo(f"{session}: paused; `stand continue` goes on; {_moving(moving)}")
 
 
 @app.command("continue")
@@ -90,7 +97,7 @@ def stop(directory: DirectoryArgument = None, config: ConfigOption = "simulated"
     Example: stand stop
     """
     with one_line_errors():
-        session, _ = _ask(directory, config, "stop")
+        session, _ = _ask(directory, config, "stop", anywhere=True)
         typer.echo(f"{session}: stopping; the stand is made safe first, and the run says when it is")
 
 
@@ -99,14 +106,17 @@ def status_lines(session: Path, found: RunStatus) -> Iterator[str]:
     state = found.state if found.state != "held" else f"held: {', '.join(found.reasons)}"
     yield _row("session", str(session))
     yield _row("recipe", found.recipe)
-    yield _row("state", f"{state}, since {date_time(found.since_ns)} UTC ({_span(found.now_ns - found.since_ns)})")
+    since = date_time(found.since_ns + found.since_utc_offset_ns)
+    yield _row("state", f"{state}, since {since} UTC ({_span(found.now_ns - found.since_ns)})")
+    if found.fault:
+        yield _row("fault", f"{found.fault_rule}: {found.fault}")
     yield _row("step", f"{found.step}/{found.steps} {found.doing}")
     yield _row("ends", _end(found))
     for channel, value_degC in found.temperatures_degC.items():
         yield _row("temperatures", f"{channel} {'BAD' if value_degC is None else f'{value_degC:.2f} degC'}")
     yield _row("frames", f"{found.frames_saved} saved, {found.frames_lost} lost")
     yield _row("disk", f"{size(found.disk_free_bytes)} free")
-    yield _row("last warning", found.warning or "none")
+    yield _row("last warning", _warning(found))
 
 
 def _row(label: str, text: str) -> str:
@@ -120,7 +130,14 @@ def _span(length_ns: int) -> str:
 def _end(found: RunStatus) -> str:
     if found.end_ns is None:
         return "not known"
-    return f"{date_time(found.end_ns)} UTC (in {_span(found.end_ns - found.now_ns)})"
+    return f"{date_time(found.end_ns + found.utc_offset_ns)} UTC (in {_span(found.end_ns - found.now_ns)})"
+
+
+def _warning(found: RunStatus) -> str:
+    if found.warning_ns is None:
+        return found.warning or "none"
+    level = "error, " if found.warning_level == "error" else ""
+    return f"{level}{date_time(found.warning_ns + found.warning_utc_offset_ns)} UTC: {found.warning}"
 
 
 def _still(answer: Mapping[str, object]) -> str:
@@ -133,19 +150,24 @@ def _still(answer: Mapping[str, object]) -> str:
     return "; ".join([f"still held: {', '.join(reasons)}", *known])
 
 
-def _ask(directory: Path | None, config: str, do: str) -> tuple[Path, Answer]:
-    session = _running(directory, config)
+def _moving(moving: Sequence[str]) -> str:
+    return f"still moving: {', '.join(map(one_line, moving))}" if moving else "nothing moves"
+
+
+def _ask(directory: Path | None, config: str, do: str, *, anywhere: bool = False) -> tuple[Path, Answer]:
+    session = _running(directory, config, anywhere=anywhere)
     return session, ask(session, {"do": do})
 
 
-def _running(directory: Path | None, config: str) -> Path:
-    """`directory` when it is a session, else the only running session in it; ConfigError when there are several."""
+def _running(directory: Path | None, config: str, *, anywhere: bool = False) -> Path:
+    """`directory` when it is a session that is run, else the only running session in it; ConfigError when there are
+    several. `anywhere`: without a directory the only one on this machine will do, for what can do no harm."""
     root = directory or load_config(packaged("", config)).recording.directory
-    if inventory(root) or (root / SOCKET_NAME).is_socket():
-        return root
-    sessions = running_sessions(root)
+    sessions = running_sessions(root) or (running_sessions() if anywhere and directory is None else [])
     if len(sessions) > 1:
         raise ConfigError(f"{root}: several sessions are running, name one: {', '.join(map(str, sessions))}")
-    if not sessions:
-        raise SessionError(f"{root}: no daemon is running a session there")
-    return sessions[0]
+    if sessions:
+        return sessions[0]
+    if inventory(root):
+        raise SessionError(f"{root}: no daemon is running this session")
+    raise SessionError(f"{root}: no daemon is running a session there")

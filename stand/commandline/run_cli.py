@@ -16,6 +16,7 @@ from typing import Annotated
 import typer
 
 from drivers.interface import ConfigError, SessionError
+from stand.aside import aside
 from stand.commandline.session_report import NotReported, check_reportable, report_session
 from stand.commandline.session_text import salvage_line
 from stand.config import StandConfig
@@ -182,9 +183,10 @@ def _check_writable(directory: Path) -> None:
 def _run_progress(
     steps: tuple[PricedStep, ...], done: Collection[str] = (), earned_s: Mapping[str, float] = MappingProxyType({})
 ) -> Generator[Callable[[Hub], None]]:
-    """Progress in expected seconds of the plan, the time left as the run goes; warnings and errors as they come."""
-    with progress("run", sum(step.duration_s for step in steps)) as report:
-        follow = Follow(steps, report, lambda line: typer.echo(line, err=True), done, earned_s)
+    """Progress in expected seconds of the plan, the time left as the run goes; warnings and errors as they come. The
+    run never waits for the terminal."""
+    with progress("run", sum(step.duration_s for step in steps)) as report, aside() as later:
+        follow = Follow(steps, later(report), later(lambda line: typer.echo(line, err=True)), done, earned_s)
         yield lambda hub: hub.subscribe(follow)
 
 

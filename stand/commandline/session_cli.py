@@ -33,7 +33,7 @@ from stand.exit_codes import FAILED, one_line_errors
 from stand.hub import Event, Hub, Item, StepMark
 from stand.progress import Report, progress
 from stand.recording.export import export
-from stand.recording.instants import date_time, parse_instant
+from stand.recording.instants import parse_instant
 from stand.recording.inventory import State, inventory
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.overview import Glance, glance, overview
@@ -218,7 +218,7 @@ def replay_session(
         if record is not None:
             _check_new(record, directory)
         seen = glance(_session_in(directory))
-        with _session_to_use(directory) as session, _replay_progress(seen) as watch:
+        with _session_to_use(directory) as session, _replay_progress(seen, session) as watch:
             if record is None:
                 asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
             else:
@@ -243,17 +243,18 @@ def _check_new(out: Path, session: Path) -> None:
 
 
 @contextmanager
-def _replay_progress(seen: Glance) -> Generator[Callable[[Hub], None]]:
-    """Progress in seconds of the session; its steps and events as lines."""
-    begin_ns, end_ns = seen.begin_ns or 0, seen.end_ns or 0
+def _replay_progress(seen: Glance, session: Session) -> Generator[Callable[[Hub], None]]:
+    """Progress in seconds of the session; its steps and events as lines, in UTC."""
+    begin_ns, end_ns, utc = seen.begin_ns or 0, seen.end_ns or 0, session.utc
     with progress("replay", (end_ns - begin_ns) / NS_PER_S) as report:
 
         def follow(item: Item) -> None:
-            report((item.time_ns - begin_ns) / NS_PER_S, f"{date_time(item.time_ns)} UTC")
+            at = utc.date_time(item.time_ns)
+            report((item.time_ns - begin_ns) / NS_PER_S, f"{at} UTC")
             if isinstance(item, StepMark):
-                typer.echo(f"{date_time(item.time_ns)}  step {item.index} {one_line(item.kind)} {item.state}")
+                typer.echo(f"{at}  step {item.index} {one_line(item.kind)} {item.state}")
             elif isinstance(item, Event):
-                typer.echo(f"{date_time(item.time_ns)}  {one_line(f'{item.level} {item.kind}: {item.text}')}")
+                typer.echo(f"{at}  {one_line(f'{item.level} {item.kind}: {item.text}')}")
 
         yield lambda hub: hub.subscribe(follow)
 
@@ -319,7 +320,7 @@ def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple
     """From when up to when; ConfigError when that is not a time, or none."""
     begin_ns = _instant(begin, session, seen)
     if seen.end_ns is not None and begin_ns > seen.end_ns:
-        raise ConfigError(f"--from {begin} is after the session's end ({date_time(seen.end_ns)} UTC)")
+        raise ConfigError(f"--from {begin} is after the session's end ({session.utc.date_time(seen.end_ns)} UTC)")
     end_ns = (seen.end_ns or 0) + 1 if end is None else _instant(end, session, seen)
     if end_ns <= begin_ns:
         raise ConfigError(f"--to {end} is not after --from {begin}")
@@ -330,7 +331,7 @@ def _instant(text: str, session: Session, seen: Glance) -> int:
     """ns since the epoch; ConfigError when the text is no time, or names no step of the session."""
     step = re.fullmatch(r"step:(\d+)", text)
     if step is None:
-        return parse_instant(text, seen.begin_ns or 0)
+        return parse_instant(text, seen.begin_ns or 0, session.utc.stand_ns)
     begun = (mark.time_ns for mark in session.steps() if mark.index == int(step[1]))
     time_ns = next(begun, None)
     if time_ns is None:

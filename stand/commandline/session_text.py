@@ -12,10 +12,11 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from stand.hub import Event, StepState
-from stand.recording.instants import date_time, duration, utc_text
+from stand.recording.instants import duration
 from stand.recording.inventory import State
 from stand.recording.overview import Frames, Glance, Overview, Step, Temperature
 from stand.recording.salvage import BEING_RECORDED, Salvaged
+from stand.recording.utc_offsets import UtcOffsets
 from stand.recording.verify import Verification
 from stand.usage import one_line
 
@@ -40,7 +41,7 @@ def list_row(seen: Glance) -> tuple[str, ...]:
     return (
         one_line(seen.path.resolve().name),
         one_line(seen.metadata.get("recipe", "?")),
-        "" if seen.begin_ns is None else date_time(seen.begin_ns),
+        "" if seen.begin_ns is None else seen.utc.date_time(seen.begin_ns),
         length,
         str(seen.frames),
         size(seen.size_bytes),
@@ -49,15 +50,19 @@ def list_row(seen: Glance) -> tuple[str, ...]:
     )
 
 
-def glance_json(seen: Glance) -> dict[str, object]:
-    """One session of `stand session list --json`, the head of `info --json`."""
+def glance_json(seen: Glance, utc: UtcOffsets | None = None) -> dict[str, object]:
+    """One session of `stand session list --json`, the head of `info --json`. start and end are UTC, what ends in _ns is
+    an instant of the stand's clock, and durations are differences of those."""
+    utc = seen.utc if utc is None else utc
     has_times = seen.begin_ns is not None and seen.end_ns is not None
     return {
         "name": seen.path.resolve().name,
         "path": str(seen.path),
         "metadata": seen.metadata,
-        "start": _instant(seen.begin_ns),
-        "end": _instant(seen.end_ns),
+        "start": _instant(seen.begin_ns, utc),
+        "end": _instant(seen.end_ns, utc),
+        "begin_ns": seen.begin_ns,
+        "end_ns": seen.end_ns,
         "duration_s": ((seen.end_ns or 0) - (seen.begin_ns or 0)) / 1e9 if has_times else None,
         "frames": seen.frames,
         "bytes": seen.size_bytes,
@@ -68,18 +73,19 @@ def glance_json(seen: Glance) -> dict[str, object]:
     }
 
 
-def _instant(time_ns: int | None) -> str | None:
-    return None if time_ns is None else utc_text(time_ns)
+def _instant(time_ns: int | None, utc: UtcOffsets) -> str | None:
+    return None if time_ns is None else utc.utc_text(time_ns)
 
 
 def info_lines(found: Overview) -> Iterator[str]:
     """`stand session info`."""
+    utc = found.utc
     parts = (
-        _facts(found),
-        _steps(found.steps),
-        _frames(found),
+        _facts(found, utc),
+        _steps(found.steps, utc),
+        _frames(found, utc),
         _temperatures(found.temperatures),
-        (*_gaps(found), *_events(found.events)),
+        (*_gaps(found, utc), *_events(found.events, utc)),
     )
     for position, part in enumerate(parts):
         if position:
@@ -95,7 +101,7 @@ def _row(label: str, text: str) -> Iterator[str]:
     yield from wrapper.wrap(one_line(text))
 
 
-def _facts(found: Overview) -> Iterator[str]:
+def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     seen = found.glance
     told = seen.metadata.get
     name, known_as = seen.path.resolve().name, told("session_id", "")
@@ -103,7 +109,7 @@ def _facts(found: Overview) -> Iterator[str]:
     yield from _row("session", f"{name}  ({seen.state}){alias}")
     yield from _row("recipe", told("recipe", "?") + (", simulated devices" if seen.simulated else ""))
     if seen.begin_ns is not None and seen.end_ns is not None:
-        span = f"{date_time(seen.begin_ns)} to {date_time(seen.end_ns)} UTC"
+        span = f"{utc.date_time(seen.begin_ns)} to {utc.date_time(seen.end_ns)} UTC"
         yield from _row(
             "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {told('clock_source', '?')} clock"
         )
@@ -141,7 +147,7 @@ def _limited(entries: Sequence[str]) -> list[str]:
     return [*entries[:_MOST], *([f"and {more} more"] if more > 0 else [])]
 
 
-def _steps(steps: Sequence[Step]) -> Iterator[str]:
+def _steps(steps: Sequence[Step], utc: UtcOffsets) -> Iterator[str]:
     done = [step for step in steps if step.state is StepState.DONE]
     kinds = Counter(step.kind for step in steps)
     listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
@@ -150,11 +156,12 @@ def _steps(steps: Sequence[Step]) -> Iterator[str]:
     for step in steps:
         if step.state is not StepState.DONE:
             parameters = " ".join(f"{name}={value}" for name, value in step.parameters.items())
-            text = f"{step.index} {step.kind} {parameters} {told[step.state]}, begun {date_time(step.begin_ns)} UTC"
+            begun = f"begun {utc.date_time(step.begin_ns)} UTC"
+            text = f"{step.index} {step.kind} {parameters} {told[step.state]}, {begun}"
             yield from _row("  not done", text)
 
 
-def _frames(found: Overview) -> Iterator[str]:
+def _frames(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     frames = found.frames
     if not frames.count:
         yield from _row("frames", f"none{_lost(frames)}")
@@ -163,9 +170,9 @@ def _frames(found: Overview) -> Iterator[str]:
     each = size(round(frames.size_bytes / frames.count))
     yield from _row("frames", f"{frames.count}, {frames.pixels}, {encoding}, {each} each{_lost(frames)}")
     if frames.first_ns is not None and frames.last_ns is not None:
-        yield from _row("", f"from {date_time(frames.first_ns)} to {date_time(frames.last_ns)} UTC")
+        yield from _row("", f"from {utc.date_time(frames.first_ns)} to {utc.date_time(frames.last_ns)} UTC")
     captures = [step for step in found.steps if step.frames]
-    yield from _limited([_capture(step) for step in captures])
+    yield from _limited([_capture(step, utc) for step in captures])
 
 
 def _lost(frames: Frames) -> str:
@@ -179,12 +186,11 @@ def _lost(frames: Frames) -> str:
     return "".join(f"; {part}" for part in parts)
 
 
-def _capture(step: Step) -> str:
+def _capture(step: Step, utc: UtcOffsets) -> str:
     told = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
     asked = step.parameters.get("frames", "?")
-    return (
-        f"{'':<{_LABEL}}step {step.index:<4d} {step.frames} of {asked} frames from {date_time(step.begin_ns)}  {told}"
-    )
+    begun = utc.date_time(step.begin_ns)
+    return f"{'':<{_LABEL}}step {step.index:<4d} {step.frames} of {asked} frames from {begun}  {told}"
 
 
 def _temperatures(temperatures: Sequence[Temperature]) -> Iterator[str]:
@@ -201,40 +207,46 @@ def _temperatures(temperatures: Sequence[Temperature]) -> Iterator[str]:
         yield f"{'':<{_LABEL}}{one_line(row.channel):<{width}}{numbers}{row.count:>10}{row.bad:>8}"
 
 
-def _gaps(found: Overview) -> Iterator[str]:
-    for position, gap in enumerate(_limited([str(gap) for gap in found.gaps]) or ["none"]):
+def _gaps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+    for position, gap in enumerate(_limited([gap.text(utc) for gap in found.gaps]) or ["none"]):
         yield from _row("" if position else "gaps", gap)
 
 
-def _events(events: Sequence[Event]) -> Iterator[str]:
+def _events(events: Sequence[Event], utc: UtcOffsets) -> Iterator[str]:
     counts = Counter(event.level for event in events)
     yield from _row("events", ", ".join(f"{count} {level}" for level, count in sorted(counts.items())) or "none")
     grave = [event for event in events if event.level != "info"]
-    for line in _limited([f"{date_time(event.time_ns)} {event.level}: {event.text}" for event in grave]):
+    for line in _limited([f"{utc.date_time(event.time_ns)} {event.level}: {event.text}" for event in grave]):
         yield from _row("", line)
 
 
 def info_json(found: Overview) -> dict[str, object]:
-    """`stand session info --json`: everything, lists in full; a temperature that was never good is null."""
+    """`stand session info --json`: everything, lists in full; a temperature that was never good is null.
+    Instants are as in glance_json."""
+    utc = found.utc
     return {
-        **glance_json(found.glance),
+        **glance_json(found.glance, utc),
         "troubles": list(found.troubles),
         "attachments": list(found.glance.attachments),
         "ending": None if found.ending is None else found.ending.text,
         "steps": [
-            {**asdict(step), "begin": _instant(step.begin_ns), "end": _instant(step.end_ns)} for step in found.steps
+            {**asdict(step), "begin": _instant(step.begin_ns, utc), "end": _instant(step.end_ns, utc)}
+            for step in found.steps
         ],
         "images": {
             **asdict(found.frames),
-            "first": _instant(found.frames.first_ns),
-            "last": _instant(found.frames.last_ns),
+            "first": _instant(found.frames.first_ns, utc),
+            "last": _instant(found.frames.last_ns, utc),
         },
         "temperatures": [
             {name: None if value != value else value for name, value in asdict(temperature).items()}
             for temperature in found.temperatures
         ],
-        "gaps": [{**asdict(gap), "begin": _instant(gap.begin_ns), "end": _instant(gap.end_ns)} for gap in found.gaps],
-        "events": [{**asdict(event), "time": _instant(event.time_ns)} for event in found.events],
+        "gaps": [
+            {**asdict(gap), "begin": _instant(gap.begin_ns, utc), "end": _instant(gap.end_ns, utc)}
+            for gap in found.gaps
+        ],
+        "events": [{**asdict(event), "time": _instant(event.time_ns, utc)} for event in found.events],
     }
 
 

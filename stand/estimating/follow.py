@@ -11,7 +11,8 @@ from stand.estimating.estimate import PricedStep
 from stand.estimating.eta import Eta
 from stand.hub import Event, Item, StepMark
 from stand.progress import Report
-from stand.recording.instants import date_time, duration
+from stand.recording.instants import duration
+from stand.recording.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
 
 _LEAST_S = 1.0  # of stand time between two reports, or a thousandth of the night: terminals are slow
 _SHARE = 1e-3
@@ -39,6 +40,7 @@ class Follow:
         self._report, self._warn = report, warn
         self._step = ""
         self._begin_ns: int | None = None
+        self._utc = UtcOffsets()  # as it is now
         self._next_ns = 0
 
     def __call__(self, item: Item) -> None:
@@ -49,8 +51,9 @@ class Follow:
     def _follow(self, item: Item) -> None:
         if isinstance(item, Event):
             self.eta.event(item)
+            self._utc = offsets_of([item]) if item.kind == CLOCK_STEP else self._utc
             if item.level != "info":
-                self._warn(f"{item.level}: {date_time(item.time_ns)[11:]} UTC {item.text}")
+                self._warn(f"{item.level}: {self._utc.date_time(item.time_ns)[11:]} UTC {item.text}")
             return
         if isinstance(item, StepMark):
             self.eta.mark(item)
@@ -65,7 +68,7 @@ class Follow:
         left_s, gone_s = self.eta.left_s(now_ns), (now_ns - begin_ns) / NS_PER_S
         left_ns = seconds_ns(left_s)
         done_s = self._total_s * gone_s / max(gone_s + left_s, 1e-9)
-        end = date_time(now_ns + left_ns)[:16]
+        end = self._utc.date_time(now_ns + left_ns)[:16]
         self._report(done_s, f"until {end} UTC ({duration(left_ns)} of stand time); {self._step}")
 
 

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from statistics import median
 from typing import get_args
 
-import yaml
 from pydantic import Field
 
 from drivers.clock import NS_PER_S
-from drivers.documents import Document
-from drivers.interface import ConfigError, SessionError
+from drivers.documents import Document, yaml_data
+from drivers.interface import SessionError
 from experiments.steps import Role, Step
 from stand.config import StandConfig
 from stand.estimating.durations import Situation, expect
 from stand.estimating.thermal_model import ChamberModel, Ramp, fit, ramps_of
 from stand.hub import StepMark, StepState
 from stand.recording.session import Session
-from stand.recording.sink import sync_folder
+from stand.recording.whole_file import write_whole
 
 LEARNED_FILE = "learned.json"
 _NIGHTS = 5  # as far back as a stand is likely to be as it is now
@@ -121,11 +118,28 @@ def _step_of(mark: StepMark) -> Step | None:
 def _nights(directory: Path, config: StandConfig) -> Iterator[_Night]:
     """The readable sessions of the stand of that name, the last one first; their names begin with the time."""
     for path in sorted(directory.glob("*/"), reverse=True):
-        with suppress(SessionError, ConfigError, yaml.YAMLError):
-            session = Session.open(path)
-            recorded = yaml.safe_load(session.attachment("config.yaml") or "{}")
-            if isinstance(recorded, dict) and recorded.get("name") == config.name:
-                yield _Night(path.name, session.steps(), ramps_of(session))
+        if (night := _night(path, config.name)) is not None:
+            yield night
+
+
+def _night(path: Path, stand: str) -> _Night | None:
+    """What the session teaches; None when it is another stand's, or cannot be read for whatever reason: a neighbour
+    in the folder never ends a run."""
+    try:
+        session = Session.open(path)
+        if recorded_name(session.attachment("config.yaml") or "") == stand:
+            return _Night(path.name, session.steps(), ramps_of(session))
+    except Exception:  # noqa: BLE001 - it was written by anybody; what one session teaches is not worth a run
+        pass
+    return None
+
+
+def recorded_name(config_text: str) -> str | None:
+    """The stand's name in the text of a configuration of any version, as it is written there; None when there is
+    none. ConfigError for what is no YAML."""
+    recorded = yaml_data(config_text, "config.yaml")
+    name = recorded.get("name") if isinstance(recorded, dict) else None
+    return name if isinstance(name, str) else None
 
 
 def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float | None]]:
@@ -141,13 +155,7 @@ def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float | None]]:
 
 
 def _replace(path: Path, text: str) -> None:
-    part = path.with_name(f"{path.name}.part")
     try:
-        with part.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        sync_folder(path.parent)
+        write_whole(path, text.encode())
     except OSError as error:
         raise SessionError(f"{path}: cannot be written ({error.strerror})") from error

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drivers.interface import ConfigError, SessionError, StandError, StandTripped
+from stand.aside import aside
 from stand.commandline.session_report import NotReported, check_reportable, report_session
 from stand.estimating.estimate import price
 from stand.estimating.follow import Follow
@@ -100,11 +101,11 @@ def _followed(
     directory: Path, order: Order, before: Interruption | None, tell: Callable[[str], None]
 ) -> Generator[Follow]:
     steps = price(order.recipe.plan(), order.config, load_learned(directory))
-    with progress("run", sum(step.duration_s for step in steps)) as report:
+    with progress("run", sum(step.duration_s for step in steps)) as report, aside() as later:
         if before is None:
-            yield Follow(steps, report, tell)
+            yield Follow(steps, later(report), later(tell))
         else:
-            yield Follow(steps, report, tell, before.progress.done, before.progress.earned_s)
+            yield Follow(steps, later(report), later(tell), before.progress.done, before.progress.earned_s)
 
 
 def _interruption(session: Path) -> Interruption:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.clock import Now
-from drivers.interface import DeviceError, SessionError, StandError, StandTripped
+from drivers.interface import DeviceError, InUse, SessionError, StandError, StandTripped
 from stand.queueing.queue import finish, note_session, note_step, queued, take
 from stand.queueing.queue_file import Entry, State, working
 from stand.running.stop import Interrupted
@@ -38,9 +38,9 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
 
     A run that fails is marked and the next one begun, unless the stand tripped, `run_one` raises Halt, a device did not
     answer before the run had begun (the next would fail likewise), or the failure is a mistake of the program: then the
-    queue is halted and the error raised. What an operator stops is interrupted, ends the work, and is resumed by the
-    next one. A run whose daemon was killed MOST_FRUITLESS_STARTS times in a row before one more step was done is marked
-    as failed, or it would keep all others from their turn.
+    queue is halted and the error raised. What an operator stops, or finds the stand in use by another run, is
+    interrupted, ends the work, and is resumed by the next one. A run whose daemon was killed MOST_FRUITLESS_STARTS
+    times in a row before one more step was done is marked as failed, or it would keep all others from their turn.
     """
     with working(directory):
         while (entry := take(directory, clock.now_ns())) is not None:
@@ -76,7 +76,7 @@ class _Run:
         self._tell(f"{self._name} " + (f"goes on in {entry.session}" if entry.session else "begins"))
         try:
             session = await run_one(entry, Notes(self._note_session, self._note_step))
-        except (Interrupted, asyncio.CancelledError) as error:
+        except (Interrupted, InUse, asyncio.CancelledError) as error:
             self._end(State.INTERRUPTED, str(error) or "stopped by the operator")
             raise
         except (StandTripped, Halt) as error:

@@ -19,8 +19,6 @@ Instants are ns on the stand's clock, so a run in virtual time has the same jour
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import os
 import zlib
@@ -34,10 +32,15 @@ from typing import Literal, cast
 from drivers.clock import Clock
 from drivers.interface import SessionError
 from drivers.lane import Lane
+from stand.recording.disk import JOURNAL_LINE, Disk, Line
+from stand.recording.home import FolderLost
+from stand.recording.locks import lock
 from stand.recording.sink import sync_folder
+from stand.running.journal_file import JournalFile, taken_over
 
 JOURNAL_NAME = "journal.jsonl"
 _CRC_DIGITS = 8
+_KEPT = "journal"  # its name in the disk process
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,13 +167,18 @@ def _decoded(text: bytes) -> Entry:
 class Journal:
     """The journal of one session, locked (flock) while it is open: one daemon per session.
 
-    Lines that the disk refuses are kept and written with the next one; `trouble` is told when that begins.
+    Lines that the disk refuses are kept and written with the next one; `trouble` is told when that begins. All lines
+    are kept in memory: a journal that was removed under its run is written anew when an operator has cleared that.
     """
 
-    def __init__(self, path: Path, fd: int, size_bytes: int) -> None:
+    def __init__(self, path: Path, fd: int, data: bytes) -> None:
         self.path = path
-        self._fd = fd
-        self._size_bytes = size_bytes
+        self.name = path.name
+        self.lost = ""
+        self._file: JournalFile | None = JournalFile(path, fd, len(data))
+        self._line: Line | None = None  # to the disk process, when that has the file
+        self._disk: Disk | None = None
+        self._acknowledged = bytearray(data)
         self._waiting: list[bytes] = []
         self._failing = False
         self._notes: set[Task[None]] = set()
@@ -183,11 +191,11 @@ class Journal:
         path = directory / JOURNAL_NAME
         try:
             fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(fd)
             sync_folder(directory)
         except OSError as error:
             raise SessionError(f"{path}: no journal can be begun here ({error.strerror})") from error
-        return cls(path, fd, 0)
+        return cls(path, fd, b"")
 
     @classmethod
     def open(cls, directory: Path) -> tuple[Journal, list[Entry]]:
@@ -201,20 +209,22 @@ class Journal:
         except OSError as error:
             raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
         try:
-            entries, size_bytes = _opened(fd)
+            entries, data = _opened(fd)
         except BaseException as error:
             os.close(fd)
             if isinstance(error, BlockingIOError):
-                raise SessionError(f"{directory}: a daemon is running this session already") from error
+                raise SessionError(f"{directory}: {error.strerror}") from error
             if isinstance(error, OSError):
                 raise SessionError(f"{path}: cannot be read ({error.strerror})") from error
             raise
-        return cls(path, fd, size_bytes), entries
+        return cls(path, fd, data), entries
 
-    def start(self, clock: Clock, trouble: Callable[[str], None]) -> None:
-        """Before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence."""
-        self._lane = Lane("journal", clock)
+    def start(self, clock: Clock, trouble: Callable[[str], None], disk: Disk | None = None) -> None:
+        """Before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence, `disk` is the
+        process that has the file from then on."""
+        self._lane = Lane("journal", clock, patient=False)
         self._trouble = trouble
+        self._disk = disk
 
     async def write(self, *entries: Entry) -> None:
         """The entries on the disk, or kept for the next time."""
@@ -232,19 +242,36 @@ class Journal:
         self._notes.add(task)
         task.add_done_callback(self._notes.discard)
 
+    async def refound(self) -> bool:
+        """Whether the file is at its place; else it is written there anew, whole. OSError when the disk refuses."""
+        if self._lane is None:
+            return True
+        is_back = await self._lane.call(self._refound)
+        self.lost = ""
+        return is_back
+
     async def close(self) -> None:
         """Let go of the session, after all notes; may be called twice."""
         await gather(*self._notes)
         if self._lane is not None:
+            if self._line is not None:
+                with suppress(OSError):
+                    await self._lane.call(self._line.call, _KEPT, "close")
             self._lane.close()
+            self._lane = None
+        self.release()
+
+    def abandon(self) -> None:
+        """As `close`, without waiting for a disk that does not answer."""
+        if self._lane is not None:
+            self._lane.abandon()
             self._lane = None
         self.release()
 
     def release(self) -> None:
         """As `close`, for a journal that was not started."""
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            os.close(fd)
+        if self._file is not None:
+            self._file.close()
 
     def _commit(self) -> OSError | None:
         """In the lane's thread: what waits on the disk; on OSError the file is as it was."""
@@ -253,28 +280,40 @@ class Journal:
             return None
         data = b"".join(self._waiting[:count])
         try:
-            if os.pwrite(self._fd, data, self._size_bytes) < len(data):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a part of it fitted
-            os.fdatasync(self._fd)
+            self._do("append", data)
         except OSError as error:
-            with suppress(OSError):
-                os.ftruncate(self._fd, self._size_bytes)
+            self.lost = str(error.strerror) if isinstance(error, FolderLost) else ""
             return error
-        self._size_bytes += len(data)
+        self.lost = ""
+        self._acknowledged += data
         del self._waiting[:count]
         return None
 
+    def _refound(self) -> bool:
+        return bool(self._do("refound", bytes(self._acknowledged)))
 
-def _opened(fd: int) -> tuple[list[Entry], int]:
+    def _do(self, method: str, data: bytes) -> object:
+        """A method of the file, here or in the disk process, which takes it over before the first."""
+        if self._disk is not None and self._file is not None:
+            self._file.close()
+            self._line = self._disk.line(JOURNAL_LINE)
+            self._line.make(_KEPT, taken_over, self.path.absolute(), len(self._acknowledged))
+            self._file = None
+        if self._line is not None:
+            return self._line.call(_KEPT, method, data)
+        return getattr(self._file, method)(data)
+
+
+def _opened(fd: int) -> tuple[list[Entry], bytes]:
     """Lock, read, and cut off what was not acknowledged; OSError, SessionError."""
-    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    lock(fd)
     with open(fd, "rb", closefd=False) as file:
         data = file.read()
     entries, size_bytes = read_lines(data)
     if size_bytes < len(data):
         os.ftruncate(fd, size_bytes)
         os.fsync(fd)
-    return entries, size_bytes
+    return entries, data[:size_bytes]
 
 
 def _ignored(text: str) -> None:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Mapping
+
 from drivers.clock import Clock
+from drivers.interface import SessionError
 from stand.guarding.interlocks import Fault
 from stand.hub import Event, Hub
+from stand.recording.disk import Disk
 from stand.running.gate import INTERLOCK, STOPPING
 from stand.running.journal import Cleared, Ended, Entry, Held, Journal, Tripped
+
+_END_WITHIN_S, _COMPLETE_WITHIN_S = 1.0, 10.0  # real seconds that a disk may take for the last entry
 
 
 class Logbook:
@@ -17,21 +24,30 @@ class Logbook:
         self._clock = clock
         self._journal: Journal | None = None
 
-    async def begin(self, journal: Journal, *entries: Entry) -> None:
-        """The journal's first entries of this run, on the disk when this returns."""
+    async def begin(self, journal: Journal, *entries: Entry, disk: Disk | None = None) -> None:
+        """The journal's first entries of this run, on the disk when this returns; `disk` writes it."""
         self._journal = journal
-        journal.start(self._clock, lambda text: self.tell("error", "journal_not_saved", text))
+        journal.start(self._clock, lambda text: self.tell("error", "journal_not_saved", text), disk)
         await journal.write(*entries)
 
     async def end(self, ended: Ended) -> None:
-        """The journal's last entry, at this instant."""
-        if self._journal is not None:
-            await self._journal.write(Ended(self._clock.now_ns(), ended.status, ended.text))
-            await self._journal.close()
+        """The journal's last entry, at this instant; SessionError when the disk does not take it in time."""
+        journal = self._journal
+        if journal is None:
+            return
+        within_s = _COMPLETE_WITHIN_S if ended.status == "complete" else _END_WITHIN_S
+        try:
+            async with asyncio.timeout(within_s):
+                await journal.write(Ended(self._clock.now_ns(), ended.status, ended.text))
+                await journal.close()
+        except TimeoutError as error:
+            journal.abandon()
+            text = f"the disk has not answered for {within_s:g} s; how the run ended is not in the journal"
+            raise SessionError(f"{journal.path}: {text}") from error
 
-    def tell(self, level: str, kind: str, text: str) -> None:
+    def tell(self, level: str, kind: str, text: str, data: Mapping[str, object] | None = None) -> None:
         """An event, now."""
-        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
+        self._hub.publish(Event(self._clock.now_ns(), level, kind, text, data or {}))
 
     def tripped(self, fault: Fault) -> None:
         """The guard makes the stand safe; it tells the hub by itself."""
@@ -41,7 +57,8 @@ class Logbook:
         """A listener of the gate; the end of a run is told by itself."""
         if reason == STOPPING:
             return
-        self.tell("warning" if held else "info", "held" if held else "released", reason)
+        level, kind = ("warning", "held") if held else ("info", "released")
+        self.tell(level, kind, reason, {"reason": reason})
         now_ns = self._clock.now_ns()
         if reason == INTERLOCK and not held:
             self._note(Cleared(now_ns))

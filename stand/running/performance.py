@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from compensation.target import Target
-from drivers.clock import NS_PER_S
+from drivers.clock import NS_PER_S, Clock, boot_of, utc_offset_ns
 from drivers.documents import parse_document
 from drivers.interface import SessionError, StandTripped
 from stand.assembly import Assembly
@@ -21,9 +21,12 @@ from stand.hub import Event, Item
 from stand.poller import Poller
 from stand.recording.instants import utc_text
 from stand.recording.recorder import Recorder
-from stand.recording.superseded import restarted
-from stand.remote.control import SOCKET_NAME, handlers, serve
+from stand.recording.restarts import restarted
+from stand.remote.control import handlers, serve
 from stand.remote.status import StatusBoard
+from stand.running.camera_gap import doubt
+from stand.running.camera_offset import OffsetGap, OffsetWatch
+from stand.running.flap_care import keep_shut_in_holds
 from stand.running.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.running.journal import Again, Cleared, Ended, Entry, Gap, Journal
 from stand.running.logbook import Logbook
@@ -32,8 +35,7 @@ from stand.running.scheduler import Progress, Scheduler
 from stand.running.session_setup import Order
 from stand.running.settling_watch import SettlingWatch
 from stand.running.stop import OPERATOR, Stop
-from stand.running.tasks import cancelled, watched
-from stand.stand import Stand
+from stand.running.tasks import cancelled, cause_of, failure_text, watched
 
 # The recorder's events that hold a run, and those that let it go on.
 _HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
@@ -60,16 +62,18 @@ async def perform(work: Performance) -> None:
     assembly, stop = work.assembly, work.stop
     log = Logbook(assembly.hub, assembly.clock)
     assembly.stand.attended = work.order.attended
-    pollers, guard = assembly.pollers(), _guard(assembly, stop, log)
+    pollers, guard = assembly.pollers(), _guard(work, log)
     target = parse_document(work.order.target_text, Target, "target.yaml")
     settling = SettlingWatch(assembly.stand, assembly.hub, assembly.clock, target)
     watchers: list[asyncio.Task[None]] = []
     ended = Ended(0, "failed", "")
     try:
         scheduler = await watched(_begun(work, pollers, guard, log, settling), work.background)
-        watchers.append(asyncio.create_task(_answer(work, log)))
+        watchers.append(asyncio.create_task(_answer(work, await _board(work, guard), log)))
         watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
         watchers.append(asyncio.create_task(guard.run()))
+        watchers.append(asyncio.create_task(assembly.stand.keeper.run()))
+        watchers.append(asyncio.create_task(keep_shut_in_holds(assembly.stand, assembly.hub, assembly.clock)))
         stop.started()
         await watched(scheduler.run(work.order.recipe.plan()), [*work.background, *watchers])
         ended = Ended(0, "complete", "complete")
@@ -82,19 +86,25 @@ async def perform(work: Performance) -> None:
         try:
             log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
         finally:  # also when somebody who listens fails
-            await _taken_down(assembly.stand, watchers, pollers)
+            await _taken_down(assembly, guard, watchers, pollers)
             settling.close()
             stop.ended()
             await log.end(ended)
 
 
-async def _taken_down(stand: Stand, watchers: Sequence[asyncio.Task[None]], pollers: Iterable[Poller]) -> None:
-    """The actuators safe, and nobody left who could move them; then one more look at every device, so that the
-    recording ends with the safe state as the wire tells it."""
+async def _taken_down(
+    assembly: Assembly, guard: Guard, watchers: Sequence[asyncio.Task[None]], pollers: Iterable[Poller]
+) -> None:
+    """The actuators safe, tried until they confirm it, and nobody left who could move them; then one more look at every
+    device, so that the recording ends with the safe state as the wire tells it."""
+    safety = assembly.stand.safety
     try:
-        await stand.make_safe()
+        safety.demand()
+        await safety.confirmed(assembly.config.guard.safe_limit_s)
     finally:
         await cancelled(watchers)
+        await safety.close()
+        await guard.told()
     for poller in pollers:
         await poller.poll()
 
@@ -106,43 +116,81 @@ async def _begun(
     for poller in pollers:
         await poller.first()
     if work.before is None:
-        log.tell("info", "run.start", f"recipe {work.order.recipe.name}")
+        log.tell("info", "run.start", f"recipe {work.order.recipe.name}", _host_now(work.assembly.clock))
     else:
-        _tell_interruption(work.before, work.assembly.clock.now_ns(), log)
+        _tell_interruption(work.before, work.assembly.clock, log)
         if work.before.again:
-            event = restarted(work.assembly.clock.now_ns(), work.before.again[-1], work.before.superseded)
-            work.assembly.hub.publish(event)
-    if not await guard.check():
+            step_id, frames = work.before.again[-1], work.before.superseded
+            work.assembly.hub.publish(restarted(work.assembly.clock.now_ns(), step_id, frames, "from a cold camera"))
+    if not guard.look():
         raise StandTripped("the rules do not hold")
     await work.recorder.flushed()  # a session with a journal can be opened and resumed
     before = work.before
     journal = Journal.create(work.recorder.directory) if before is None else before.journal
-    await log.begin(journal, *_first_entries(work))
+    await log.begin(journal, *_first_entries(work), disk=work.recorder.disk)
+    work.recorder.beside(journal)
     work.begun(work.recorder.directory)
     gate = work.assembly.stand.gate
     gate.subscribe(log.held)
-    gate.subscribe(lambda reason, held: _forget_cleared(guard, reason, held))
+    gate.subscribe(lambda reason, held: _forget_cleared(guard, work, reason, held))
     if guard.held is not None:  # by the first look, when there was no journal yet
         log.tripped(guard.held)
         log.held(INTERLOCK, True)
     work.assembly.hub.subscribe(_hold_while_not_recorded(gate))
-    if before is not None and not before.set_up.camera_on:
-        work.assembly.stand.camera_is_off(before.cooling)
+    if before is not None:
+        _judge_camera(before, work.assembly)
     progress = None if before is None else before.progress
     assembly = work.assembly
-    return Scheduler(assembly.stand, assembly.hub, assembly.clock, journal, work.recorder.flushed, settling, progress)
+    offsets = OffsetWatch(assembly.hub, assembly.clock, None if before is None else _gap(before, assembly.clock))
+    return Scheduler(
+        assembly.stand, assembly.hub, assembly.clock, journal, work.recorder.flushed, settling, offsets, progress
+    )
 
 
-async def _answer(work: Performance, log: Logbook) -> None:
-    """Answer at the control socket until cancelled; a run goes on without one."""
+def _gap(before: Interruption, clock: Clock) -> OffsetGap:
+    return OffsetGap(before.camera.offsets_K, before.last_ns, clock.now_ns())
+
+
+def _judge_camera(before: Interruption, assembly: Assembly) -> None:
+    """A camera that the plan has on, and that may have been off since, has lost its equilibrium."""
+    stand, boot = assembly.stand, boot_of(assembly.clock)
+    if not before.set_up.camera_on:
+        stand.camera_is_off(before.camera.last)
+    elif reason := doubt(
+        before.camera,
+        None if boot is None else boot.id,
+        stand.camera_was_supplied,
+        assembly.hub.latest("camera.temperature"),
+    ):
+        stand.lose_equilibrium(reason)
+
+
+def _host_now(clock: Clock) -> dict[str, object]:
+    """For whoever resumes the run: whether the host has run on since."""
+    boot = boot_of(clock)
+    return {} if boot is None else {"boot_id": boot.id}
+
+
+async def _board(work: Performance, guard: Guard) -> StatusBoard:
+    """What tells the state of the run, from before its first step on."""
     assembly, before = work.assembly, work.before
     progress = Progress() if before is None else before.progress
-    steps = price(work.order.recipe.plan(), work.order.config, load_learned(work.recorder.directory.parent))
-    gate, stop, clock = assembly.stand.gate, work.stop, assembly.clock
-    board = StatusBoard(work.order.recipe.name, steps, progress, gate, stop, work.recorder, clock)
+    with assembly.clock.hold():  # nothing moves yet: the disk may take its time
+        learned = await asyncio.to_thread(load_learned, work.recorder.directory.parent)
+    steps = price(work.order.recipe.plan(), work.order.config, learned)
+    gate, recorder, clock = assembly.stand.gate, work.recorder, assembly.clock
+    name = work.order.recipe.name
+    board = StatusBoard(name, steps, progress, gate, work.stop, lambda: guard.held, recorder, clock)
     assembly.hub.subscribe(board)
+    return board
+
+
+async def _answer(work: Performance, board: StatusBoard, log: Logbook) -> None:
+    """Answer at the control socket until cancelled; a run goes on without one."""
+    stand = work.assembly.stand
+    table = handlers(stand.gate, work.stop, board.status, lambda: stand.motions.texts)
     try:
-        async with serve(work.recorder.directory / SOCKET_NAME, handlers(gate, stop, board.status)):
+        async with serve(work.recorder.directory, work.order.config.name, table):
             await asyncio.Event().wait()
     except SessionError as error:
         log.tell("warning", "no_control", f"the run cannot be asked or paused: {error}")
@@ -158,44 +206,56 @@ def _first_entries(work: Performance) -> tuple[Entry, ...]:
     return (*cleared, Gap(work.before.last_ns, now_ns), *again)
 
 
-def _tell_interruption(before: Interruption, now_ns: int, log: Logbook) -> None:
+def _tell_interruption(before: Interruption, clock: Clock, log: Logbook) -> None:
     """The end of the run that was interrupted, the gap since, and that it goes on."""
+    now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
     if not before.ended:
-        log.tell("error", "run.end", f"interrupted: killed after {utc_text(before.last_ns)}")
+        log.tell("error", "run.end", f"interrupted: killed after {utc_text(last_utc_ns)}")
     gap_s = (now_ns - before.last_ns) / NS_PER_S
-    span = f"from {utc_text(before.last_ns)} to {utc_text(now_ns)}"
+    span = f"from {utc_text(last_utc_ns)} to {utc_text(now_ns + utc_offset_ns(clock))}"
     log.tell("warning", "gap", f"nothing was recorded and nobody watched the stand {span} ({gap_s:.3f} s)")
     if before.tripped:
         log.tell("warning", "cleared", f"an operator cleared: {before.tripped}")
     version = importlib.metadata.version("thermostand")
     done = f"{len(before.progress.done)} steps are done"
-    log.tell("info", "run.resume", f"recipe {before.order.recipe.name} goes on, {done}; thermostand {version}")
+    log.tell(
+        "info",
+        "run.resume",
+        f"recipe {before.order.recipe.name} goes on, {done}; thermostand {version}",
+        _host_now(clock),
+    )
 
 
-def _guard(assembly: Assembly, stop: Stop, log: Logbook) -> Guard:
-    """On a fault it ends the run, or makes the stand safe and lets the run wait for an operator."""
+def _guard(work: Performance, log: Logbook) -> Guard:
+    """On a fault it ends the run, or makes the stand safe and lets the run wait for an operator, or for a disk."""
+    gate = work.assembly.stand.gate
 
     def trip(fault: Fault) -> None:
-        stop(fault)
+        work.stop(fault)
         log.tripped(fault)
 
     def hold(fault: Fault) -> None:
-        assembly.stand.gate.hold(INTERLOCK)
+        gate.hold(INTERLOCK)
         log.tripped(fault)
 
-    return assembly.guard(trip, hold)
+    return work.assembly.guard(trip, hold, lambda: gate.clear(INTERLOCK), work.recorder)
 
 
-def _forget_cleared(guard: Guard, reason: str, held: bool) -> None:
-    """An operator has cleared the interlock: the guard's hold is over."""
+def _forget_cleared(guard: Guard, work: Performance, reason: str, held: bool) -> None:
+    """An operator has cleared the interlock: the guard's hold is over. Of a folder that is lost another one is made."""
     if reason == INTERLOCK and not held:
+        work.assembly.stand.permits.forgive()
+        work.assembly.stand.safety.forgive()
+        work.recorder.refound()
         guard.clear()
 
 
 def _ending(fault: Fault | None, error: BaseException) -> Ended:
     """How a run ended that did not come to its end."""
     if fault is None:
-        return Ended(0, "failed", f"failed: {error or 'cancelled'}")
+        cause = cause_of(error)
+        reason = "cancelled" if isinstance(cause, asyncio.CancelledError) else failure_text(cause)
+        return Ended(0, "failed", f"failed: {reason}")
     return Ended(0, "interrupted" if fault.rule == OPERATOR else "tripped", f"aborted: {fault.text}")
 
 

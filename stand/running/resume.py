@@ -8,9 +8,8 @@ were attached to the session, whatever today's files are.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, cast
 
@@ -23,7 +22,7 @@ from stand.recording.overview import glance
 from stand.recording.salvage import Salvaged, salvage_unfinished
 from stand.recording.session import Session
 from stand.recording.settings import SessionInfo
-from stand.running.camera_cooling import Cooling
+from stand.running.camera_gap import CameraBefore, camera_before
 from stand.running.cold_start import cold_start
 from stand.running.journal import Again, Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
 from stand.running.scheduler import Progress
@@ -50,9 +49,9 @@ class Interruption:
     """A run that may go on. Its journal is open, and so locked, until it is run or `release`d.
 
     last_ns: the last instant on the disk. seed: of the simulated laboratory. ended: how it ended, "" when it was
-    killed. tripped: what an operator has cleared. salvaged: what had to be finished first. cooling: the last word of
-    a camera that was off. again: ids of the steps of an interrupted warm-up that are done again, its capture last,
-    which had `superseded` frames.
+    killed. tripped: what an operator has cleared. salvaged: what had to be finished first. camera: what the session
+    tells of it. again: ids of the steps of an interrupted warm-up that are done again, its capture last, which had
+    `superseded` frames. utc_offset_ns: UTC minus the stand's clock at last_ns, as it is recorded.
     """
 
     directory: Path
@@ -66,9 +65,10 @@ class Interruption:
     ended: str
     tripped: str
     salvaged: tuple[Salvaged, ...]
-    cooling: Cooling | None
+    camera: CameraBefore
     again: tuple[str, ...] = ()
     superseded: int = 0
+    utc_offset_ns: int = 0
 
     def release(self) -> None:
         """Give the session free for another daemon; may be called twice."""
@@ -103,7 +103,8 @@ def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear
     session = Session.open(directory)
     order = _order(session, first)
     found = _found(session, entries, order.recipe)
-    progress = found.progress
+    last_ns = max(entries[-1].time_ns, glance(directory).end_ns or 0)
+    progress = replace(found.progress, until_ns=last_ns)
     set_up = SetUp()
     for planned in order.recipe.plan():
         set_up = set_up.after(planned) if planned.step_id in progress.done else set_up
@@ -114,14 +115,15 @@ def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear
         journal,
         progress,
         set_up,
-        max(entries[-1].time_ns, glance(directory).end_ns or 0),
+        last_ns,
         first.seed,
         last.text if isinstance(last, Ended) else "",
         tripped,
         salvaged,
-        None if set_up.camera_on else _cooling(session),
+        camera_before(session),
         found.again,
         found.superseded,
+        session.utc.at(last_ns),
     )
 
 
@@ -223,12 +225,3 @@ def _frames(session: Session, step_ids: set[str], since_ns: Mapping[str, int]) -
         if meta.step_id in step_ids and time_ns in times_ns and time_ns >= since_ns.get(meta.step_id, 0):
             counts[meta.step_id] = counts.get(meta.step_id, 0) + 1
     return counts
-
-
-def _cooling(session: Session) -> Cooling | None:
-    """The camera's last temperature; None when it never gave one."""
-    times_ns, values_degC = session.readings("camera.temperature")
-    for time_ns, camera_degC in zip(reversed(times_ns.tolist()), reversed(values_degC.tolist()), strict=True):
-        if not math.isnan(camera_degC):
-            return Cooling(camera_degC, time_ns)
-    return None

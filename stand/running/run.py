@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
-from contextlib import AsyncExitStack, suppress
-from dataclasses import dataclass
+from contextlib import AsyncExitStack, nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.clock import Clock, VirtualClock, WallClock, seconds_ns
-from drivers.interface import ConfigError, SessionError, StandError, StandTripped, Unreachable
+from drivers.interface import ConfigError, SessionError, StandError, StandTripped
 from stand.assembly import Assembly, assemble
+from stand.clock_watch import ClockWatch
 from stand.commandline.session_text import salvage_line
+from stand.guarding.safe_ranges import accepted_text
 from stand.hub import Event, Hub, Item
-from stand.recording.recorder import Recorder
+from stand.one_cpu import one_cpu
+from stand.recording.disk import FILES_LINE, Disk
+from stand.recording.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from stand.recording.salvage import Salvaged, salvage_unfinished
 from stand.recording.settings import SessionInfo
+from stand.running.claim import claimed
 from stand.running.performance import Performance, perform
 from stand.running.resume import Interruption
 from stand.running.session_setup import Order, info_of, recorder_of, session_directory
 from stand.running.stop import Interrupted, Stop
-from stand.running.tasks import cancelled, watched
-from stand.simulator import ControlSocket, Simulator, laboratory_of, one_cpu
+from stand.running.tasks import cancelled, cause_of, failure_text, watched
+from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
 __all__ = ["Interrupted", "resume", "run_real", "run_virtual"]
 
-# Real time that an orphaned simulator takes to answer, and to let go of its addresses.
-_ORPHAN_ANSWERS_S, _ORPHAN_TRIES, _ORPHAN_PAUSE_S = 5.0, 40, 0.25
+_OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +78,7 @@ async def run_virtual(
 ) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
+    The laboratory takes free addresses, whatever the configured ones are: any number of virtual runs go side by side.
     The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start;
     `begun` is told the folder as soon as a run that is killed could be resumed in it.
     Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
@@ -96,85 +101,79 @@ async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s:
     """Go on with an interrupted run, in the time it was run in, and add to its session; raises as run_virtual.
 
     What is done is not done again. In virtual time the laboratory is a new one with a chamber at room temperature,
-    `downtime_s` after the last recorded instant. SessionError when the host's clock is before that instant.
+    `downtime_s` after the last recorded instant. When the host's clock is before that instant (it was set back since),
+    the session goes on at that instant, and the offset to UTC is recorded.
     """
     try:
         job = _Job(before.order, before.directory.parent, before.seed, watch, _nobody, before)
         if before.info.clock_source == "virtual":
             return await _run_virtual(job, before.last_ns + seconds_ns(downtime_s))
-        clock = WallClock()
-        if clock.now_ns() <= before.last_ns:
-            raise SessionError(f"{before.directory}: the host's clock is before its last instant; set it right")
         async with Stop() as stop:
-            return await _run(job, clock, None, stop)
+            return await _run(job, WallClock(before.last_ns + 1), None, stop)
     finally:
         before.release()
 
 
 async def _run_virtual(job: _Job, start_ns: int) -> Path:
-    laboratory = {**laboratory_of(job.order.config, virtual=True, seed=job.seed), "start_ns": start_ns}
+    order = job.order
+    laboratory = laboratory_of(
+        order.config, virtual=True, seed=job.seed, start_ns=start_ns, is_anywhere=not order.at_configured_addresses
+    )
     async with Stop() as stop, AsyncExitStack() as stack:
         stack.enter_context(one_cpu())
-        address = str(laboratory["control"])
-        simulator = await _started(laboratory, await _orphan_ended(address))
+        simulator = await _started(laboratory)
         stack.push_async_callback(asyncio.to_thread, simulator.stop)
-        control = ControlSocket(address)
+        control = ControlSocket(simulator.addresses["control"])
         stack.push_async_callback(control.close)
         await control.open()
         clock = VirtualClock(start_ns, control.advance)
-        return await _run(job, clock, clock.run, stop)
+        there = replace(job, order=replace(order, config=relocated(order.config, simulator.addresses)))
+        return await _run(there, clock, clock.run, stop)
 
 
-async def _orphan_ended(address: str) -> int:
-    """End the simulator that a killed daemon has left, which would go on for a minute and knows nothing of the time
-    since. Returns how often to try to start a new one, which it keeps from its addresses until it is gone."""
-    control = ControlSocket(address)
-    try:
-        async with asyncio.timeout(_ORPHAN_ANSWERS_S):
-            await control.open()
-            return _ORPHAN_TRIES if (await control.request({"do": "quit_if_orphaned"}))["quits"] else 1
-    except (Unreachable, TimeoutError, ValueError):
-        return 1  # nobody is there, or is any more, or no simulator: starting one will say so
-    finally:
-        await control.close()
-
-
-async def _started(laboratory: Mapping[str, object], tries: int) -> Simulator:
+async def _started(laboratory: Mapping[str, object]) -> Simulator:
     """The simulator process; when the run is stopped meanwhile, it is ended again."""
-    clock = WallClock()
-    while True:
-        starting = asyncio.ensure_future(asyncio.to_thread(Simulator, laboratory))
-        try:
-            return await asyncio.shield(starting)
-        except ConfigError:
-            tries -= 1
-            if tries <= 0:
-                raise
-            await clock.sleep_until(clock.now_ns() + seconds_ns(_ORPHAN_PAUSE_S))
-        except asyncio.CancelledError:
-            simulator = await starting
-            await asyncio.to_thread(simulator.stop)
-            raise
+    starting = asyncio.ensure_future(asyncio.to_thread(Simulator, laboratory))
+    try:
+        return await asyncio.shield(starting)
+    except asyncio.CancelledError:
+        simulator = await starting
+        await asyncio.to_thread(simulator.stop)
+        raise
 
 
+# What drives virtual time, or looks after the real one.
 _Time = Callable[[], Coroutine[None, None, None]]
 
 
 async def _run(job: _Job, clock: Clock, time: _Time | None, stop: Stop) -> Path:
-    """The whole run; whoever is told of trips is told, too, of one that ends by itself before its plan is complete."""
+    """The whole run; one on a real stand has it for itself from before anything is opened, or does not touch it."""
+    directory = job.directory(clock)
+    async with claimed(job.order.config, directory) if isinstance(clock, WallClock) else nullcontext():
+        return await _told(job, directory, clock, time, stop)
+
+
+async def _told(job: _Job, directory: Path, clock: Clock, time: _Time | None, stop: Stop) -> Path:
+    """Whoever is told of trips is told, too, of a run that ends by itself before its plan is complete."""
     hub, early = Hub(), _Early()
     job.watch(hub)
     hub.subscribe(early)
+    if isinstance(clock, WallClock):
+        time = ClockWatch(hub, clock, 0 if job.before is None else job.before.utc_offset_ns).run
     for segment in await job.salvaged():
         hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
     assembly = assemble(job.order.config, hub, clock)
-    directory = job.directory(clock)
+    if accepted := job.order.config.accepted():
+        hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
     try:
         recorder = await _performed(job, directory, assembly, time, stop, early)
         _check_outcome(directory, recorder, assembly)
-    except Exception as error:
+    except Exception as raised:
+        error = cause_of(raised)
         if stop.fault is None:  # else the guard has told, or the operator knows
             await _tell_failure(assembly, directory.name, error)
+        if isinstance(error, MemoryError):
+            raise StandError(f"{directory}: {failure_text(error)}{_unsafe(assembly)}") from raised
         raise
     return directory
 
@@ -184,6 +183,11 @@ async def _performed(
 ) -> Recorder:
     """From opening everything to closing it."""
     async with AsyncExitStack() as stack:
+        disk = None if isinstance(assembly.clock, VirtualClock) else Disk()
+        if disk is not None:
+            stack.callback(disk.close)
+            assembly.stand.compressor_file.through(disk.line(FILES_LINE).run)
+        stack.push_async_callback(assembly.stand.compressor_file.close)
         background: list[asyncio.Task[None]] = []
         stack.push_async_callback(cancelled, background)
         if time is not None:
@@ -193,9 +197,9 @@ async def _performed(
         stack.push_async_callback(stop.settled)
         stop.watch(assembly.stand)
         await _opened(assembly, background, stop, camera_on=job.before is None or job.before.set_up.camera_on)
-        recorder = await _recording(job, directory, assembly, stop, early)
+        recorder = await _recording(job, directory, assembly, stop, early, disk)
         recording = asyncio.create_task(recorder.run())
-        stack.push_async_callback(_finish, recorder, recording)
+        stack.push_async_callback(_finish, recorder, recording, stop)
         tasks = (*background, recording)
         await perform(Performance(job.order, job.seed, job.before, job.begun, assembly, recorder, stop, tasks))
     return recorder
@@ -204,17 +208,22 @@ async def _performed(
 def _check_outcome(directory: Path, recorder: Recorder, assembly: Assembly) -> None:
     """What is wrong with a run that has done its whole plan: nobody may take such a stand for safe, or such a session
     for whole."""
-    if unsafe := assembly.stand.unconfirmed:
+    if unsafe := assembly.stand.safety.unconfirmed:
         raise StandTripped(f"{directory}: complete, but NOT SAFE: {'; '.join(unsafe)}")
     if recorder.frames_lost:
         raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
 
 
-async def _tell_failure(assembly: Assembly, name: str, error: Exception) -> None:
-    unsafe = assembly.stand.unconfirmed
-    ending = f"; NOT SAFE: {'; '.join(unsafe)}" if unsafe and not isinstance(error, StandTripped) else ""
-    if failure := await assembly.notifier().tell(f"{name} has failed: {error or type(error).__name__}{ending}"):
+async def _tell_failure(assembly: Assembly, name: str, error: BaseException) -> None:
+    ending = "" if isinstance(error, StandTripped) else _unsafe(assembly)
+    if failure := await assembly.notifier().tell(f"{name} has failed: {failure_text(error)}{ending}"):
         assembly.hub.publish(Event(assembly.clock.now_ns(), "warning", "notify_failed", failure))
+
+
+def _unsafe(assembly: Assembly) -> str:
+    """What is not confirmed safe, as the end of a sentence; "" when nothing is."""
+    unsafe = assembly.stand.safety.unconfirmed
+    return f"; NOT SAFE: {'; '.join(unsafe)}" if unsafe else ""
 
 
 class _Early:
@@ -238,39 +247,56 @@ async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop
     try:
         await watched(_open(assembly, camera_on=camera_on), background)
     except BaseException:
-        stop.taking_down()
-        await assembly.stand.make_safe()
+        await _made_safe(assembly, stop)
         raise
 
 
-async def _recording(job: _Job, directory: Path, assembly: Assembly, stop: Stop, early: _Early) -> Recorder:
+async def _made_safe(assembly: Assembly, stop: Stop) -> None:
+    """Before anything was permitted: whatever answers already is made safe."""
+    stop.taking_down()
+    safety = assembly.stand.safety
+    safety.demand()
+    try:
+        await safety.confirmed(min(_OPENING_SAFE_LIMIT_S, assembly.config.guard.safe_limit_s))
+    finally:
+        await safety.close()
+
+
+async def _recording(
+    job: _Job, directory: Path, assembly: Assembly, stop: Stop, early: _Early, disk: Disk | None
+) -> Recorder:
     """The recorder, started; a disk that refuses it leaves the stand safe, as everything after this does."""
     try:
-        recorder = recorder_of(job.order, directory, job.info(directory, assembly), assembly)
-        recorder.start(early.taken())
+        recorder = recorder_of(job.order, directory, job.info(directory, assembly), assembly, disk)
+        await recorder.begin(early.taken)
     except BaseException:
-        stop.taking_down()
-        await assembly.stand.make_safe()
+        await _made_safe(assembly, stop)
         raise
     return recorder
 
 
 async def _open(assembly: Assembly, *, camera_on: bool) -> None:
-    """Connect everything; heat and cold lose what permission somebody left them, the flap is closed and the camera
-    switched on before anything else may happen, but for a run that goes on with the camera off."""
-    devices = assembly.devices
+    """Connect everything; heat and cold lose what permission somebody left them, the flap is closed, the relay board's
+    timer tested, and the camera switched on before anything else may happen, but for a run that goes on with the camera
+    off."""
+    devices, stand = assembly.devices, assembly.stand
     await assembly.bus.open()
     await devices.relays.open()
-    await assembly.stand.withdraw_permits()
+    stand.opened(devices.relays)
+    await stand.withdraw_permits()
     await devices.regulator.open()
+    stand.opened(devices.regulator)
     await devices.regulator.stop()
     await devices.thermometers.open()
     await devices.flap.open()
+    stand.opened(devices.flap)
     await devices.flap.move_closed()
     for axis in devices.axes.values():
         await axis.open()
+        stand.opened(axis)
+    await stand.test_dead_man()
     if camera_on:
-        await assembly.stand.power_camera(on=True)
+        await stand.power_camera(on=True)
 
 
 async def _close(assembly: Assembly) -> None:
@@ -281,6 +307,6 @@ async def _close(assembly: Assembly) -> None:
     await assembly.bus.close()
 
 
-async def _finish(recorder: Recorder, recording: asyncio.Task[None]) -> None:
+async def _finish(recorder: Recorder, recording: asyncio.Task[None], stop: Stop) -> None:
     await cancelled([recording])
-    await recorder.finish()
+    await recorder.finish(COMPLETE_WITHIN_S if stop.fault is None else FINISH_WITHIN_S)

@@ -2,8 +2,9 @@
 
 Before each action, and within dwells and captures, the run waits at the stand's gate. What an interlock or the death of
 an earlier daemon has undone is brought about again: the set-up the steps so far have left, and the soaks since the last
-set-point, unless the chamber is still (or back) in its band. A warm-up cannot be gone on with after an interlock: it
-begins anew, from a cold camera. A step is done when all it has recorded is on the disk.
+set-point, unless the chamber is still (or back) in its band; a camera that was or may have been off is soaked anew
+before the next frames. A capture that was interrupted for long is taken again as a whole, a warm-up from a cold camera.
+A step is done when all it has recorded is on the disk.
 """
 
 from __future__ import annotations
@@ -33,14 +34,16 @@ from experiments.steps import (
     StartChamber,
     StopChamber,
     kind_of,
-    longest_s,
     parameters_of,
 )
 from stand.hub import Event, Hub, StepMark, StepState
-from stand.recording.superseded import restarted
+from stand.recording.restarts import restarted
+from stand.running.camera_offset import OffsetWatch
 from stand.running.cold_start import cold_start
+from stand.running.earned import Earned, duration_of
 from stand.running.gate import INTERLOCK
-from stand.running.journal import Again, Dwell, Journal, Step
+from stand.running.journal import Again, Journal, Step
+from stand.running.outage import Outage
 from stand.running.set_up import SetUp
 from stand.running.settling_watch import SettlingWatch
 from stand.stand import Interlocked, Stand
@@ -48,24 +51,29 @@ from stand.stand import Interlocked, Stand
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
 # chamber left alone for a minute has gone further. The camera, which is slower than the air, has then hardly moved.
 BAND_K = 1.0
+# A capture that did not go on for longer than this is taken again: its flap was shut meanwhile, and the air is not the
+# same any more.
+AGAIN_AFTER_S = 60.0
 _JOURNAL_NS = 60 * NS_PER_S  # of a dwell that a kill costs at most
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
     """What an earlier daemon has done. done: ids of steps. earned_s: of soaks, by id; one that is done and not listed
-    has earned all of it. frames: on the disk, by the id of a capture that is not done."""
+    has earned all of it. frames: on the disk, by the id of a capture that is not done. until_ns: the last instant of
+    which anything is known, None when it is not known."""
 
     done: frozenset[str] = frozenset()
     earned_s: Mapping[str, float] = field(default_factory=dict[str, float])
     frames: Mapping[str, int] = field(default_factory=dict[str, int])
+    until_ns: int | None = None
 
 
 class _ColdStart(Exception):
     """No error, but a way out of wherever the run is: these steps, a warm-up's, have to be done again."""
 
     def __init__(self, again: tuple[PlannedStep, ...]) -> None:
-        super().__init__("an interlock held the warm-up; it begins anew")
+        super().__init__("the warm-up was interrupted; it begins anew")
         self.again = again
 
 
@@ -73,7 +81,7 @@ class Scheduler:
     """Performs a plan; what a step raises ends the run, after the step is marked as failed.
 
     `flushed` returns when all that was published is on the disk. `progress`: go on where an earlier daemon was.
-    `settling` tells when a soak may end early.
+    `settling` tells when a soak may end early, `offsets` is told what has settled.
     """
 
     def __init__(
@@ -84,6 +92,7 @@ class Scheduler:
         journal: Journal,
         flushed: Callable[[], Awaitable[None]],
         settling: SettlingWatch,
+        offsets: OffsetWatch,
         progress: Progress | None = None,
     ) -> None:
         self._stand = stand
@@ -92,16 +101,22 @@ class Scheduler:
         self._journal = journal
         self._flushed = flushed
         self._settling = settling
+        self._offsets = offsets
         self._disturbed = progress is not None  # the set-up has to be brought about before anything else
         progress = progress or Progress()
         self._done = set(progress.done)
-        self._earned_ns = {step_id: seconds_ns(earned_s) for step_id, earned_s in progress.earned_s.items()}
+        self._earned = Earned(progress.earned_s, self._done, journal, clock)
         self._frames = dict(progress.frames)
         self._plan: tuple[PlannedStep, ...] = ()
         self._begun: set[str] = set()
         self._warming_ns = 0  # when the warm-up's camera was switched on, or gave its last frame
         self._was_held = False  # since then
+        self._outage = Outage(stand.gate, clock)  # since the last frame
+        if progress.until_ns is not None:
+            self._outage.reset(clock.now_ns() - progress.until_ns)
+        self._lost_equilibrium = stand.equilibrium.is_lost  # and the soaks have not been taken back yet
         stand.gate.subscribe(self._on_hold)
+        stand.equilibrium.subscribe(self._on_lost_equilibrium)
 
     async def run(self, plan: Iterable[PlannedStep]) -> None:
         """What is not done of the plan."""
@@ -110,7 +125,8 @@ class Scheduler:
             try:
                 return await self._walk()
             except _ColdStart as needed:
-                await self._begin_anew(needed.again)
+                self._disturbed = True  # the steps before the first of these have to be brought about, too
+                await self._begin_anew(needed.again, "from a cold camera")
 
     async def _walk(self) -> None:
         set_up = SetUp()
@@ -122,19 +138,18 @@ class Scheduler:
                 await self._run_step(planned, needed)
             set_up = set_up.after(planned)
 
-    async def _begin_anew(self, again: tuple[PlannedStep, ...]) -> None:
+    async def _begin_anew(self, again: tuple[PlannedStep, ...], how: str) -> None:
         """These steps count as neither begun nor done, and no frame of theirs so far: told before it is journaled, so
         that no frame is ever left out that nobody was told of."""
         now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]
-        self._hub.publish(restarted(now_ns, step_ids[-1], self._frames.pop(step_ids[-1], 0)))
+        self._hub.publish(restarted(now_ns, step_ids[-1], self._frames.pop(step_ids[-1], 0), how))
         await self._flushed()
         await self._journal.write(Again(now_ns, step_ids))
         self._done.difference_update(step_ids)
         self._begun.difference_update(step_ids)
 
     async def _run_step(self, planned: PlannedStep, set_up: SetUp) -> None:
-        self._begun.add(planned.step_id)
-        await self._journal.write(Step(self._clock.now_ns(), planned.step_id, "started"))
+        await self._begin(planned)
         self._mark(planned, StepState.STARTED)
         try:
             await self._perform_undisturbed(planned, set_up)
@@ -145,9 +160,13 @@ class Scheduler:
             raise
         self._mark(planned, StepState.DONE)
         await self._flushed()
-        self._earned_ns.pop(planned.step_id, None)
+        self._earned.forget(planned.step_id)
         self._done.add(planned.step_id)
         await self._journal.write(Step(self._clock.now_ns(), planned.step_id, "done"))
+
+    async def _begin(self, planned: PlannedStep) -> None:
+        self._begun.add(planned.step_id)
+        await self._journal.write(Step(self._clock.now_ns(), planned.step_id, "started"))
 
     async def _perform_undisturbed(self, planned: PlannedStep, set_up: SetUp) -> None:
         """The step; once more after an interlock that made it fail has been cleared."""
@@ -184,6 +203,9 @@ class Scheduler:
                 await stand.move_to(axis, position)
             case PowerCamera(on):
                 self._warming_ns, self._was_held = self._clock.now_ns(), False
+                self._outage.reset()
+                self._lost_equilibrium = False
+                stand.equilibrium.forget()
                 await stand.power_camera(on=on)
             case CoolDown(band_K, time_constant_s, max_s):
                 await stand.cool_down(band_K, time_constant_s, max_s)
@@ -194,24 +216,49 @@ class Scheduler:
 
     async def _capture(self, planned: PlannedStep, capture: Capture, set_up: SetUp) -> None:
         """The frames that are not there yet, on a grid of absolute deadlines: those missed while the run was held or a
-        lost camera opened anew are skipped, not made up for by a burst."""
+        lost camera opened anew are skipped, not made up for by a burst. All of them when that took long."""
         step_id = planned.step_id
+        if not self._frames.get(step_id) and capture.role is not Role.WARM_UP:
+            self._outage.reset()
         await self._stand.approach_again()
         lead_ns = self._clock.lead_ns  # the camera is told of a frame before its instant, and prepared when it comes
         due_ns, interval_ns = self._clock.now_ns() + lead_ns, seconds_ns(capture.interval_s)
+        is_lost = False  # the camera was, a moment ago
         while self._frames.get(step_id, 0) < capture.frames:
             await self._clock.sleep_until(due_ns - lead_ns)
-            if self._stand.gate.reasons or self._disturbed:
+            if is_lost or not self._is_ready(set_up):
                 await self._ready(planned, set_up)
                 await self._stand.approach_again()
-                due_ns += max(0, math.ceil((self._clock.now_ns() - due_ns) / interval_ns)) * interval_ns
+                due_ns += max(is_lost, math.ceil((self._clock.now_ns() - due_ns) / interval_ns)) * interval_ns
+                is_lost = False
                 continue
+            await self._again_after_outage(planned, capture)
+            if not self._frames.get(step_id) and set_up.soaks and capture.role is not Role.WARM_UP:
+                self._offsets.settled(capture.chamber_degC)
             self._tell_missing(capture)
-            await self._stand.take_frame(capture.exposure_s, step_id, due_ns)
-            self._warming_ns = self._clock.now_ns()
-            self._frames[step_id] = self._frames.get(step_id, 0) + 1
+            is_lost = not await self._stand.take_frame(capture.exposure_s, step_id, due_ns)
+            if not is_lost:
+                self._warming_ns = self._clock.now_ns()
+                self._outage.reset()
+                self._frames[step_id] = self._frames.get(step_id, 0) + 1
             # To the latest deadline that has passed: a free-running camera gives its frame up to a period late.
             due_ns += max(1, (self._clock.now_ns() - due_ns) // interval_ns) * interval_ns
+
+    def _is_ready(self, set_up: SetUp) -> bool:
+        """Whether nothing holds the run, and nothing has undone what the steps have set up."""
+        is_shut = set_up.flap_open and not self._stand.flap_open  # in a hold
+        return not (self._stand.gate.reasons or self._disturbed or is_shut)
+
+    async def _again_after_outage(self, planned: PlannedStep, capture: Capture) -> None:
+        """A capture that was interrupted for long has no frame any more; a warm-up has to begin with a cold camera."""
+        if self._outage.length_ns <= seconds_ns(AGAIN_AFTER_S):
+            return
+        if capture.role is Role.WARM_UP and (again := cold_start(self._plan, self._done, self._begun)):
+            raise _ColdStart(again)
+        if self._frames.get(planned.step_id):
+            length_s = self._outage.length_ns / NS_PER_S
+            await self._begin_anew((planned,), f"it was interrupted for {length_s:.0f} s")
+            await self._begin(planned)
 
     def _tell_missing(self, capture: Capture) -> None:
         """A camera goes on warming up while the run is held: what was not seen of it is told."""
@@ -223,23 +270,20 @@ class Scheduler:
 
     async def _soak(self, planned: PlannedStep, set_up: SetUp) -> None:
         """All of a soak, with everything that has to be restored on the way."""
-        while self._owed_ns(planned):
+        while self._earned.owed_ns(planned):
             await self._ready(planned, set_up)
             await self._dwell(planned)
 
     async def _dwell(self, planned: PlannedStep) -> None:
         """Earn what a soak still owes, while the gate is open; returns early when the set-up was disturbed."""
         self._settling.restart()
-        while (owed_ns := self._owed_ns(planned)) and not self._disturbed:
+        duration_ns = duration_of(planned)
+        while (owed_ns := self._earned.owed_ns(planned)) and not self._disturbed:
             begin_ns = self._clock.now_ns()
             await self._sleep_while_open(begin_ns + min(owed_ns, _JOURNAL_NS))
-            duration_ns = self._duration_ns(planned)
             is_settled = await self._is_settled(planned, duration_ns - owed_ns + self._clock.now_ns() - begin_ns)
-            end_ns = self._clock.now_ns()
-            # Who has settled owes nothing more.
-            earned_ns = duration_ns if is_settled else duration_ns - owed_ns + min(end_ns - begin_ns, owed_ns)
-            self._earned_ns[planned.step_id] = earned_ns
-            await self._journal.write(Dwell(end_ns, planned.step_id, earned_ns / NS_PER_S))
+            earned_ns = duration_ns - owed_ns + min(self._clock.now_ns() - begin_ns, owed_ns)
+            await self._earned.earn(planned, duration_ns if is_settled else earned_ns)
             if self._stand.gate.reasons:
                 await self._stand.gate.passed()
                 self._settling.restart()
@@ -263,27 +307,34 @@ class Scheduler:
 
     async def _ready(self, planned: PlannedStep, set_up: SetUp) -> None:
         """Return when nothing holds the run and everything is as the steps before `planned` have left it."""
-        restored = False
-        while True:
-            await self._stand.gate.passed()
-            if self._disturbed and (again := cold_start(self._plan, self._done, self._begun)):
-                raise _ColdStart(again)
-            try:
-                if self._disturbed:
-                    self._disturbed, restored = False, True
-                    await self._restore(set_up)
-                for soak in set_up.soaks:
-                    if soak != planned:
-                        await self._dwell(soak)
+        with self._outage.counted():
+            while True:
                 await self._stand.gate.passed()
-                if restored and set_up.flap_open and not self._disturbed:
-                    await self._stand.open_flap()
-                    restored = False
-            except (DeviceError, Interlocked):
-                if not self._disturbed:
-                    raise
-            if not self._disturbed and not self._stand.gate.reasons:
-                return
+                if self._disturbed and (again := cold_start(self._plan, self._done, self._begun)):
+                    raise _ColdStart(again)
+                try:
+                    await self._make_ready(planned, set_up)
+                except (DeviceError, Interlocked):
+                    if not self._disturbed:
+                        raise
+                if not self._disturbed and not self._stand.gate.reasons:
+                    return
+
+    async def _make_ready(self, planned: PlannedStep, set_up: SetUp) -> None:
+        """Returns early when it is disturbed."""
+        stand = self._stand
+        if self._disturbed:
+            self._disturbed = False
+            await self._restore(set_up)
+        for soak in set_up.soaks:
+            if soak != planned:
+                await self._dwell(soak)
+        if set_up.camera_on and isinstance(planned.step, OpenFlap | Capture):
+            await stand.equilibrium.regained(lambda: self._disturbed)
+        await stand.gate.passed()
+        is_wanted_open = set_up.flap_open and not isinstance(planned.step, CloseFlap)
+        if is_wanted_open and not stand.flap_open and not self._disturbed:
+            await stand.open_flap()
 
     async def _restore(self, set_up: SetUp) -> None:
         """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
@@ -293,61 +344,51 @@ class Scheduler:
             await stand.gate.passed()
             await stand.move_to(axis, position)
         await stand.gate.passed()
-        if not set_up.camera_on:
+        if set_up.camera_on:
+            await stand.restore_camera()
+        else:
+            stand.equilibrium.forget()
             await stand.power_camera(on=False)
         if set_up.chamber_degC is not None:
             await stand.gate.passed()
             await self._credit_soaks(set_up, set_up.chamber_degC)
             await stand.start_chamber(set_up.chamber_degC)
+        else:
+            self._lost_equilibrium = False
         self._tell("info", "restored", set_up.text)
 
     async def _credit_soaks(self, set_up: SetUp, chamber_degC: float) -> None:
         """Soaks since the last set-point keep what they have earned only if the chamber is in its band."""
-        begun = [soak for soak in set_up.soaks if self._is_begun(soak)]
-        pv = self._hub.latest("regulator.pv")
+        begun = [soak for soak in set_up.soaks if self._earned.is_begun(soak)]
+        pv = self._hub.known("regulator.pv")  # one lost reply costs no soak
         pv_degC = math.nan if pv is None else pv.value
+        is_cold, self._lost_equilibrium = self._lost_equilibrium and set_up.camera_on, False
         if not begun:
             return
+        if is_cold:
+            await self._earned.lose(begun)
+            return self._tell("warning", "soak_restarted", "the camera was or may have been off; it soaks anew")
         if abs(pv_degC - chamber_degC) <= BAND_K:
             self._tell(
                 "info", "soak_credited", f"the chamber is at {pv_degC:.2f} degC, within {BAND_K:g} K of its set-point"
             )
             return
-        for soak in begun:
-            self._earned_ns[soak.step_id] = 0
-        now_ns = self._clock.now_ns()
-        await self._journal.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in begun))
+        await self._earned.lose(begun)
         text = f"the chamber is at {pv_degC:.2f} degC, not within {BAND_K:g} K of its set-point; it soaks anew"
         self._tell("warning", "soak_restarted", text)
-
-    def _is_begun(self, soak: PlannedStep) -> bool:
-        return soak.step_id in self._done or self._earned_ns.get(soak.step_id, 0) > 0
-
-    def _owed_ns(self, soak: PlannedStep) -> int:
-        """What the soak has not earned yet."""
-        duration_ns = self._duration_ns(soak)
-        earned_ns = self._earned_ns.get(soak.step_id, duration_ns if soak.step_id in self._done else 0)
-        return max(0, duration_ns - earned_ns)
-
-    def _duration_ns(self, soak: PlannedStep) -> int:
-        return seconds_ns(longest_s(soak.step)) if isinstance(soak.step, AnySoak) else 0
 
     def _on_hold(self, reason: str, held: bool) -> None:
         """An interlock makes the stand safe: nothing is as it was."""
         self._disturbed = self._disturbed or (held and reason == INTERLOCK)
         self._was_held = self._was_held or held
 
+    def _on_lost_equilibrium(self) -> None:
+        """The camera has to be brought back as well; in a plan that has it off that is nothing."""
+        self._disturbed = self._lost_equilibrium = True
+
     def _tell(self, level: str, kind: str, text: str) -> None:
         self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
 
     def _mark(self, planned: PlannedStep, state: StepState) -> None:
-        self._hub.publish(
-            StepMark(
-                self._clock.now_ns(),
-                planned.step_id,
-                planned.index,
-                kind_of(planned.step),
-                state,
-                parameters_of(planned.step),
-            )
-        )
+        now_ns, kind = self._clock.now_ns(), kind_of(planned.step)
+        self._hub.publish(StepMark(now_ns, planned.step_id, planned.index, kind, state, parameters_of(planned.step)))

@@ -16,8 +16,9 @@ from compensation.target import Target
 from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.documents import parse_document
 from stand.assembly import Assembly
-from stand.config import StandConfig
+from stand.config import RecordingConfig, StandConfig
 from stand.recipe import Recipe
+from stand.recording.disk import Disk
 from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.recording.roi import RoiEncoder
 from stand.recording.settings import VIRTUAL_COMMIT_S
@@ -26,7 +27,8 @@ from stand.recording.settings import VIRTUAL_COMMIT_S
 @dataclass(frozen=True, slots=True)
 class Order:
     """What to run: the checked files and their texts (they are attached to the recording). attended: somebody is there
-    to do what the plan prompts for."""
+    to do what the plan prompts for. at_configured_addresses: the laboratory of a virtual run answers there instead of
+    at free addresses, for a program that has to find it."""
 
     config: StandConfig
     recipe: Recipe
@@ -34,6 +36,7 @@ class Order:
     recipe_text: str
     target_text: str
     attended: bool = False
+    at_configured_addresses: bool = False
 
     def attachments(self) -> dict[str, str]:
         """The texts by the names under which a session has them."""
@@ -64,20 +67,31 @@ def info_of(order: Order, directory: Path, assembly: Assembly) -> SessionInfo:
     )
 
 
-def recorder_of(order: Order, directory: Path, info: SessionInfo, assembly: Assembly) -> Recorder:
-    """The recorder of this run."""
+def recorder_of(
+    order: Order, directory: Path, info: SessionInfo, assembly: Assembly, disk: Disk | None = None
+) -> Recorder:
+    """The recorder of this run; `disk` is the process that touches the disk for it."""
     config, clock = order.config, assembly.clock
     settings = RecordingSettings(
         config.recording.frame_encoding,
-        VIRTUAL_COMMIT_S if isinstance(clock, VirtualClock) else config.recording.telemetry_commit_s,
+        _commit_s(config.recording, clock),
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
     encode = _partial_frames(order)
-    recorder = Recorder(directory, info, order.attachments(), _kinds(config), assembly.hub, clock, settings, encode)
+    recorder = Recorder(
+        directory, info, order.attachments(), _kinds(config), assembly.hub, clock, settings, encode, disk
+    )
     if encode is not None:
         encode.tell = partial(recorder.warn, "search_failed")
     return recorder
+
+
+def _commit_s(recording: RecordingConfig, clock: Clock) -> float:
+    """Between commits of telemetry: on a virtual clock few, but nothing waits for half of what a guard allows."""
+    if isinstance(clock, VirtualClock):
+        return min(VIRTUAL_COMMIT_S, recording.durable_within_s / 3)
+    return min(recording.telemetry_commit_s, recording.durable_within_s / 3)
 
 
 def _partial_frames(order: Order) -> RoiEncoder | None:

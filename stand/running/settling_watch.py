@@ -10,7 +10,7 @@ import numpy as np
 from compensation.markers.detection import Detection, DetectionError, detect
 from compensation.target import Target
 from drivers.clock import Clock, seconds_ns
-from drivers.interface import Frame
+from drivers.interface import Frame, Reading
 from drivers.lane import Lane
 from experiments.steps import SoakUntilSettled
 from stand.estimating.thermal_model import BAND_K
@@ -19,6 +19,7 @@ from stand.running.settling import Float, Seen, digit_K, judge, movement, second
 from stand.stand import Stand
 
 CHAMBER, CAMERA = "regulator.pv", "camera.temperature"
+_UNKNOWN_S = 60.0
 _KEPT = 20_000  # readings: more than a day at one every 5 s
 
 
@@ -106,8 +107,9 @@ class SettlingWatch:
         """The hub's subscriber."""
         if isinstance(item, Batch):
             for reading in item.readings:
-                if reading.channel in self._readings:
-                    self._readings[reading.channel].append((seconds(reading.time_ns), reading.value))
+                kept = self._readings.get(reading.channel)
+                if kept is not None and not _is_passing(reading, kept):
+                    kept.append((seconds(reading.time_ns), reading.value))
 
     def _tell(self, level: str, kind: str, text: str) -> None:
         self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
@@ -121,6 +123,12 @@ class SettlingWatch:
         # A camera at rest shows one digit only; how wide that is shows while it moves.
         self._digit_K = min(filter(None, (self._digit_K, digit_K(camera[1]))), default=0.0)
         return Seen(chamber, camera, self._digit_K, _table(self._looks, 6))
+
+
+def _is_passing(reading: Reading, kept: deque[tuple[float, float]]) -> bool:
+    """A poll that failed on the wire says nothing, and soon it is asked again; when that lasts, what was meanwhile is
+    not known."""
+    return reading.cause == "wire" and bool(kept) and seconds(reading.time_ns) - kept[-1][0] < _UNKNOWN_S
 
 
 def _table(rows: Iterable[object], width: int) -> Float:

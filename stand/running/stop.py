@@ -20,11 +20,12 @@ class Interrupted(StandError):
 
 
 class Stop:
-    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM, and SIGHUP, when the terminal
-    is closed and nohup does not keep it away): `stop(fault)`, in any phase.
+    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM, SIGQUIT, and SIGHUP, when the
+    terminal is closed and nohup does not keep it away): `stop(fault)`, in any phase.
 
     The stand is latched and made safe, the run cancelled where it waits, once, and not while it is being taken down;
-    what it then raises becomes Interrupted or StandTripped with the first reason.
+    what it then raises becomes Interrupted or StandTripped with the first reason. While an actuator does not confirm
+    that it is safe, a signal a minute after the first ends the wait.
     """
 
     def __init__(self) -> None:
@@ -33,7 +34,7 @@ class Stop:
         self._stand: Stand | None = None
         self._aborting: asyncio.Task[None] | None = None
         self._taking_down = False
-        self._signals = [signal.SIGINT, signal.SIGTERM]
+        self._signals = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             self._signals.append(signal.SIGHUP)
 
@@ -49,16 +50,19 @@ class Stop:
             self._follow(self._stand.gate)
 
     def __call__(self, fault: Fault = _BY_OPERATOR) -> None:
-        """Latch at once, begin to make safe, and return; the run is cancelled when the actuators have answered."""
+        """Latch at once, begin to make safe, and return; the run is cancelled when every actuator has been tried."""
         self.fault = self.fault or fault
         if self._stand is not None:
             self._stand.latch(fault)
         if self.phase in (Phase.ABORTING, Phase.ENDED) or self._taking_down:
+            if self._stand is not None and fault.rule == OPERATOR:
+                self._stand.safety.give_up()
             return
         self._turn(Turn.STOP)
         if self._stand is None:
             self._run.cancel()
         else:
+            self._stand.safety.demand()
             self._aborting = asyncio.create_task(self._abort(self._stand))
 
     def taking_down(self) -> None:
@@ -66,7 +70,7 @@ class Stop:
         self._taking_down = True
 
     async def settled(self) -> None:
-        """From here on nothing is cancelled, and no making safe is under way: the clock and the wires may go."""
+        """From here on nothing is cancelled: the clock and the wires may go."""
         self._taking_down = True
         if self._aborting is not None:
             await asyncio.wait([self._aborting])
@@ -77,7 +81,7 @@ class Stop:
 
     async def _abort(self, stand: Stand) -> None:
         try:
-            await stand.make_safe()
+            await stand.safety.tried()
         finally:
             if not self._taking_down:
                 self._taking_down = True
@@ -103,7 +107,7 @@ class Stop:
             asyncio.get_running_loop().remove_signal_handler(number)
         if self.fault is None or error is None:
             return
-        unsafe = self._stand.unconfirmed if self._stand is not None else ()
+        unsafe = self._stand.safety.unconfirmed if self._stand is not None else ()
         text = f"{self.fault.text}; " + (f"NOT SAFE: {'; '.join(unsafe)}" if unsafe else "the stand is safe")
         if isinstance(error, SessionError):
             text = f"{text}; {error}"

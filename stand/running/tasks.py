@@ -36,3 +36,18 @@ async def cancelled(tasks: Sequence[asyncio.Task[Any]]) -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def cause_of(error: BaseException) -> BaseException:
+    """What has really gone wrong: of a group of errors the first, but a lack of memory before all others."""
+    if not isinstance(error, BaseExceptionGroup):
+        return error
+    leaves = [cause_of(each) for each in error.exceptions]
+    return next((leaf for leaf in leaves if isinstance(leaf, MemoryError)), leaves[0])
+
+
+def failure_text(error: BaseException) -> str:
+    """The error as words for an operator."""
+    if isinstance(error, MemoryError):
+        return "out of memory"
+    return str(error) or type(error).__name__

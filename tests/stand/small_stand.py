@@ -8,9 +8,13 @@ from pathlib import Path
 from compensation.target import Target
 from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
 from drivers.interface import Frame, Reading, StandTripped, Unreachable
-from stand.hub import Batch, Hub, StepMark, StepState
+from stand.guarding.safety import Safety
+from stand.hub import Batch, Event, Hub, StepMark, StepState
+from stand.running.camera_offset import OffsetWatch
+from stand.running.equilibrium import LOST, CameraEquilibrium, EquilibriumLimits
+from stand.running.flap_care import keep_shut_in_holds
 from stand.running.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
-from stand.running.journal import JOURNAL_NAME, Journal
+from stand.running.journal import JOURNAL_NAME, Again, Journal
 from stand.running.resume import journaled
 from stand.running.scheduler import Progress, Scheduler
 from stand.running.settling_watch import SettlingWatch
@@ -18,25 +22,29 @@ from stand.running.stop import Stop
 from stand.stand import Interlocked
 
 TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
+TIME_CONSTANT_S = 5.0  # of a camera that tells no temperature
 COMMIT_S = 0.2  # what the disk takes to have all that was published
 COMMIT_EVERY_S = 1.0  # and what was published before that, it has in any case
 
 
 class SmallStand:
     """As stand.stand.Stand towards the scheduler. broken: the next action fails; camera_back_ns: until then it is
-    lost."""
+    lost; supplied: whether the camera is."""
 
     def __init__(self, clock, hub, wrong):
         self.gate = Gate()
+        self.equilibrium = CameraEquilibrium(EquilibriumLimits(0.2, 600.0, TIME_CONSTANT_S), hub, clock)
+        self.safety = Safety(lambda: None, hub, clock)
+        self.safety.take(self)
         self.fault = None
-        self.unconfirmed = ()
+        self.name = "stand"
+        self.supplied, self.supplied_ns = True, None
         self.safe = self.heating = self.flap_open = self.broken = False
         self.camera_back_ns = 0
         self.image = None  # what a look shows
         self.started_at_degC = None  # what the chamber was at when it was last set going, None after a new set-point
         self.set_ns = 0  # when that was
         self._clock, self._hub, self._wrong = clock, hub, wrong
-        self._making_safe = asyncio.Lock()
 
     def latch(self, fault):
         self.fault = self.fault or fault
@@ -60,9 +68,9 @@ class SmallStand:
             raise Unreachable("flap", "unplugged")
 
     async def start_chamber(self, chamber_degC):
+        found_degC = self._hub.latest("regulator.pv").value
         await self._act("start_chamber")
-        self.heating, self.set_ns = True, self._clock.now_ns()
-        self.started_at_degC = self._hub.latest("regulator.pv").value
+        self.heating, self.set_ns, self.started_at_degC = True, self._clock.now_ns(), found_degC
 
     async def set_temperature(self, chamber_degC):
         await self._act("set_temperature")
@@ -85,15 +93,33 @@ class SmallStand:
     async def take_frame(self, exposure_s, step_id, due_ns):
         try:
             await self._act("take_frame")
-            while self._clock.now_ns() < self.camera_back_ns:
+            is_lost = self._clock.now_ns() < self.camera_back_ns or not self.supplied
+            while self._clock.now_ns() < self.camera_back_ns and self.supplied:
                 self.gate.hold(CAMERA_LOST)
                 await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
                 self._check()
         finally:
             self.gate.clear(CAMERA_LOST)
+        if is_lost:
+            return False
         if not (self.flap_open and self.heating):
             self._wrong.append("a frame of a stand that is not set up")
+        if self.supplied_ns is not None and self._clock.now_ns() < self.supplied_ns + seconds_ns(5 * TIME_CONSTANT_S):
+            self._wrong.append("a frame of a cold camera")
         self._hub.publish(Frame("camera.image", None, self._clock.now_ns(), exposure_s, 0.0, 40.0, 1, 1, 0, step_id))
+        return True
+
+    def drop_supply(self):
+        """As the keeper finds it."""
+        if self.supplied:
+            self.supplied = False
+            self.equilibrium.lose("brown-out")
+
+    async def restore_camera(self):
+        if not self.supplied:
+            await self._act("restore_camera")
+            self.supplied, self.supplied_ns = True, self._clock.now_ns()
+            self.equilibrium.begin()
 
     async def look(self, exposure_s, step_id):
         await self.open_flap()
@@ -104,11 +130,10 @@ class SmallStand:
         return frame
 
     async def make_safe(self):
-        async with self._making_safe:
-            self.heating = self.flap_open = False
-            await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
-            self.heating = self.flap_open = False
-            self.safe = True
+        self.heating = self.flap_open = False
+        await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
+        self.heating = self.flap_open = False
+        self.safe = True
 
 
 class Life:
@@ -123,9 +148,9 @@ class Life:
         self.stand.gate.subscribe(self._on_gate)
         self.hub.subscribe(self._on_item)
         self.begun = 0  # steps
-        self.interlocks = 0
+        self.disturbances = 0  # interlocks, and cameras that were off
         self.cancelled_before_safe = False
-        self._open_since_ns, self._open_ns = start_ns, 0
+        self._open_since_ns, self._open_ns, self._closed_ns = start_ns, 0, start_ns
         self._plan, self._journal_path = plan, folder / JOURNAL_NAME
         self._disk, self._unsaved = disk, []
         self._resumes = self._journal_path.exists()
@@ -139,14 +164,24 @@ class Life:
             done, earned_s = journaled(entries)
             marks = [item for item in self._disk if isinstance(item, StepMark)]
             done |= {mark.step_id for mark in marks if mark.state is StepState.DONE}
-            progress = Progress(done, earned_s, Counter(i.step_id for i in self._disk if isinstance(i, Frame)))
+            frames = [item for item in self._disk if isinstance(item, Frame) and self._counts(item, entries)]
+            last_ns = max([item.time_ns for item in self._disk] + [entry.time_ns for entry in entries], default=None)
+            progress = Progress(done, earned_s, Counter(frame.step_id for frame in frames), last_ns)
         else:
             self._journal = Journal.create(folder)
         self._journal.start(self.clock, self.wrong.append)
         settling = SettlingWatch(self.stand, self.hub, self.clock, TARGET)
-        scheduler = Scheduler(self.stand, self.hub, self.clock, self._journal, self._flushed, settling, progress)
+        watches = settling, OffsetWatch(self.hub, self.clock)
+        scheduler = Scheduler(self.stand, self.hub, self.clock, self._journal, self._flushed, *watches, progress)
         self._time = asyncio.create_task(self.clock.run())
+        self._flap = asyncio.create_task(keep_shut_in_holds(self.stand, self.hub, self.clock))
         self.run = asyncio.create_task(self._run(scheduler))
+
+    @staticmethod
+    def _counts(frame, entries):
+        """Whether its capture was not begun anew after it."""
+        again = [entry.time_ns for entry in entries if isinstance(entry, Again) and frame.step_id in entry.step_ids]
+        return all(frame.time_ns >= time_ns for time_ns in again)
 
     async def _run(self, scheduler):
         """As a performance has it."""
@@ -160,7 +195,8 @@ class Life:
                 raise
             finally:
                 self.stop.taking_down()
-                await self.stand.make_safe()
+                self.stand.safety.demand()
+                await self.stand.safety.confirmed(600.0)
                 self.stop.ended()
                 await self.stop.settled()
 
@@ -191,9 +227,8 @@ class Life:
 
     def interlock(self):
         """As the guard does: hold, then make safe; the run waits."""
-        safe = []
-        self.call(lambda: (self.stand.gate.hold(INTERLOCK), safe.append(asyncio.create_task(self.stand.make_safe()))))
-        self._do(safe[0])
+        self.call(lambda: (self.stand.gate.hold(INTERLOCK), self.stand.safety.demand()))
+        self._do(self.stand.safety.tried())
 
     def kill(self):
         """Nothing that happens from now on, here the end of its tasks, reaches the disk. The next life begins then."""
@@ -203,7 +238,8 @@ class Life:
         self.call(self._cancel)
         self.passes(30.0)
         self._time.cancel()
-        self._do(asyncio.gather(self._time, self.run, return_exceptions=True))
+        self._flap.cancel()
+        self._do(asyncio.gather(self._time, self._flap, self.run, return_exceptions=True))
         self._do(self._journal.close())
         self.loop.close()
         self._journal_path.write_bytes(journal)
@@ -218,14 +254,20 @@ class Life:
         since_ns = self.clock.now_ns() if self.stand.gate.reasons else self._open_since_ns
         return (self._open_ns + self.clock.now_ns() - since_ns) / NS_PER_S
 
+    def held_s(self):
+        """For how long something has held the run."""
+        return (self.clock.now_ns() - self._closed_ns) / NS_PER_S if self.stand.gate.reasons else 0.0
+
     def _on_gate(self, reason, held):
-        self.interlocks += held and reason == INTERLOCK
+        self.disturbances += held and reason == INTERLOCK
         if held and len(self.stand.gate.reasons) == 1:
-            self._open_ns += self.clock.now_ns() - self._open_since_ns
+            self._closed_ns = self.clock.now_ns()
+            self._open_ns += self._closed_ns - self._open_since_ns
         elif not self.stand.gate.reasons:
             self._open_since_ns = self.clock.now_ns()
 
     def _on_item(self, item):
+        self.disturbances += isinstance(item, Event) and item.kind == LOST
         if isinstance(item, StepMark):
             self.begun += item.state is StepState.STARTED
         if isinstance(item, StepMark | Frame):

@@ -7,14 +7,16 @@ from drivers.clock import WallClock
 from drivers.interface import ConfigError
 from stand.assembly import assemble
 from stand.config import load_config, packaged
+from stand.guarding.safe_ranges import largest_correction_K
 from stand.hub import Hub
 from stand.recipe import load_recipe
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
-def changed(tmp_path: Path, path: str, value: object) -> Path:
+def changed(tmp_path: Path, path: str, value: object, accept: list[str] | None = None) -> Path:
     data = yaml.safe_load((CONFIGS / "laboratory.yaml").read_text())
+    data["guard"]["accept"] = accept or []
     section = data
     *parents, last = path.split(".")
     for parent in parents:
@@ -116,6 +118,103 @@ def test_a_wrong_entry_names_file_and_path(tmp_path: Path, path: str, value: obj
         load_config(file)
     assert sentence in str(caught.value)
     assert str(caught.value).startswith(str(file))
+
+
+SAFE_EDGES = [  # path, the last safe value, one that is not, what the refusal says of both
+    ("compressor.min_off_s", 180, 179, "179 s is outside the safe range (at least 180 s): a compressor started"),
+    ("compressor.min_on_s", 60, 59.5, "59.5 s is outside the safe range (at least 60 s): a compressor stopped"),
+    ("compressor.max_starts_per_h", 12, 13, "13 is outside the safe range (at most 12): each start heats"),
+    ("guard.sensors.trip_K", 10, 10.5, "10.5 K is outside the safe range (at most 10 K): a probe that"),
+    ("guard.sensors.trip_after_s", 600, 601, "601 s is outside the safe range (at most 600 s): a probe that"),
+    ("guard.stale_after_s", 30, 31, "31 s is outside the safe range (at most 30 s): it would be heated"),
+    ("guard.keys_s", 120, 121, "121 s is outside the safe range (at most 120 s): a set-point changed by hand"),
+    ("guard.flap_open_s", 3600, 3601, "3601 s is outside the safe range (at most 3600 s): an open flap"),
+    ("guard.disk_low_s", 1800, 1801, "1801 s is outside the safe range (at most 1800 s): it would be heated"),
+    ("recording.stop_frames_below_GB", 0.5, 0.4, "0.4 GB is outside the safe range (at least 0.5 GB): telemetry"),
+    ("bus.timeout_s", 2, 2.1, "2.1 s is outside the safe range (at most 2 s): the guard could wait"),
+    (
+        "thermometers.channels.air.polynomial",
+        [0, 0.1],
+        [0, 0.11],
+        "with offset_K a correction of up to 11 K over -40 to 100 degC is outside the safe range (at most 10 K)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("path", "safe", "unsafe", "sentence"), SAFE_EDGES, ids=[edge[0] for edge in SAFE_EDGES])
+def test_a_value_that_disarms_a_rule_is_refused_unless_its_path_is_accepted(
+    tmp_path: Path, path: str, safe: object, unsafe: object, sentence: str
+):
+    assert load_config(changed(tmp_path, path, safe)).accepted() == {}
+    file = changed(tmp_path, path, unsafe)
+    with pytest.raises(ConfigError) as caught:
+        load_config(file)
+    assert str(caught.value).startswith(f"{file}: {path}: {sentence}")
+    assert str(caught.value).endswith(f"; choose a value within it, or name {path} in guard.accept")
+    accepted = load_config(changed(tmp_path, path, unsafe, accept=[path])).accepted()
+    assert accepted == {path: pytest.approx(unsafe if isinstance(unsafe, int | float) else 11.0)}
+
+
+def test_every_value_outside_is_named_at_once_and_accepting_one_leaves_the_others_refused(tmp_path: Path):
+    data = yaml.safe_load(changed(tmp_path, "compressor.min_off_s", 10, ["compressor.min_off_s"]).read_text())
+    data["guard"].update(keys_s=300, stale_after_s=60)
+    (tmp_path / "changed.yaml").write_text(yaml.safe_dump(data))
+    with pytest.raises(ConfigError) as caught:
+        load_config(tmp_path / "changed.yaml")
+    assert "guard.keys_s: 300 s is outside" in str(caught.value)
+    assert "guard.stale_after_s: 60 s is outside" in str(caught.value)
+    assert "min_off_s: " not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("accept", "sentence"),
+    [
+        (["bus.timeout_s"], "guard.accept: bus.timeout_s is not needed: 0.3 s is within its range (at most 2 s)"),
+        (["guard.max_air_degC"], "guard.accept: guard.max_air_degC is not a path that can be accepted; those are comp"),
+        (["compressor"], "guard.accept: compressor is not a path that can be accepted"),
+        (["thermometers.channels.air.offset_K"], "air.offset_K is not a path that can be accepted"),
+        ([""], "guard.accept:  is not a path that can be accepted"),
+        (["compressor.min_on_s"] * 2, "guard.accept: compressor.min_on_s is given twice"),
+    ],
+)
+def test_an_entry_of_accept_that_is_not_needed_or_no_path_is_refused(tmp_path: Path, accept: list[str], sentence: str):
+    value = 10 if "compressor.min_on_s" in accept else 180
+    with pytest.raises(ConfigError) as caught:
+        load_config(changed(tmp_path, "compressor.min_on_s", value, accept))
+    assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize(("path", "value"), [("guard.stale_after_s", 121), ("bus.timeout_s", 11)])
+def test_what_no_file_may_have_cannot_be_accepted(tmp_path: Path, path: str, value: float):
+    with pytest.raises(ConfigError, match=f"{path}: Input should be less than or equal to"):
+        load_config(changed(tmp_path, path, value, accept=[path]))
+
+
+@pytest.mark.parametrize(
+    ("offset_K", "polynomial", "largest_K"),
+    [
+        (0.0, (), 0.0),
+        (-9.5, (), 9.5),
+        (9.0, (2.0,), 11.0),
+        (0.0, (0.0, 0.01), 1.0),
+        (5.0, (0.0, -0.05), 7.0),
+        (0.0, (0.0, 0.6, -0.01), 40.0),  # 9 K at 30 degC, between the ends
+        (0.0, (0.0, 0.0, 0.0), 0.0),
+        (0.0, (9.0, 0.0, -0.02, 0.0), 191.0),
+        (0.0, (0.0,) * 7 + (1e-300,), 1e-286),
+        (0.0, (0.0,) * 7 + (1e308,), 1e9),
+        (0.0, (1e308, 1e308, 1e308), 1e9),
+    ],
+)
+def test_the_largest_correction_of_a_thermometer_over_its_whole_range(
+    offset_K: float, polynomial: tuple[float, ...], largest_K: float
+):
+    assert largest_correction_K(offset_K, polynomial) == pytest.approx(largest_K)
+
+
+def test_a_correction_that_is_largest_between_the_ends_is_found():
+    """0 at both ends, 12.25 K in the middle, which a look at the ends would miss."""
+    assert largest_correction_K(0.0, (10.0, 0.15, -0.0025)) == pytest.approx(12.25)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.clock import FollowedClock
-from drivers.interface import DeviceFault, SessionError, StandTripped, Unreachable
+from drivers.interface import DeviceFault, InUse, SessionError, StandTripped, Unreachable
 from stand.order_files import load_order
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry, working
@@ -69,6 +69,19 @@ async def test_what_is_added_while_a_run_is_under_way_has_its_turn(tmp_path: Pat
         return tmp_path / str(entry.id)
 
     await work(tmp_path, run, FollowedClock(7), runs.lines.append)
+    assert [entry[0] for entry in runs.entries()] == ["done", "done"]
+
+
+@pytest.mark.parametrize("session_first", [False, True])
+async def test_a_stand_that_another_run_has_ends_the_work_and_fails_no_run(tmp_path: Path, session_first: bool):
+    """Nothing was touched, so nobody has to look: the next `stand queue start` tries again."""
+    runs = Runs(tmp_path, InUse("bus", "is in use by session night (pid 7)"), None, session_first=session_first)
+    with pytest.raises(InUse, match=r"is in use by session night"):
+        await runs.work()
+    assert [entry[0] for entry in runs.entries()] == ["interrupted", "waiting"]
+    assert queue.queued(tmp_path).halted == ""
+    runs.ends.append(None)
+    await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["done", "done"]
 
 

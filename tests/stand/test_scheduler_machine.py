@@ -1,6 +1,7 @@
 """Pauses, interlocks, faults, stops, kills and time in any order: what a dwell has earned is neither lost nor counted
 twice, no step is done twice, and a stop makes safe before anything unwinds and ends the run from wherever it is."""
 
+import itertools
 import tempfile
 from collections import Counter
 from pathlib import Path
@@ -26,7 +27,7 @@ from experiments.steps import (
 from stand.guarding.interlocks import Fault
 from stand.hub import StepMark, StepState
 from stand.running.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
-from stand.running.journal import JOURNAL_NAME, Dwell, Step, read_lines
+from stand.running.journal import JOURNAL_NAME, Again, Dwell, Step, read_lines
 from stand.running.scheduler import BAND_K
 from stand.running.stop import Interrupted
 from tests.stand.small_stand import Life
@@ -97,6 +98,17 @@ class RunMachine(RuleBasedStateMachine):
     def _entries(self):
         return read_lines((Path(self.folder.name) / JOURNAL_NAME).read_bytes())[0]
 
+    def _frames_that_count(self):
+        """Those on the disk that were not superseded."""
+        since_ns = {
+            step_id: entry.time_ns
+            for entry in (self._entries() if self.life is not None else ())
+            if isinstance(entry, Again)
+            for step_id in entry.step_ids
+        }
+        frames = [item for item in self.disk if isinstance(item, Frame)]
+        return [frame for frame in frames if frame.time_ns >= since_ns.get(frame.step_id, 0)]
+
     # What is seen as it happens.
 
     def _on_item(self, item):
@@ -114,18 +126,20 @@ class RunMachine(RuleBasedStateMachine):
         credited = stand.started_at_degC is not None and abs(stand.started_at_degC - chamber_degC) <= BAND_K
         if not credited and (now_ns - stand.set_ns) / NS_PER_S < soaked_s:
             self.life.wrong.append(f"a frame of {step_id} before the chamber had soaked")
+        if stand.supplied_ns is not None and (now_ns - stand.supplied_ns) / NS_PER_S < soaked_s:
+            self.life.wrong.append(f"a frame of {step_id} before the camera had soaked")
 
     def _check_soak(self, mark):
         """A soak that no interlock disturbs takes what it owes of the time during which nothing holds it."""
         life = self.life
         if mark.state is StepState.STARTED:
             earned_s = [e.earned_s for e in self._entries() if isinstance(e, Dwell) and e.step_id == mark.step_id]
-            self.soak = life.open_s() + SOAKS_S[mark.step_id] - (earned_s[-1] if earned_s else 0.0), life.interlocks
+            self.soak = life.open_s() + SOAKS_S[mark.step_id] - (earned_s[-1] if earned_s else 0.0), life.disturbances
         if mark.state is StepState.DONE:
-            end_s, interlocks = self.soak
-            if interlocks == life.interlocks and abs(life.open_s() - end_s) > 1e-6:
+            end_s, disturbances = self.soak
+            if disturbances == life.disturbances and abs(life.open_s() - end_s) > 1e-6:
                 life.wrong.append(f"{mark} at {life.open_s()} instead of {end_s}")
-            if interlocks == life.interlocks and (not life.stand.heating or life.stand.flap_open):
+            if disturbances == life.disturbances and (not life.stand.heating or life.stand.flap_open):
                 life.wrong.append(f"{mark} in a stand that is not set up")
 
     # What may happen.
@@ -163,7 +177,7 @@ class RunMachine(RuleBasedStateMachine):
         self.life.call(lambda: self.life.stand.gate.clear(reason))
 
     @lives
-    @rule(duration_s=st.sampled_from([3.0, 40.0]))
+    @rule(duration_s=st.sampled_from([3.0, 40.0, 90.0]))
     def camera_is_lost(self, duration_s):
         self.life.stand.camera_back_ns = self.life.clock.now_ns() + seconds_ns(duration_s)
 
@@ -184,6 +198,11 @@ class RunMachine(RuleBasedStateMachine):
     def operator_clears(self, pv_degC):
         self.life.publish_pv(pv_degC)
         self.clear(INTERLOCK)
+
+    @lives
+    @rule()
+    def camera_loses_its_supply(self):
+        self.life.call(self.life.stand.drop_supply)
 
     @lives
     @rule()
@@ -242,12 +261,24 @@ class RunMachine(RuleBasedStateMachine):
 
     @invariant()
     def a_capture_that_is_done_has_its_frames(self):
-        frames = Counter(item.step_id for item in self.disk if isinstance(item, Frame))
+        frames = Counter(frame.step_id for frame in self._frames_that_count())
         done = {item.step_id for item in self.disk if isinstance(item, StepMark) and item.state is StepState.DONE}
         for planned in PLAN:
             if isinstance(planned.step, Capture):
                 taken = frames[planned.step_id]
                 assert taken == FRAMES if planned.step_id in done else taken <= FRAMES
+
+    @invariant()
+    def the_frames_of_a_capture_belong_together(self):
+        """But for an interruption of a minute, and what is on the way then."""
+        frames = self._frames_that_count()
+        for earlier, later in itertools.pairwise(frames):
+            assert earlier.step_id != later.step_id or later.time_ns - earlier.time_ns <= 80 * NS_PER_S
+
+    @invariant()
+    def the_flap_is_shut_in_a_hold_that_lasts(self):
+        if self.life is not None and not self.life.run.done():
+            assert not (self.life.held_s() >= 60.0 and self.life.stand.flap_open)
 
     @invariant()
     def a_run_that_has_ended_heats_nothing_and_was_safe_before_it_unwound(self):

@@ -1,0 +1,60 @@
+"""Shuts the flap in every hold that lasts, whatever the hold is and wherever the run waits in it.
+
+Through an open flap the chamber breathes the laboratory's air: frost in the cold, and no equilibrium. A capture that
+waits for a disk, a camera or an operator would leave it open.
+"""
+
+from __future__ import annotations
+
+import asyncio
+
+from drivers.clock import Clock, seconds_ns
+from drivers.interface import DeviceError
+from stand.hub import Event, Hub
+from stand.running.gate import STOPPING, Gate
+from stand.stand import Stand
+
+# Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.
+SHUT_AFTER_S = 48.0
+_LOOK_S = 5.0  # who was on the way when the gate closed may open it later
+_AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be worn
+
+
+async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
+    """Until cancelled. The events `flap_shut_in_hold` and, when it does not close, `flap_not_shut` (an error) tell."""
+    while True:
+        await stand.gate.closed()
+        if await _opens_within(stand.gate, clock, SHUT_AFTER_S):
+            continue
+        while stand.gate.reasons:
+            wait_s = _LOOK_S
+            if stand.flap_open and STOPPING not in stand.gate.reasons and not await _shut(stand, hub, clock):
+                wait_s = _AGAIN_S
+            await _opens_within(stand.gate, clock, wait_s)
+
+
+async def _shut(stand: Stand, hub: Hub, clock: Clock) -> bool:
+    """Whether it is shut now."""
+    reasons = sorted(stand.gate.reasons)
+    data = {"reasons": reasons}
+    try:
+        await stand.close_flap()
+    except DeviceError as error:
+        text = f"the flap does not close, although the run is held ({', '.join(reasons)}): {error}"
+        hub.publish(Event(clock.now_ns(), "error", "flap_not_shut", text, data))
+        return False
+    text = f"the flap was shut: the run is held ({', '.join(reasons)})"
+    hub.publish(Event(clock.now_ns(), "info", "flap_shut_in_hold", text, data))
+    return True
+
+
+async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
+    """Whether the gate opens before so long is over."""
+    sleeping = asyncio.ensure_future(clock.sleep_until(clock.now_ns() + seconds_ns(duration_s)))
+    opening = asyncio.ensure_future(gate.passed())
+    try:
+        await asyncio.wait([sleeping, opening], return_when=asyncio.FIRST_COMPLETED)
+        return opening.done()
+    finally:
+        sleeping.cancel()
+        opening.cancel()
