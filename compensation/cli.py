@@ -13,6 +13,7 @@ from compensation.apply_cli import apply_model, export_model
 from compensation.budget_cli import budget_of_session, budgets_of_sessions
 from compensation.calibration_cli import calibrate_session
 from compensation.command_line import (
+    AcrossGap,
     Cache,
     Cluster,
     TargetOption,
@@ -105,6 +106,7 @@ def fit(
     workers: Workers = 1,
     cluster: Cluster = None,
     cache: Cache = True,
+    across_gap: AcrossGap = False,
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
@@ -114,7 +116,7 @@ def fit(
         check_request(degree, form)
         check_writable(out)
         found_by = finder(workers, cluster, use_cache=cache)
-        observations = observe_sessions(sessions, progress, named_target(target), found_by)
+        observations = observe_sessions(sessions, progress, named_target(target), found_by, across_gap=across_gap)
         model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
         save_model(model, out)
@@ -137,6 +139,7 @@ def report(
     workers: Workers = 1,
     cluster: Cluster = None,
     cache: Cache = True,
+    across_gap: AcrossGap = False,
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
@@ -154,7 +157,7 @@ def report(
             positions=table_positions([Session.open(path).steps() for path in sessions]),
             validation=None if validation is None else load_validation(validation),
         )
-        observations = observe_sessions(sessions, progress, wanted, found_by)
+        observations = observe_sessions(sessions, progress, wanted, found_by, across_gap=across_gap)
         has_cycle = can_be_fitted(observations)
         used = fit_model(observations) if given is None and has_cycle else given
         evaluation = None if used is None or not has_cycle else evaluate(used, observations)

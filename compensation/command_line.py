@@ -17,6 +17,13 @@ from stand.usage import tell
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
 ]
+AcrossGap = Annotated[
+    bool,
+    typer.Option(
+        "--across-gap",
+        help="Use frames from before and after a gap together, though camera minus air has changed in it.",
+    ),
+]
 Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
 Cluster = Annotated[
     str | None, typer.Option("--cluster", help="A Dask scheduler, host:port, whose workers see the same files.")

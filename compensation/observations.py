@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import islice
 from pathlib import Path
@@ -21,12 +21,14 @@ from compensation.drift.history import History, recorded_history
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
 from compensation.markers.noise import Noise, estimate_noise
+from compensation.one_equilibrium import check_sessions
 from compensation.target import Target
 from drivers.documents import parse_document
 from drivers.interface import Frame, SessionError
 from stand.progress import Report
 from stand.recording.session import Session
 from stand.recording.superseded import begins_of, is_superseded
+from stand.recording.utc_offsets import UtcOffsets
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -62,7 +64,7 @@ class Role(StrEnum):
 @dataclass(frozen=True, slots=True)
 class SessionFacts:
     """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
-    segments that a killed recorder left behind and nobody has read."""
+    segments that a killed recorder left behind and nobody has read. utc: from its instants to UTC."""
 
     session_id: str
     recipe: str
@@ -71,6 +73,7 @@ class SessionFacts:
     software_version: str
     simulated: bool | None
     incomplete: int
+    utc: UtcOffsets = field(default_factory=UtcOffsets)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,10 +175,19 @@ def read_frames(session: Session) -> Iterator[Frame]:
 
 
 def observe_sessions(
-    paths: Sequence[Path], progress: Progress, target: Target | None = None, finder: Finder | None = None
+    paths: Sequence[Path],
+    progress: Progress,
+    target: Target | None = None,
+    finder: Finder | None = None,
+    *,
+    across_gap: bool = False,
 ) -> Observations:
-    """All frames of all sessions, found once, with progress. target: instead of the ones attached to the sessions."""
+    """All frames of all sessions, found once, with progress. target: instead of the ones attached to the sessions.
+
+    SessionError when a session has frames of two equilibria of the camera, unless `across_gap`.
+    """
     sessions = [Session.open(path) for path in paths]
+    check_sessions(sessions, across_gap=across_gap)
     targets = [target or session_target(session) for session in sessions]
     parts: list[Observations] = []
     done = 0
@@ -260,7 +272,7 @@ def _facts(session: Session) -> SessionFacts:
     fields = ("session_id", "recipe", "camera_serial", "operator", "software_version")
     texts = {name: session.metadata.get(name, "") for name in fields}
     simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
-    return SessionFacts(**texts, simulated=simulated, incomplete=len(session.incomplete))
+    return SessionFacts(**texts, simulated=simulated, incomplete=len(session.incomplete), utc=session.utc)
 
 
 def _air_degC(session: Session, time_ns: NDArray[np.int64]) -> Float:

@@ -9,7 +9,7 @@ import typer
 
 from compensation.budget.geometry import load_geometry
 from compensation.calibration.camera_file import CameraFile
-from compensation.command_line import Cache, Cluster, TargetOption, Workers, named_target, one_line_errors
+from compensation.command_line import AcrossGap, Cache, Cluster, TargetOption, Workers, named_target, one_line_errors
 from compensation.drift.model_file import load_model
 from compensation.files import check_writable, write_whole
 from compensation.finding.found import finder
@@ -40,6 +40,7 @@ def validate_session(
     workers: Workers = 1,
     cluster: Cluster = None,
     cache: Cache = True,
+    across_gap: AcrossGap = False,
 ) -> None:
     """How far the target at V0..V3 seems to move with temperature, before and after compensation, beside the paper's.
 
@@ -55,7 +56,11 @@ def validate_session(
         file, drift = CameraFile.load(camera), load_model(model)
         geometry = None if budget is None else load_geometry(budget)
         observations = observe_sessions(
-            [session], progress, named_target(target), finder(workers, cluster, use_cache=cache)
+            [session],
+            progress,
+            named_target(target),
+            finder(workers, cluster, use_cache=cache),
+            across_gap=across_gap,
         )
         check_same(observations, file, drift)
         opened = Session.open(session)

@@ -10,6 +10,7 @@ The centre is that of the ellipse in the image. For a tilted target this is not 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,9 +93,10 @@ def detect(
         if len(previous.flags) != target.count:
             raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
         if _still_there(grey, previous):
-            tracked = _fit(grey, target, previous.state, noise)
-            if tracked is not None and _has_followed(tracked, previous):
-                return tracked
+            with suppress(DetectionError):
+                tracked = _fit(grey, target, previous.state, noise)
+                if tracked is not None and _has_followed(tracked, previous):
+                    return tracked
     return _search(grey, target, None if previous is None else previous.homography, noise)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.markers.edge_model import B0, CX, CY, M11, M12, M22, SIGMA, EdgeState, Float
-from compensation.markers.plane import expected_px
+from compensation.markers.plane import expected_px, project
 from compensation.target import Target
 
 _FIRST_BLUR_PX = 1.2
@@ -28,6 +28,7 @@ def expected_edges(homography: Float, target: Target) -> EdgeState:
     """The image ellipses of the target's circles, levels unknown (NaN): conic C = H^-T Q H^-1 of each circle Q."""
     x, y = target.coordinates_mm().T
     radius = target.diameters_mm() / 2
+    _require_in_front(homography, np.column_stack([x, y]), radius)
     circle = np.zeros((target.count, 3, 3))
     circle[:, [0, 1, 2], [0, 1, 2]] = np.stack([np.ones_like(x), np.ones_like(x), x**2 + y**2 - radius**2], axis=1)
     circle[:, 0, 2] = circle[:, 2, 0] = -x
@@ -44,6 +45,12 @@ def expected_edges(homography: Float, target: Target) -> EdgeState:
     parameters[:, M11], parameters[:, M12], parameters[:, M22] = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
     parameters[:, SIGMA] = _FIRST_BLUR_PX
     return EdgeState(parameters, scale)
+
+
+def _require_in_front(homography: Float, centres_mm: Float, radii_mm: Float) -> None:
+    """DetectionError when the image's horizon goes between or through the discs: their outlines are no ellipses."""
+    corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    project(homography, (centres_mm[:, None] + radii_mm[:, None, None] * corners).reshape(-1, 2))
 
 
 def implied_edges(

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.markers.bootstrap import Candidates
+from compensation.markers.errors import DetectionError
 from compensation.markers.lattice import largest_lattice
 from compensation.markers.placement import LEAST_SEEN, Placement, placements, settled
 from compensation.markers.plane import area_scale, expected_px, fit_homography, pitch_px, project, roll_deg
 from compensation.target import Target
-from drivers.interface import StandError
 
 __all__ = [
     "DetectionError",
@@ -35,17 +35,13 @@ __all__ = [
 _AMBIGUOUS_RESIDUAL = 1.5
 _AMBIGUOUS_ROLL_DEG = 30.0
 _TRACKED_PITCH = 0.5
+_MOST_SPOTS, _MOST_SPOTS_PER_MARKER = 2000, 20
+"""Among more spots that look like markers nothing is looked for: the time grows with their number."""
+_LARGEST_LATTICE = 4
+"""In a lattice of more than so many times its markers the target fits in hundreds of places."""
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
-
-
-class DetectionError(StandError):
-    """The target was not found or not identified beyond doubt; `found` counts the markers that were."""
-
-    def __init__(self, text: str, found: int = 0) -> None:
-        super().__init__(text)
-        self.found = found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,9 +58,13 @@ def identify(candidates: Candidates, target: Target, previous: Float | None = No
     Raises DetectionError with the reason when there are too few or more than one reading is possible.
     """
     points = candidates.centres_px
+    if len(points) > max(_MOST_SPOTS, _MOST_SPOTS_PER_MARKER * target.count):
+        raise _too_many(f"{len(points)} round spots", target)
     lattice = largest_lattice(points, target.count)
     if len(lattice) < LEAST_SEEN:
         raise _too_few(len(lattice), target)
+    if len(lattice) > _LARGEST_LATTICE * target.count:
+        raise _too_many(f"a grid of {len(lattice)} spots", target)
     possible = placements(lattice, points, target)
     _require(max((p.seen for p in possible), default=0), target)
     possible = _with_odd_marker(possible, candidates, target)
@@ -76,6 +76,13 @@ def identify(candidates: Candidates, target: Target, previous: Float | None = No
 def _require(found: int, target: Target) -> None:
     if found < target.least_markers:
         raise _too_few(found, target)
+
+
+def _too_many(what: str, target: Target) -> DetectionError:
+    return DetectionError(
+        f"found {what} where {target.name} has {target.count} markers: is it another target? If not, cut it out of the "
+        "image"
+    )
 
 
 def _too_few(found: int, target: Target) -> DetectionError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
@@ -9,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from compensation.markers.errors import DetectionError
 from compensation.markers.lattice import Cell
-from compensation.markers.plane import area_scale, expected_px, fit_homography, pitch_px, project
+from compensation.markers.plane import area_scale, checked_homography, expected_px, fit_homography, pitch_px, project
 from compensation.target import Target
 
 _MISSING_PX = 0.5
@@ -60,20 +62,33 @@ def placements(lattice: dict[Cell, int], points: Float, target: Target) -> list[
     if max(_seen(table) for table in tables) < target.count:
         tables = _settled(tables, points, target)
         tables += _settled(_beyond(tables, points, target), points, target)
-    return [placement(table, points, target) for table in _fullest(_distinct(tables))]
+    return _placed(_fullest(_distinct(tables)), points, target)
+
+
+def _placed(tables: list[Index], points: Float, target: Target) -> list[Placement]:
+    """The placements of those tables that are the image of a flat target at all."""
+    possible: list[Placement] = []
+    for table in tables:
+        with suppress(DetectionError):
+            possible.append(placement(table, points, target))
+    return possible
 
 
 def _settled(tables: list[Index], points: Float, target: Target) -> list[Index]:
     most = max((_seen(table) for table in tables), default=0)
     near = [table for table in tables if _seen(table) >= max(LEAST_SEEN, _WORTH_SETTLING * most)]
-    return [settled(table, points, target) for table in near]
+    possible: list[Index] = []
+    for table in near:
+        with suppress(DetectionError):
+            possible.append(settled(table, points, target))
+    return possible
 
 
 def _beyond(tables: list[Index], points: Float, target: Target) -> list[Index]:
     """The best table moved by up to two cells, where that finds as many markers: the growth may have missed a side of
     the grid and gone on into clutter at the other.
     """
-    possible = [placement(table, points, target) for table in _fullest(tables)]
+    possible = _placed(_fullest(tables), points, target)
     if not possible:
         return []
     best = min(possible, key=lambda p: p.residual_px)
@@ -88,8 +103,11 @@ def _within_reach(candidate: Index, points: Float, tree: KDTree, target: Target)
     """How many markers have a candidate near where the homography of those in the table puts them."""
     target_mm = target.coordinates_mm()
     seen = candidate >= 0
-    homography = fit_homography(target_mm[seen], points[candidate[seen]])
-    away, _ = tree.query(project(homography, target_mm))
+    try:
+        homography = fit_homography(target_mm[seen], points[candidate[seen]])
+        away, _ = tree.query(project(homography, target_mm))
+    except DetectionError:
+        return 0
     return int((away < _REACH * pitch_px(homography, target)).sum())
 
 
@@ -130,7 +148,7 @@ def settled(candidate: Index, points: Float, target: Target) -> Index:
 
 def _robust_homography(target_mm: Float, centres_px: Float, target: Target) -> Float:
     threshold_px = _RANSAC_PITCH * pitch_px(fit_homography(target_mm, centres_px), target)
-    return np.asarray(cv2.findHomography(target_mm, centres_px, cv2.RANSAC, threshold_px)[0], dtype=np.float64)
+    return checked_homography(cv2.findHomography(target_mm, centres_px, cv2.RANSAC, threshold_px)[0])
 
 
 def _distinct(tables: list[Index]) -> list[Index]:

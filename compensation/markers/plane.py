@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.markers.errors import DetectionError
 from compensation.target import Target
 
 _LEAST_FOR_DEGREE = {5: 80, 3: 20}
 """A polynomial of this degree needs so many markers: about four for each coefficient, or two for the cubic."""
 _ROUNDS = 8
+_NOT_FLAT = "the spots found cannot be the markers of a flat target"
 _SIGMA_OF_MEDIAN = 1 / np.sqrt(2 * np.log(2))
 """Of distances in two dimensions (Rayleigh)."""
 
@@ -18,15 +20,27 @@ Float = NDArray[np.float64]
 
 
 def project(homography: Float, points: Float) -> Float:
-    """Points (K, 2) mapped by a homography."""
+    """Points (K, 2) mapped by a homography; DetectionError when its horizon lies among them: no camera sees them so."""
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    if not (np.all(mapped[:, 2] > 0) or np.all(mapped[:, 2] < 0)):
+        raise DetectionError(_NOT_FLAT)
     return mapped[:, :2] / mapped[:, 2:]
 
 
 def fit_homography(target_mm: Float, centres_px: Float) -> Float:
-    """Least-squares homography (3, 3), target mm -> px, from at least four pairs of points."""
-    homography, _ = cv2.findHomography(target_mm, centres_px, 0)
-    return np.asarray(homography, dtype=np.float64)
+    """Least-squares homography (3, 3), target mm -> px, from at least four pairs of points.
+
+    DetectionError when there is none, as for points on a line.
+    """
+    return checked_homography(cv2.findHomography(target_mm, centres_px, 0)[0])
+
+
+def checked_homography(found: object) -> Float:
+    """What cv2.findHomography gave, as an array; DetectionError when it gave none, or one that cannot be inverted."""
+    homography = np.full((3, 3), np.nan) if found is None else np.asarray(found, dtype=np.float64)
+    if not np.isfinite(homography).all() or np.linalg.det(homography) == 0:
+        raise DetectionError(_NOT_FLAT)
+    return homography
 
 
 def area_scale(homography: Float, points: Float) -> Float:

@@ -82,8 +82,8 @@ def _session(observations: Observations, index: int) -> SessionNumbers:
         software_version=facts.software_version,
         simulated=facts.simulated,
         incomplete_segments=facts.incomplete,
-        begin=_instant(observations.time_ns[own][0]),
-        end=_instant(observations.time_ns[own][-1]),
+        begin=_instant(facts.utc.utc_ns(int(observations.time_ns[own][0]))),
+        end=_instant(facts.utc.utc_ns(int(observations.time_ns[own][-1]))),
         frames=int(own.sum()),
         frames_by_role={role: count for role, count in by_role.items() if count},
         unusable=int((own & ~observations.usable).sum()),
@@ -99,8 +99,8 @@ def _words(name: str) -> str:
     return name.lower().replace("_", " ")
 
 
-def _instant(time_ns: int) -> str:
-    return datetime.fromtimestamp(int(time_ns) // 1_000_000_000, UTC).isoformat()
+def _instant(utc_ns: int) -> str:
+    return datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).isoformat()
 
 
 def _set_points(observations: Observations, own: Mask) -> tuple[float, ...]:

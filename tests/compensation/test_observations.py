@@ -17,8 +17,8 @@ from drivers.clock import NS_PER_S
 from drivers.interface import ConfigError, SessionError
 from stand.recording.instants import utc_text
 from stand.recording.records import frame_places
+from stand.recording.restarts import restarted
 from stand.recording.session import Session
-from stand.recording.superseded import restarted
 
 from .conftest import DARK, GLARE, SEQUENCE, START_NS, TARGET_YAML, Recorded, record
 from .synthetic import facts, observations, quadratic
@@ -110,7 +110,7 @@ def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
 
 def test_frames_of_a_capture_that_was_begun_anew_do_not_count(tmp_path: Path):
     after_ns = START_NS + 2 * 60 * NS_PER_S + 1
-    again = restarted(after_ns, "step-1", 1)
+    again = restarted(after_ns, "step-1", 1, "after a long interruption")
     asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))
     session = Session.open(tmp_path / "night")
     seen = observe(session, session_target(session))

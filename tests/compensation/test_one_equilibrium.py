@@ -1,0 +1,52 @@
+"""A session whose camera came out of a gap with another temperature over the air is not fitted as one, silently."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from compensation.cli import app
+from compensation.one_equilibrium import check_one_equilibrium
+from drivers.clock import NS_PER_S
+from drivers.interface import SessionError
+from stand.hub import Event, StepMark, StepState
+from stand.recording.restarts import restarted
+from stand.recording.session import Session
+from tests.recording.recorded import START_NS, frame, record
+
+
+def items(gap_index: int, *, superseded: bool = False, role: str = "fit"):
+    """A frame each half second; the gap comes before the one of `gap_index`, and is told in the end."""
+
+    def at(time_ns, index):
+        parameters = {"role": role, "chamber_degC": 24.0}
+        yield StepMark(time_ns, f"capture-{index}", index, "Capture", StepState.STARTED, parameters)
+        yield frame(time_ns - 50_000_000, index)
+        if index == 11:
+            if superseded:
+                yield from (restarted(time_ns - NS_PER_S // 4, f"capture-{each}", 1, "x") for each in range(gap_index))
+            data = {"before_K": 15.2, "after_K": 13.1, "gap_ns": START_NS + gap_index * NS_PER_S // 2 - NS_PER_S // 4}
+            yield Event(time_ns, "warning", "camera_offset_changed", "text is for people", data)
+
+    return at
+
+
+async def test_frames_of_both_sides_are_refused_unless_somebody_wants_them(tmp_path: Path):
+    await record(tmp_path / "night", items=items(6))
+    with pytest.raises(SessionError, match=r"camera minus air was 15\.20 K before the gap at .* and 13\.10 K after it"):
+        check_one_equilibrium(Session.open(tmp_path / "night"))
+    for command in (
+        ["fit", str(tmp_path / "night"), "-o", str(tmp_path / "model.json")],
+        ["report", str(tmp_path / "night"), "-o", str(tmp_path / "report.html")],
+    ):
+        refused = CliRunner().invoke(app, command)
+        assert refused.exit_code != 0
+        assert "only with --across-gap" in refused.output
+        told = CliRunner().invoke(app, [*command, "--across-gap"])
+        assert "across-gap" not in told.output  # it gets as far as these frames, which show no target, take it
+
+
+@pytest.mark.parametrize(("gap_index", "options"), [(0, {}), (6, {"superseded": True}), (6, {"role": "warm_up"})])
+async def test_frames_of_one_side_are_of_one_equilibrium(tmp_path: Path, gap_index: int, options: dict[str, object]):
+    await record(tmp_path / "night", items=items(gap_index, **options))
+    check_one_equilibrium(Session.open(tmp_path / "night"))
