@@ -1,11 +1,59 @@
+"""What all tests share: the stock camera, and how they are dealt out to the workers of pytest-xdist."""
+
+import signal
 from collections.abc import Iterator
+from pathlib import Path, PurePath
+from typing import Any
 
 import pytest
 
 from tests.stock_camera import run_stock_camera
+
+# GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
+_STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera.py"}
+# In tests/system, whose long runs have each a laboratory of its own, the tests are dealt out one by one but for those
+# of a file that makes something once for all of them.
+_DEALT_OUT = PurePath("tests/system")
+_TOGETHER = {"tests/system/test_camera_wire.py", "tests/system/test_kill_recording.py"}
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Ctrl-C is for the programs that the tests start, too when the tests themselves run in the background of a shell,
+    which has them ignore it and pass that on."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def runtime_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where the daemons of these tests, and those they start, have their sockets and locks."""
+    with pytest.MonkeyPatch.context() as patch:
+        parent = tmp_path_factory.mktemp("runtime")
+        patch.setenv("XDG_RUNTIME_DIR", str(parent))
+        yield parent / "thermostand"
 
 
 @pytest.fixture(scope="session")
 def stock_camera() -> Iterator[None]:
     """The stock Aravis fake camera answers at its address."""
     yield from run_stock_camera()
+
+
+def _unit(nodeid: str) -> str:
+    """The tests that go to one worker together with this one have the same unit: those of its file, mostly."""
+    file = nodeid.partition("::")[0]
+    if file in _STOCK_CAMERA:
+        return "stock camera"
+    return nodeid if PurePath(file).parent == _DEALT_OUT and file not in _TOGETHER else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
+    """Workers of `-n` take units of tests in their order, one after the other."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Units(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return _unit(nodeid)
+
+    return Units(config, log)

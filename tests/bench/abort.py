@@ -28,6 +28,7 @@ from stand.config import StandConfig, packaged
 from stand.guarding.compressor import CompressorLimits
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Watch, over_temperature
+from stand.guarding.permits import PermitLimits
 from stand.hub import Hub
 from stand.running.stop import Interrupted, Stop
 from stand.running.tasks import cancelled
@@ -93,8 +94,11 @@ async def _trip_ms(assembly: Assembly, control: ControlSocket, trip: Trip, delay
     relays = assembly.devices.relays
     config = assembly.config
     compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
-    limits = Limits(config.limits.chamber_degC, config.guard.heater_hold_s, config.camera.boot_s, compressor)
+    permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, compressor)
+    limits = Limits(config.limits.chamber_degC, permits, config.guard.heater_renew_s, config.camera.boot_s)
     stand = Stand(assembly.devices, limits, assembly.hub, assembly.clock)
+    for actuator in (relays, assembly.devices.regulator, assembly.devices.flap, *assembly.devices.axes.values()):
+        stand.opened(actuator)
     await stand.start_chamber(40.0)
     await _expect_heater(control, 1)
     await assembly.clock.sleep_until(assembly.clock.now_ns() + seconds_ns(delay_s))
@@ -123,7 +127,7 @@ async def _by_guard(stand: Stand, assembly: Assembly) -> float:
         async with Stop() as stop:
             stop.watch(stand)
             watches = (Watch(over_temperature("regulator.pv", -273.15)),)
-            guard = Guard(stand, watches, assembly.hub, assembly.clock, 1.0, 5.0, stop)
+            guard = Guard(stand.safety, watches, assembly.hub, assembly.clock, 1.0, stop)
             begun_s = time.perf_counter()
             watching.append(asyncio.create_task(guard.run()))
             await asyncio.Event().wait()

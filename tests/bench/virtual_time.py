@@ -17,9 +17,10 @@ from drivers.aravis_library import library
 from drivers.clock import NS_PER_S, seconds_ns
 from drivers.interface import StandError
 from stand.hub import Hub, Item, StepMark, StepState
+from stand.one_cpu import one_cpu
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
-from stand.simulator import ControlSocket, Simulator, laboratory_of, one_cpu
+from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
 from tests.bench.orders import simulated_order
 

@@ -1,7 +1,6 @@
 """A simulated laboratory of its own for each test: free ports, a folder for the pseudo-terminals, a camera address."""
 
 import os
-import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from stand.config import StandConfig, load_config, packaged
 from stand.recipe import load_recipe
 from stand.running.session_setup import Order
 from stand.simulator import Simulator, laboratory_of
+from tests.addresses import camera_address, free_port
 
 SHORT_RECIPE = """
 name: short
@@ -39,11 +39,6 @@ def require_aravis() -> None:
         pytest.skip(str(error))
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
 @pytest.fixture
 def config_text(tmp_path: Path) -> Callable[..., str]:
     """The installed simulated configuration at free addresses; keyword arguments replace whole sections' entries."""
@@ -54,12 +49,10 @@ def config_text(tmp_path: Path) -> Callable[..., str]:
         for name, axis in data["axes"].items():
             axis["address"] = f"serial:{tmp_path / name}"
         data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
-        data["camera"]["address"] = (
-            f"127.0.{10 + os.getpid() % 200}.{1 + os.getpid() // 200 % 250}"  # runs side by side
-        )
+        data["camera"]["address"] = camera_address()
         data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
         for section, entries in sections.items():
-            data[section].update(entries)
+            data.setdefault(section, {}).update(entries)
         return yaml.safe_dump(data)
 
     return build
@@ -67,7 +60,8 @@ def config_text(tmp_path: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Order]:
-    """An order for a recipe text against a simulated laboratory of its own."""
+    """An order for a recipe text against a simulated laboratory of its own, to be found where the order's configuration
+    says."""
 
     def build(recipe: str = SHORT_RECIPE, **options: object) -> Order:
         text = config_text(**options)
@@ -75,7 +69,8 @@ def order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Orde
         config_file.write_text(text)
         recipe_file.write_text(recipe)
         target = packaged("targets", "paper-9x6").read_text()
-        return Order(load_config(config_file), load_recipe(recipe_file), text, recipe, target)
+        config = load_config(config_file)
+        return Order(config, load_recipe(recipe_file), text, recipe, target, at_configured_addresses=True)
 
     return build
 

@@ -20,7 +20,7 @@ from drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer
 T0 = 1_700_000_000_000_000_000
 OURS, OTHER = "00351210", "00351299"
 SETTINGS = FlapSettings(serial_number=OURS, open_target=3500, closed_target=500, tolerance=40, travel_s=5.0)
-SET_TARGET, STOP_MOTOR, GET_VARIABLES = 0x84, 0x87, 0xE5
+SET_TARGET, STOP_MOTOR, GET_VARIABLES, GET_RAM_SETTINGS = 0x84, 0x87, 0xE5, 0xEA
 
 
 class Laboratory:
@@ -84,10 +84,25 @@ class Bench:
         self.server = UsbServer("127.0.0.1", 0, [self.other, self.fake])
         self.backend = GuardedBackend("127.0.0.1", self.server.port)
         self.clock = VirtualClock(T0, self._advance)
+        self._while_advancing: Callable[[], Awaitable[object]] | None = None
+        self._begun: asyncio.Future[object] | None = None
         self.flap = Flap("flap", SETTINGS, self.clock, self.backend)
 
     async def _advance(self, time_ns: int) -> None:
+        """As the simulator's answer does, it comes some turns of the event loop later."""
         self.followed.follow(time_ns)
+        if (action := self._while_advancing) is not None:
+            self._while_advancing = None
+            self._begun = asyncio.ensure_future(action())
+            for _ in range(10):
+                await asyncio.sleep(0)
+
+    async def act_while_time_moves(self, by_s: float, action: Callable[[], Awaitable[object]]) -> None:
+        """Begin something from outside of virtual time, while the simulator is told of an instant that much ahead."""
+        self._while_advancing = action
+        await self.wait(by_s)
+        assert self._begun is not None
+        await self._begun
 
     @property
     def now_s(self) -> float:

@@ -19,8 +19,9 @@ from drivers.camera import Camera, CameraSettings, TemperatureFeature
 from drivers.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
 from drivers.interface import Quality, Refused, StandError, Unreachable
 from drivers.sim.camera import FakeCamera
+from tests.addresses import camera_address
 
-ADDRESS = "127.0.0.61"
+ADDRESS = camera_address()
 SERIAL = "C0061"
 WIDTH_px, HEIGHT_px = 640, 480
 START_NS = 1_700_000_000 * NS_PER_S
@@ -331,6 +332,24 @@ async def test_after_a_power_cycle_open_makes_everything_new(fake: FakeCamera, p
     assert effective.gain_dB == pytest.approx(6.0, abs=0.5)
     assert after.exposure_s == pytest.approx(EXPOSURE_S, abs=50e-6)
     assert after.block_id > before.block_id
+
+
+async def test_a_camera_that_returns_without_a_stream_channel_is_unreachable_until_it_has_one(fake: FakeCamera):
+    camera = Camera("camera", settings(), WallClock())
+    await camera.open()
+    await camera.grab()
+    await camera.stop()
+    fake.faults.no_stream_channel = True
+    fake.restart()
+    clock = WallClock()
+    await clock.sleep_until(clock.now_ns() + seconds_ns(0.3))  # it boots
+    await camera.open()
+    with pytest.raises(Unreachable, match="stream channel"):
+        await camera.grab()
+    fake.faults.no_stream_channel = False
+    await camera.open()
+    await camera.grab()
+    await camera.close()
 
 
 async def why_unreachable(camera: Camera) -> str:

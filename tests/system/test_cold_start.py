@@ -186,16 +186,13 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_anew_from_a_cold_came
     assert done == ["PowerCamera", "CoolDown", "PowerCamera"] * 2
 
 
-async def test_a_warm_up_that_is_paused_goes_on_and_says_what_was_not_seen(tmp_path: Path, order: Callable[..., Order]):
-    ordered, out = (
-        order(WARM_UP.replace("band_K: 2", "cool_down_max_s: 10").replace("frames: 8", "frames: 40")),
-        tmp_path / "out",
-    )
+async def paused(order: Order, out: Path, pause_s: float) -> Session:
+    """The session of a run that was paused for so long after its third frame."""
     watcher = Watcher()
 
     async def operator(reason: str) -> None:
         (directory,) = out.iterdir()
-        await watcher.wait(200)
+        await watcher.wait(pause_s)
         await asyncio.to_thread(ask, directory, {"do": "continue"})
 
     async def pause() -> None:
@@ -203,13 +200,36 @@ async def test_a_warm_up_that_is_paused_goes_on_and_says_what_was_not_seen(tmp_p
         await asyncio.to_thread(ask, directory, {"do": "pause"})
 
     act, tasks, _ = acting({3: pause}, operator)
-    session = Session.open(await run_virtual(ordered, out, None, lambda hub: (hub.subscribe(watcher), act(hub))))
+    directory = await run_virtual(order, out, None, lambda hub: (hub.subscribe(watcher), act(hub)))
     await asyncio.gather(*tasks)
-    assert len(session.frame_metas) == 40
+    return Session.open(directory)
+
+
+async def test_a_warm_up_that_is_paused_shortly_goes_on_and_says_what_was_not_seen(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    ordered = order(WARM_UP.replace("band_K: 2", "cool_down_max_s: 10").replace("interval_s: 30", "interval_s: 5"))
+    session = await paused(ordered, tmp_path / "out", 35.0)
+    assert len(session.frame_metas) == 8
     (gap,) = [event for event in session.events() if event.kind == "warm_up_gap"]
     missing_s = float(gap.text.split(" for ")[1].split()[0])
     times_ns = [time_ns for time_ns, _ in session.frame_metas]
     gaps_s = [(later - time_ns) / NS_PER_S for time_ns, later in itertools.pairwise(times_ns)]
     assert missing_s == pytest.approx(max(gaps_s), abs=1.0)
-    assert missing_s > 200.0
+    assert missing_s > 35.0
     assert not [event for event in session.events() if event.kind == "capture_restarted"]
+
+
+async def test_a_warm_up_that_is_paused_for_long_begins_anew_from_its_cool_down(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    ordered = order(WARM_UP)
+    session = await paused(ordered, tmp_path / "out", 100.0)
+    begins_ns = begins_of(session)
+    counted = [meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]
+    assert len(counted) == 8
+    assert len(session.frame_metas) == 8 + 3
+    assert counted[0].camera_degC < 27.0
+    cooled = [mark for mark in session.steps() if mark.kind == "CoolDown" and mark.state is StepState.DONE]
+    assert len(cooled) == 2
+    assert [event for event in session.events() if event.kind == "flap_shut_in_hold"]

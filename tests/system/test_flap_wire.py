@@ -1,12 +1,14 @@
 """The flap driver against a fake controller behind pyusb and a TCP connection; time is virtual."""
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator
 
 import pytest
 
+from drivers.clock import WallClock
 from drivers.flap import Flap
-from drivers.interface import DeviceFault, Quality, Reading, Refused, Unreachable
+from drivers.interface import DeviceFault, Quality, Reading, Refused, Superseded, Unreachable
 from drivers.sim.flap import (
     ERROR_FEEDBACK_DISCONNECT,
     ERROR_HARD_OVER_CURRENT,
@@ -15,7 +17,7 @@ from drivers.sim.flap import (
 )
 from drivers.sim.usb import TimedOut
 
-from .flap_bench import GET_VARIABLES, SET_TARGET, STOP_MOTOR, T0, Bench, running_bench
+from .flap_bench import GET_RAM_SETTINGS, GET_VARIABLES, SET_TARGET, SETTINGS, STOP_MOTOR, T0, Bench, running_bench
 
 
 @pytest.fixture
@@ -111,7 +113,7 @@ async def test_a_jam_within_the_tolerance_is_good_enough(bench: Bench, flap: Fla
 
 async def test_a_flap_too_slow_for_its_time_is_stopped(bench: Bench, flap: Flap) -> None:
     bench.set_max_duty(100)  # 6 s for the whole way
-    with pytest.raises(DeviceFault, match=r"not at 3500, after 5\.0 s; the motor is stopped"):
+    with pytest.raises(DeviceFault, match=r"not at 3500, after 5 s; the motor is stopped"):
         await flap.move_open()
     assert bench.now_s == pytest.approx(5.05, abs=0.051)
     assert 0.7 < bench.openness < 0.9
@@ -229,9 +231,70 @@ async def test_make_safe_turns_an_opening_flap_round(bench: Bench, flap: Flap) -
     opening = asyncio.create_task(flap.move_open())
     await bench.after(0.5, flap.make_safe)
     assert bench.openness == 0
-    with pytest.raises(DeviceFault, match="its target was changed by someone else"):
+    with pytest.raises(Superseded, match=r"^flap: a newer command, or making safe, has taken over"):
         await opening
     assert bench.fake.targets == [3500, 500]
+
+
+async def test_a_target_that_somebody_else_has_sent_ends_the_move(bench: Bench, flap: Flap) -> None:
+    def interfere() -> None:
+        bench.fake.control_transfer(0x40, SET_TARGET, 700, 0, b"")
+
+    with pytest.raises(DeviceFault, match="its target was changed by someone else"):
+        await asyncio.gather(flap.move_open(), bench.after(0.5, interfere))
+
+
+async def test_closed_by_two_at_once_it_closes_for_both(bench: Bench, flap: Flap) -> None:
+    """The run closes it after a frame while it is made safe."""
+    await flap.move_open()
+    await asyncio.gather(flap.move_closed(), bench.after(0.2, flap.make_safe), bench.after(0.4, flap.move_closed))
+    assert bench.openness == 0
+    assert bench.fake.requests.count((STOP_MOTOR, 0)) == 0
+
+
+async def test_once_made_safe_it_is_not_opened_until_it_is_allowed_again(bench: Bench, flap: Flap) -> None:
+    await flap.make_safe()
+    with pytest.raises(Superseded, match="made safe and has not been allowed to move since; nothing was sent"):
+        await flap.move_open()
+    assert bench.fake.targets == [500]
+    await flap.move_closed()
+    flap.allow()
+    await flap.move_open()
+    assert bench.openness == 1
+
+
+async def test_made_safe_while_its_settings_are_read_an_opening_sends_no_target(bench: Bench) -> None:
+    """In real time: calls wait for each other in the lane's thread, and the stop comes before the target is sent."""
+    flap = Flap("flap", SETTINGS, WallClock(), bench.backend)
+    await flap.open()
+    loop, made_safe, begun = asyncio.get_running_loop(), list[asyncio.Task[None]](), threading.Event()
+    transfer = bench.fake.control_transfer
+
+    def hold_back(kind: int, request: int, value: int, index: int, length_or_data: int | bytes) -> bytes:
+        if request == GET_RAM_SETTINGS and not begun.is_set():
+            loop.call_soon_threadsafe(lambda: made_safe.append(asyncio.ensure_future(flap.make_safe())))
+            loop.call_soon_threadsafe(lambda: loop.call_soon(begun.set))
+            begun.wait(10)
+        return transfer(kind, request, value, index, length_or_data)
+
+    bench.fake.control_transfer = hold_back
+    with pytest.raises(Superseded):
+        await flap.move_open()
+    await made_safe[0]
+    assert bench.fake.targets == [500]
+    await flap.close()
+
+
+# Time that passes unwatched
+
+
+async def test_a_stop_that_comes_while_time_is_being_moved_is_no_jam(bench: Bench, flap: Flap) -> None:
+    """A signal is served whenever it comes: here while the simulator is told of a time 2 s ahead. The flap, told to
+    close at that time, still stands open then, and has had no time to move."""
+    await flap.move_open()
+    await bench.act_while_time_moves(2.0, flap.make_safe)
+    assert bench.openness == 0
+    assert bench.fake.requests.count((STOP_MOTOR, 0)) == 0
 
 
 async def test_make_safe_that_jams_is_a_fault_with_the_motor_stopped(bench: Bench, flap: Flap) -> None:

@@ -36,6 +36,7 @@ Start = Callable[[StandConfig, bool], Simulator]
 class Bench:
     """A stand without its camera, polled and guarded in virtual time."""
 
+    order: Order
     assembly: Assembly
     clock: Clock
     control: ControlSocket
@@ -57,8 +58,10 @@ class Bench:
     async def start(self, chamber_degC: float, soak_s: float) -> None:
         """A chamber in good order, guarded by a guard with no memory of what was."""
         self.trips.clear()
+        guard = self.assembly.guard(self.trips.append, self.trips.append)
+        assert guard.look()
+        self.guarding = [asyncio.create_task(guard.run()), asyncio.create_task(self.assembly.stand.keeper.run())]
         await self.assembly.stand.start_chamber(chamber_degC)
-        self.guarding = [asyncio.create_task(self.assembly.guard(self.trips.append, self.trips.append).run())]
         await self.wait(soak_s)
         assert self.trips == []
         assert await self.plant("heater_enabled") == 1
@@ -76,6 +79,10 @@ class Bench:
         assert await self.plant("compressor_on") == 0
         await self.end()
         return self.trips[0]
+
+    async def make_safe(self) -> None:
+        self.assembly.stand.safety.demand()
+        assert await self.assembly.stand.safety.confirmed(60)
 
     async def end(self) -> None:
         await _cancel(self.guarding)
@@ -117,14 +124,18 @@ async def bench_from(order: Order, start_ns: int | None) -> AsyncIterator[Bench]
     clock, hub = WallClock() if start_ns is None else VirtualClock(start_ns, driver.advance), Hub()
     assembly = assemble(order.config, hub, clock)
     events: list[Event] = []
-    bench = Bench(assembly, clock, faults, events)  # which the hub must not know: pyusb closes what nobody refers to
+    bench = Bench(
+        order, assembly, clock, faults, events
+    )  # which the hub must not know: pyusb closes what nobody refers to
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     tasks = [asyncio.create_task(clock.run() if isinstance(clock, VirtualClock) else asyncio.Event().wait())]
     devices = assembly.devices
     try:
         await assembly.bus.open()
-        for device in (devices.relays, devices.regulator, devices.thermometers, devices.flap, *devices.axes.values()):
+        for device in (devices.relays, devices.regulator, devices.flap, *devices.axes.values()):
             await device.open()
+            assembly.stand.opened(device)
+        await devices.thermometers.open()
         await devices.regulator.stop()
         await devices.flap.move_closed()
         pollers = [poller for poller in assembly.pollers() if poller.sensor is not devices.camera]
@@ -134,6 +145,7 @@ async def bench_from(order: Order, start_ns: int | None) -> AsyncIterator[Bench]
         yield bench
     finally:
         await bench.end()
+        await assembly.stand.safety.close()
         await _cancel(tasks[1:])
         for close in (*(axis.close for axis in devices.axes.values()), devices.flap.close):
             await close()
@@ -236,7 +248,7 @@ async def test_heat_that_does_not_come_or_comes_unasked_and_sensors_that_lie_are
         await bench.fault("heater.cut_out", True)
         await bench.assembly.stand.set_temperature(50)
         trip = await bench.tripped(700)
-        assert (trip.rule, trip.action) == ("heater_not_warming", "abort")
+        assert (trip.rule, trip.action) == ("first_heat", "hold")  # no heat was needed before
         await bench.fault("heater.cut_out", False)
 
         await bench.start(30, 1200)
@@ -267,7 +279,7 @@ async def test_a_daemon_that_starts_again_spares_the_compressor_as_one_that_goes
         await bench.wait(20)
         assert await bench.plant("compressor_on") == 1
         await bench.end()
-        await bench.assembly.stand.make_safe()
+        await bench.make_safe()
         await bench.wait(100)
         restart_ns = bench.clock.now_ns()
     async with bench_from(ordered, restart_ns) as bench:
@@ -276,7 +288,7 @@ async def test_a_daemon_that_starts_again_spares_the_compressor_as_one_that_goes
         await bench.wait(20)
         assert await bench.plant("compressor_on") == 1
         await bench.end()
-        await bench.assembly.stand.make_safe()
+        await bench.make_safe()
         await bench.wait(900)
         restart_ns = bench.clock.now_ns()
     async with bench_from(ordered, restart_ns) as bench:
@@ -305,7 +317,7 @@ async def test_what_somebody_left_switched_on_is_switched_off_and_told_before_an
     simulation = ordered.config.simulation
     assert simulation is not None
     start_ns = seconds_ns(simulation.start.timestamp())
-    keep(state_file, CompressorState(False, start_ns - seconds_ns(7200)))
+    keep(state_file, CompressorState(False, start_ns - seconds_ns(7200)), boot=None)
     compressor = CompressorConfig(state_file=state_file)
     ordered = replace(ordered, config=ordered.config.model_copy(update={"compressor": compressor}))
     await asyncio.to_thread(simulator, ordered.config, True)
@@ -360,7 +372,7 @@ async def test_a_daemon_whose_event_loop_is_held_up_does_not_heat(order: Callabl
         assert "guard_late" in {event.kind for event in bench.events}
         assert bench.trips == []
         await bench.end()
-        await bench.assembly.stand.make_safe()
+        await bench.make_safe()
 
 
 @pytest.fixture

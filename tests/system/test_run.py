@@ -115,7 +115,7 @@ def check_temperatures(session: Session) -> None:
 async def test_a_lost_safety_sensor_makes_the_stand_safe_and_ends_the_run(
     tmp_path: Path, order: Callable[..., Order], name: str, value: object, reason: str
 ):
-    ordered = order(bus={"timeout_s": 0.1})
+    ordered = order(bus={"timeout_s": 0.1}, guard={"safe_limit_s": 5})
     tasks: list[asyncio.Task[None]] = []
     events: list[Event] = []
 

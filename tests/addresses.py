@@ -1,0 +1,33 @@
+"""Addresses for fakes and servers of a test that no other worker, and no other test run of this machine, is given."""
+
+import itertools
+import os
+import re
+import socket
+
+# Below the kernel's ephemeral ports, which it hands out to every client on this machine.
+_FIRST_PORT, _PORTS_PER_WORKER = 10_000, 1_500
+
+WORKER = int("0" + re.sub(r"\D", "", os.environ.get("PYTEST_XDIST_WORKER", "")))  # gw0, gw1 ...; 0 without xdist
+_ports, _cameras = itertools.count(os.getpid()), itertools.count()
+
+
+def free_port() -> int:
+    """A TCP port of 127.0.0.1 that nobody listens at, and that this worker has not been given for a long time."""
+    first = _FIRST_PORT + WORKER % 14 * _PORTS_PER_WORKER
+    for number in itertools.islice(_ports, _PORTS_PER_WORKER):
+        port = first + number % _PORTS_PER_WORKER
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
+    raise OSError(f"no port from {first} on is free")
+
+
+def camera_address() -> str:
+    """An address of 127.0.0.0/8 that this process has not given to a camera for a long time: the port of GVCP is fixed,
+    and a laboratory whose daemon was killed keeps its own for a minute."""
+    return f"127.{1 + os.getpid() // 250 % 60}.{1 + os.getpid() % 250}.{1 + next(_cameras) % 254}"

@@ -1,0 +1,77 @@
+"""A daemon that records in real time with a disk process, without a stand: `python -m tests.system.disk_daemon FOLDER`.
+
+Each 20 ms an event and a frame are published, each 100 ms a line is written into the journal; it says the disk
+process's id, then how much is acknowledged and how old what waits is. SIGTERM ends it, as the end of a run does.
+"""
+
+import asyncio
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from drivers.clock import NS_PER_S, WallClock
+from drivers.interface import Frame, SessionError
+from stand.hub import Event, Hub
+from stand.recording.disk import Disk
+from stand.recording.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
+from stand.running.journal import Begun, Dwell, Ended, Journal
+from stand.running.logbook import Logbook
+
+INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
+SETTINGS = RecordingSettings("raw", telemetry_commit_s=0.05, stop_frames_below_bytes=0, alert_below_fraction=0.0)
+IMAGE = np.zeros((100, 100), np.uint8)
+
+
+def say(*words):
+    sys.stdout.write("\t".join(map(str, words)) + "\n")
+    sys.stdout.flush()
+
+
+async def publish(hub, clock, journal):
+    number = 0
+    while True:
+        now_ns = clock.now_ns()
+        hub.publish(Event(now_ns, "info", "note", str(number)))
+        hub.publish(Frame("camera.image", IMAGE, now_ns, 0.1, 0.0, 40.0, number, number))
+        if number % 5 == 0:
+            journal.note(Dwell(now_ns, "a1", float(number)))
+        number += 1
+        await asyncio.sleep(0.02)
+
+
+async def main(directory):
+    clock, hub, disk, stopped = WallClock(), Hub(), Disk(), asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopped.set)
+    recorder = Recorder(directory, INFO, {}, {}, hub, clock, SETTINGS, disk=disk)
+    await recorder.begin(tuple)
+    recording = asyncio.create_task(recorder.run())
+    log, journal = Logbook(hub, clock), Journal.create(directory)
+    await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
+    recorder.beside(journal)
+    publishing = asyncio.create_task(publish(hub, clock, journal))
+    say(disk.pid)
+    while not stopped.is_set():
+        since_ns = recorder.waiting_since_ns
+        age_s = 0.0 if since_ns is None else (clock.now_ns() - since_ns) / NS_PER_S
+        say(recorder.saved.frames, recorder.saved.telemetry, age_s, recorder.folder_lost)
+        await asyncio.sleep(0.02)
+    publishing.cancel()
+    try:
+        try:
+            await log.end(Ended(0, "interrupted", "stopped"))
+        finally:
+            recording.cancel()
+            await asyncio.wait([recording])
+            await recorder.finish(FINISH_WITHIN_S)
+    finally:
+        disk.close()
+
+
+if __name__ == "__main__":
+    try:
+        asyncio.run(main(Path(sys.argv[1])))
+    except SessionError as told:
+        sys.stderr.write(f"{told}\n")
+        sys.exit(3)

@@ -1,0 +1,44 @@
+"""A camera that restarts in a capture and is not ready at once when it answers again."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.interface import Frame
+from stand.hub import Event, Hub, Item
+from stand.recording.session import Session
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_run_ends import SHORTER, break_now
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_has_one(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    ordered, lost, frames = order(SHORTER), list[str](), list[Frame]()
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Frame):
+            frames.append(item)
+            if len(frames) == 1:
+                break_now(ordered, "camera.no_stream_channel", True)
+        elif isinstance(item, Event) and item.kind == "camera_lost":
+            lost.append(item.text)
+            if len(lost) == 2:
+                break_now(ordered, "camera.no_stream_channel", False)
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(follow)
+
+    session = Session.open(await run_virtual(ordered, tmp_path / "out", None, watch))
+    assert session.events()[-1].text == "complete"
+    assert session.frame_count == 3
+    assert len(lost) >= 2
+    assert "stream channel" in lost[-1]

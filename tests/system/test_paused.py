@@ -1,0 +1,62 @@
+"""A pause, over the wires: what still moves is told, and after its limit the stand is made safe and held."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from stand.recording.session import Session
+from stand.remote.control import RunStatus, handlers
+from stand.remote.control_client import ask
+from stand.running.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
+from tests.system.test_guard_wire import Start, bench_of
+
+
+def no_status() -> RunStatus:
+    raise AssertionError("nobody asks for it")
+
+
+async def test_the_answer_to_a_pause_says_what_still_moves(order: Callable[..., Order], simulator: Start):
+    async with bench_of(order(), simulator) as bench:
+        stand = bench.assembly.stand
+        table = handlers(stand.gate, lambda: None, no_status, lambda: stand.motions.texts)
+        tasks = [asyncio.create_task(stand.move_to("linear", 140)), asyncio.create_task(stand.open_flap())]
+        await bench.wait(1)
+        held = ["operator"]
+        assert table["pause"]({}) == {"reasons": held, "moving": ["linear homing, then to 140 mm", "flap opening"]}
+        await asyncio.gather(*tasks)
+        assert table["pause"]({}) == {"reasons": held, "moving": []}
+        tasks = [asyncio.create_task(stand.move_to("linear", 1)), asyncio.create_task(stand.close_flap())]
+        await bench.wait(1)
+        assert table["pause"]({}) == {"reasons": held, "moving": ["linear to 1 mm", "flap closing"]}
+        await asyncio.gather(*tasks)
+
+
+async def test_a_pause_that_lasts_too_long_is_made_safe_and_held(tmp_path: Path, order: Callable[..., Order]):
+    require_aravis()
+    ordered, out, watcher = order(LONG_SOAK, guard={"pause_limit_h": 0.25}), tmp_path / "out", Watcher()
+    reasons: list[object] = []
+
+    async def operate() -> None:
+        await watcher.event("run.start", 60)
+        (directory,) = out.iterdir()
+        await watcher.wait(600)
+        await asyncio.to_thread(ask, directory, {"do": "pause"})
+        await watcher.event("held", 60)
+        trip = await watcher.event("guard.paused_too_long", 960)
+        assert trip.data == {"rule": "paused_too_long", "action": "hold"}
+        await watcher.wait(60)
+        reasons.append((await asyncio.to_thread(ask, directory, {"do": "continue"}))["reasons"])
+        reasons.append((await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"])
+        await watcher.event("restored", 60)
+        await asyncio.to_thread(ask, directory, {"do": "stop"})
+
+    await run_operated(ordered, out, watcher, operate())
+    assert reasons == [["interlock"], []]
+    (directory,) = out.iterdir()
+    session = Session.open(directory)
+    (trip,) = [event for event in session.events() if event.kind == "guard.paused_too_long"]
+    (restored,) = [event for event in session.events() if event.kind == "restored"]
+    times_ns, running = session.readings("regulator.running")
+    assert running[(times_ns > trip.time_ns + 10e9) & (times_ns < restored.time_ns)].max() == 0

@@ -1,0 +1,56 @@
+"""Virtual runs side by side on one machine, of one configuration, from the command line."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stand.recording.session import Session
+from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.test_run import digests
+
+STAND = [sys.executable, "-m", "stand.cli"]
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+def begun(tmp_path: Path, name: str, *arguments: str) -> subprocess.Popen[str]:
+    command = [*STAND, *arguments, "--virtual-time", "--out", str(tmp_path / name)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ended(run: subprocess.Popen[str]) -> Path:
+    stdout, stderr = run.communicate(timeout=300)
+    assert run.returncode == 0, stderr
+    return Path(stdout.splitlines()[-1])
+
+
+def test_two_virtual_nights_side_by_side_of_the_installed_configuration_give_the_same_session(tmp_path: Path):
+    recipe = tmp_path / "short.yaml"
+    recipe.write_text(SHORT_RECIPE)
+    runs = [begun(tmp_path, name, "run", str(recipe), "--seed", "7") for name in ("first", "second")]
+    first, second = (digests(ended(run)) for run in runs)
+    assert first == second
+    assert {name.split("/")[0] for name in first} >= {"frames", "telemetry", "journal.jsonl"}
+
+
+def test_a_virtual_run_goes_on_and_a_new_one_begins_while_the_laboratory_of_a_killed_one_lives(tmp_path: Path):
+    """An orphaned laboratory lives for a minute; nobody waits for its addresses."""
+    recipe = tmp_path / "short.yaml"
+    recipe.write_text(SHORT_RECIPE)
+    killed = begun(tmp_path, "killed", "run", str(recipe))
+    assert killed.stderr is not None
+    assert any(line.startswith("run:") for line in killed.stderr)  # it is under way
+    killed.kill()
+    killed.communicate()
+    (session,) = (tmp_path / "killed").iterdir()
+    resumed = subprocess.Popen(
+        [*STAND, "resume", str(session)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    new = begun(tmp_path, "new", "run", str(recipe))
+    assert ended(resumed) == session
+    assert Session.open(session).frame_count == Session.open(ended(new)).frame_count == 5

@@ -1,0 +1,207 @@
+"""Heat only while it is recorded: in real time, on a disk that hangs, and in a folder that is taken away."""
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import NS_PER_S, WallClock
+from drivers.interface import StandError
+from stand.recording.session import Session
+from stand.running.run import Interrupted, run_real
+from stand.running.session_setup import Order
+from stand.simulator import ControlSocket
+from tests.recording.disks import ext4, run
+from tests.system.conftest import require_aravis
+from tests.system.test_guard_run import Watcher
+from tests.system.test_run import at_step
+
+SOAK = """
+name: soak
+experiments:
+  - thermal_cycle:
+      reference_degC: 40
+      equilibrium_s: 400000
+      set_points_degC: [41]
+      reference_frames: 1
+      frames_per_point: 1
+"""
+FAST = {
+    "regulator": {"poll_s": 0.25},
+    "thermometers": {"poll_s": 0.25},
+    "relays": {"poll_s": 0.5, "self_test_s": 0.6},
+    "flap": {"poll_s": 0.5},
+    "camera": {"poll_s": 0.5, "boot_s": 1.0},
+    "guard": {"period_s": 0.25, "heater_hold_s": 3.0, "heater_renew_s": 0.5},
+    "recording": {"telemetry_commit_s": 0.2, "durable_within_s": 1.5},
+}
+LIMIT_S = 60.0  # for anything that happens within a second on a machine without other work
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with ext4(tmp_path / "disk", 6 << 30) as folder:
+        yield folder
+
+
+async def plant(order: Order, quantity: str) -> float:
+    assert order.config.simulation is not None
+    control = ControlSocket(order.config.simulation.control)
+    await control.open()
+    try:
+        return float(str((await control.request({"do": "state"}))[quantity]))
+    finally:
+        await control.close()
+
+
+async def heater_is(order: Order, enabled: int) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while await plant(order, "heater_enabled") != enabled:
+            await asyncio.sleep(0.05)
+
+
+@asynccontextmanager
+async def heating(order: Order, out: Path) -> AsyncIterator[tuple[asyncio.Task[Path], Watcher]]:
+    """A run in real time that has come to its first soak, and heats."""
+    watcher, soaking = Watcher(), asyncio.Event()
+
+    def watch(hub) -> None:
+        hub.subscribe(watcher)
+        at_step("Soak", soaking.set)(hub)
+
+    task = asyncio.create_task(run_real(order, out, watch))
+    started = asyncio.create_task(soaking.wait())
+    await asyncio.wait([task, started], return_when=asyncio.FIRST_COMPLETED)
+    assert not task.done(), task.exception()
+    await heater_is(order, 1)
+    yield task, watcher
+    if not task.done():
+        os.kill(os.getpid(), signal.SIGINT)
+        await asyncio.wait([task])
+
+
+async def happens(watcher: Watcher, kind: str) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        await watcher.until(lambda: kind in {event.kind for event in watcher.events})
+
+
+async def test_a_disk_that_hangs_withdraws_the_heat_and_the_run_goes_on_when_it_is_back(
+    disk: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    ordered = order(SOAK, **FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    async with heating(ordered, disk / "out") as (task, watcher):
+        watcher.events.clear()
+        run("fsfreeze", "-f", disk)
+        try:
+            await happens(watcher, "guard.not_recorded")
+            await heater_is(ordered, 0)
+            assert [event.kind for event in watcher.events if event.kind == "guard_late"] == []
+        finally:
+            run("fsfreeze", "-u", disk)
+        await happens(watcher, "hold_ended")
+        await happens(watcher, "restored")
+        await heater_is(ordered, 1)
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(Interrupted, match="the stand is safe"):
+            await task
+    (directory,) = (disk / "out").glob("2*")
+    kinds = [event.kind for event in Session.open(directory).events()]
+    assert {"guard.not_recorded", "hold_ended", "restored", "run.end"} <= set(kinds)
+
+
+async def test_a_stop_while_the_disk_hangs_makes_safe_and_leaves(
+    disk: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    ordered, clock = order(SOAK, **FAST), WallClock()
+    await asyncio.to_thread(simulator, ordered.config, False)
+    async with heating(ordered, disk / "out") as (task, _watcher):
+        run("fsfreeze", "-f", disk)
+        try:
+            begun_ns = clock.now_ns()
+            os.kill(os.getpid(), signal.SIGQUIT)
+            await heater_is(ordered, 0)
+            safe_ns = clock.now_ns()
+            with pytest.raises(StandError, match="stopped by the operator"):
+                await asyncio.wait_for(task, LIMIT_S)
+            left_ns = clock.now_ns()
+        finally:
+            run("fsfreeze", "-u", disk)
+    assert (safe_ns - begun_ns) / NS_PER_S < 10.0
+    assert (left_ns - safe_ns) / NS_PER_S < 15.0  # 5 s where nothing else keeps the machine busy
+
+
+@pytest.mark.parametrize("how", ["removed", pytest.param("renamed", marks=pytest.mark.nightly)])
+async def test_a_folder_that_is_taken_away_holds_the_run_until_an_operator_clears_it(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object], how: str
+):
+    ordered = order(SOAK, **FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    async with heating(ordered, tmp_path / "out") as (task, watcher):
+        (directory,) = (tmp_path / "out").glob("2*")
+        watcher.events.clear()
+        if how == "removed":
+            shutil.rmtree(directory, ignore_errors=True)
+        else:
+            directory.rename(tmp_path / "elsewhere")
+        await happens(watcher, "guard.folder_lost")
+        await heater_is(ordered, 0)
+        answer = await stand_command("status", "--json", str(directory))
+        assert json.loads(answer)["state"] == "held"
+        await stand_command("clear", str(directory))
+        await happens(watcher, "restored")
+        await heater_is(ordered, 1)
+        await stand_command("stop", str(directory))
+        with pytest.raises(StandError, match="stopped by the operator"):
+            await asyncio.wait_for(task, LIMIT_S)
+    session = Session.open(directory)
+    assert "recording_lost" in {event.kind for event in session.events()}
+    numbers = [path.name for path in (directory / "telemetry").iterdir()]
+    assert "0000.mcap" not in numbers
+
+
+async def stand_command(*arguments: str) -> str:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "stand.cli", *arguments, stdout=asyncio.subprocess.PIPE
+    )
+    out, _ = await process.communicate()
+    assert process.returncode == 0
+    return out.decode()
+
+
+@pytest.mark.nightly
+async def test_a_lack_of_memory_is_said_in_words(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    """Raised where a reading is taken over, as any allocation may."""
+    ordered = order(SOAK, **FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    hungry = list[bool]()
+
+    def watch(hub) -> None:
+        def listen(item) -> None:
+            if hungry:
+                hungry.clear()
+                raise MemoryError
+
+        hub.subscribe(listen)
+        at_step("Soak", lambda: hungry.append(True))(hub)
+
+    with pytest.raises(StandError, match="out of memory"):
+        await asyncio.wait_for(run_real(replace(ordered), tmp_path / "out", watch), LIMIT_S)
+    assert await plant(ordered, "heater_enabled") == 0
+    (directory,) = (tmp_path / "out").glob("2*")
+    assert Session.open(directory).events()[-1].text == "failed: out of memory"
