@@ -19,6 +19,7 @@ from tests.system.recording_process import frame_records, nursery, telemetry_rec
 from tests.system.test_kill_recording import read_series
 
 CUTS = 12
+MOST_CUTS = 3 * CUTS
 DISK_BYTES = 256 << 20
 CONTROL = b"a frame nobody synced\n" * 1000
 
@@ -52,30 +53,41 @@ def read_after_cut(image, at):
         return frames, telemetry, control.read_bytes() if control.exists() else b""
 
 
+def power_cut(start, tmp_path, name, wait_s, synced=False):
+    """Record, cut, and read what is left: whether the cut took what was not synced. Whoever calls `sync` on this
+    machine meanwhile (`synced`: this test does) has put that on the disk, too."""
+    image, after = tmp_path / "disk", tmp_path / f"disk-{name}"
+    with image.open("wb") as file:
+        file.truncate(DISK_BYTES)
+    subprocess.run(["mkfs.ext4", "-q", "-E", "lazy_itable_init=1", image], check=True)
+    with mounted(image, tmp_path / f"before-{name}") as disk:
+        recording = start(disk / "session")
+        try:
+            (disk / "control").write_bytes(CONTROL)  # written, closed, never synced
+            recording.wait(wait_s)
+            recording.stop()
+            if synced:
+                subprocess.run(["sync", "--file-system", disk], check=True)
+            subprocess.run(["cp", "--sparse=always", image, after], check=True)
+        finally:
+            last = recording.kill()
+    frames, telemetry, control = read_after_cut(after, tmp_path / f"after-{name}")
+    after.unlink()
+    assert frames == frame_records(len(frames))
+    assert telemetry == telemetry_records(last.rounds + 1)[: len(telemetry)]
+    assert len(frames) >= last.frames
+    assert len(telemetry) >= last.messages
+    return control != CONTROL
+
+
 def test_nothing_acknowledged_is_missing_after_a_power_cut(tmp_path):
+    """After every cut what was acknowledged is there. One that left the control shows little: it is repeated."""
     rng = random.Random(4)
-    image = tmp_path / "disk"
-    lost_controls = 0
     with nursery() as start:
-        for cut in range(CUTS):
-            with image.open("wb") as file:
-                file.truncate(DISK_BYTES)
-            subprocess.run(["mkfs.ext4", "-q", "-E", "lazy_itable_init=1", image], check=True)
-            with mounted(image, tmp_path / f"before-{cut}") as disk:
-                recording = start(disk / "session")
-                try:
-                    (disk / "control").write_bytes(CONTROL)  # written, closed, never synced
-                    recording.wait(rng.uniform(0, 0.6))
-                    recording.stop()
-                    after = tmp_path / f"disk-{cut}"
-                    subprocess.run(["cp", "--sparse=always", image, after], check=True)
-                finally:
-                    last = recording.kill()
-            frames, telemetry, control = read_after_cut(after, tmp_path / f"after-{cut}")
-            assert frames == frame_records(len(frames))
-            assert telemetry == telemetry_records(last.rounds + 1)[: len(telemetry)]
-            assert len(frames) >= last.frames
-            assert len(telemetry) >= last.messages
-            lost_controls += control != CONTROL
-            after.unlink()
-    assert lost_controls == CUTS  # what is only written is gone: the cut takes what was not synced
+        assert not power_cut(start, tmp_path, "synced", 0.1, synced=True)
+        taken = 0
+        for number in range(MOST_CUTS):
+            taken += power_cut(start, tmp_path, number, rng.uniform(0, 0.6))
+            if taken == CUTS:
+                return
+    pytest.skip(f"only {taken} of {MOST_CUTS} cuts took what was not synced: somebody on this machine calls sync")
