@@ -42,6 +42,7 @@ class Assembly:
     bus: Bus
     devices: Devices
     stand: Stand
+    notifier: Notifier  # whoever is to be told when nobody is there
 
     def pollers(self) -> tuple[Poller, ...]:
         """One per device, in the order in which they are read when several are due at one instant."""
@@ -82,21 +83,18 @@ class Assembly:
             hold,
             release,
             stand.cut_camera,
-            self.notifier(),
+            self.notifier,
             VITAL,
         )
         stand.permits.allowed = guard.may_permit
         return guard
 
-    def notifier(self) -> Notifier:
-        """Whoever is to be told when nobody is there."""
-        return Notifier(self.config.guard.notify, self.config.guard.notify_limit_s, self.clock)
-
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     """Make every device the configuration names; nothing is opened. ConfigError when a named file, or the program of
     guard.notify, is missing: a plan of the same configuration can be made elsewhere."""
-    if missing := Notifier(config.guard.notify, config.guard.notify_limit_s, clock).missing():
+    notifier = Notifier(config.guard.notify, config.guard.notify_limit_s, clock)
+    if missing := notifier.missing():
         raise ConfigError(missing)
     line = LineSettings(config.bus.baud, config.bus.parity, config.bus.stopbits)
     bus = Bus("bus", config.bus.address, clock, line, config.bus.timeout_s, config.bus.gap_s)
@@ -130,7 +128,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     limits = Limits(
         config.limits.chamber_degC, permits, config.guard.heater_renew_s, config.camera.boot_s, equilibrium, state_file
     )
-    return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock))
+    return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock), notifier)
 
 
 def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers:

@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-import os
+import asyncio
 import shutil
-import signal
-import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
 
 from drivers.clock import Clock
 from drivers.lane import Lane
+from stand.guarding.notify_process import KILLED_LIMIT_S, MODULE, run_command
+from stand.helper import Helper
 
-_KILLED_LIMIT_S = 1.0  # real seconds for what was killed to be gone
+_LINE = "tell"
+_SPARE_S = 4.0  # real seconds beyond what the command may take, for a machine that is busy
 
 
 class Notifier:
     """Runs `command` with the sentence as its last argument, without a shell, in a session of its own, for at most
-    `limit_s` real seconds. An empty command tells nobody."""
+    `limit_s` real seconds. An empty command tells nobody.
+
+    A small process runs it, so that somebody is told whatever state the daemon and its disk are in. It is there from
+    `start` on, else from the first sentence on; one that has died, or does not answer, is replaced with the next.
+    """
 
     def __init__(self, command: Sequence[str], limit_s: float, clock: Clock) -> None:
         self._command = tuple(command)
         self._limit_s = limit_s
         self._clock = clock
+        self._helper: Helper | None = None
+        self._lane: Lane | None = None
+        self._turn = asyncio.Lock()
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process that runs the command; None while there is none."""
+        return None if self._helper is None else self._helper.pid
 
     def missing(self) -> str:
         """Why the command cannot be run, "" when it can."""
@@ -33,42 +46,55 @@ class Notifier:
             "install it, give its whole path, or take the line out"
         )
 
+    def start(self) -> None:
+        """Start the process; when that fails it is tried again with the first sentence."""
+        if self._command and self._helper is None:
+            with suppress(OSError):
+                self._started()
+
     async def tell(self, text: str) -> str:
-        """Why it failed, "" when it did not; off the loop, but virtual time stands still meanwhile."""
+        """Why it failed, "" when it did not; off the loop and after earlier ones, but virtual time stands still
+        meanwhile."""
         if not self._command:
             return ""
-        lane = Lane("notify", self._clock)
+        arguments = (*self._command, text.replace("\0", " "))
+        async with self._turn:
+            self._lane = self._lane or Lane("notify", self._clock, patient=False)
+            limit_s = self._limit_s + KILLED_LIMIT_S + _SPARE_S
+            try:
+                async with asyncio.timeout(limit_s):
+                    return await self._lane.call(self._run, arguments)
+            except TimeoutError:
+                self.close()
+                return f"the process that runs {self._command[0]} did not answer within {limit_s:g} s"
+
+    def close(self) -> None:
+        """End the process; a command under way goes on to its end. May be called twice."""
+        self._drop()
+        if self._lane is not None:
+            self._lane.close()
+            self._lane = None
+
+    def _run(self, arguments: tuple[str, ...]) -> str:
+        """In the lane. A process that has ended is replaced, once."""
         try:
-            return await lane.call(run_command, (*self._command, text.replace("\0", " ")), self._limit_s)
-        finally:
-            lane.close()
+            return self._asked(arguments)
+        except OSError:
+            self._drop()
+        try:
+            return self._asked(arguments)
+        except OSError as error:
+            return f"{arguments[0]} could not be started ({error})"
 
+    def _asked(self, arguments: tuple[str, ...]) -> str:
+        """Raises OSError when there is no process, or it has ended."""
+        return (self._helper or self._started()).line(_LINE).run(run_command, arguments, self._limit_s)
 
-def run_command(command: Sequence[str], limit_s: float) -> str:
-    """Run it to its end, or kill it and its children after `limit_s`; why it failed, "" when it did not."""
-    try:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # so that Ctrl-C at the stand does not end it, and its children can be found
-        )
-    except (OSError, ValueError) as error:
-        return f"{command[0]} could not be started ({error})"
-    try:
-        status = process.wait(limit_s)
-    except subprocess.TimeoutExpired:
-        return f"{command[0]} did not end within {limit_s:g} s{_killed(process)}"
-    return "" if status == 0 else f"{command[0]} ended with status {status}"
+    def _drop(self) -> None:
+        helper, self._helper = self._helper, None
+        if helper is not None:
+            helper.close()
 
-
-def _killed(process: subprocess.Popen[bytes]) -> str:
-    """Kill it and its children; "" when it is gone. One that runs as another user, or hangs in the kernel, stays."""
-    with suppress(OSError):
-        os.killpg(process.pid, signal.SIGKILL)
-    try:
-        process.wait(_KILLED_LIMIT_S)
-    except subprocess.TimeoutExpired:
-        return " and could not be killed"
-    return ""
+    def _started(self) -> Helper:
+        self._helper = Helper(MODULE, (_LINE,), "the process that runs the notify command has ended")
+        return self._helper

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from stand.recording.disk import FRAMES_LINE, TELEMETRY_LINE, Disk, Line
+from stand.helper import Line
+from stand.recording.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
 from stand.recording.forms import SessionForm
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.segment import Record

@@ -32,7 +32,8 @@ from typing import Literal, cast
 from drivers.clock import Clock
 from drivers.interface import SessionError
 from drivers.lane import Lane
-from stand.recording.disk import JOURNAL_LINE, Disk, Line
+from stand.helper import Line
+from stand.recording.disk import JOURNAL_LINE, Disk
 from stand.recording.home import FolderLost
 from stand.recording.locks import lock
 from stand.recording.sink import sync_folder

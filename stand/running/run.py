@@ -165,6 +165,7 @@ async def _told(job: _Job, directory: Path, clock: Clock, time: _Time | None, st
     assembly = assemble(job.order.config, hub, clock)
     if accepted := job.order.config.accepted():
         hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
+    assembly.notifier.start()
     try:
         recorder = await _performed(job, directory, assembly, time, stop, early)
         _check_outcome(directory, recorder, assembly)
@@ -175,6 +176,8 @@ async def _told(job: _Job, directory: Path, clock: Clock, time: _Time | None, st
         if isinstance(error, MemoryError):
             raise StandError(f"{directory}: {failure_text(error)}{_unsafe(assembly)}") from raised
         raise
+    finally:
+        assembly.notifier.close()
     return directory
 
 
@@ -216,7 +219,7 @@ def _check_outcome(directory: Path, recorder: Recorder, assembly: Assembly) -> N
 
 async def _tell_failure(assembly: Assembly, name: str, error: BaseException) -> None:
     ending = "" if isinstance(error, StandTripped) else _unsafe(assembly)
-    if failure := await assembly.notifier().tell(f"{name} has failed: {failure_text(error)}{ending}"):
+    if failure := await assembly.notifier.tell(f"{name} has failed: {failure_text(error)}{ending}"):
         assembly.hub.publish(Event(assembly.clock.now_ns(), "warning", "notify_failed", failure))
 
 

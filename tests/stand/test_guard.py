@@ -4,7 +4,7 @@ import asyncio
 import os
 import select
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,8 @@ from drivers.clock import Clock, VirtualClock, WallClock, block_until, seconds_n
 from drivers.interface import DeviceFault, Reading
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Fault, Readings, Rule, Watch
-from stand.guarding.notify import Notifier, run_command
+from stand.guarding.notify import Notifier
+from stand.guarding.notify_process import run_command
 from stand.guarding.safety import Safety
 from stand.hub import Batch, Event, Hub
 
@@ -32,6 +33,16 @@ class PlainActuator:
         self.log.append("safe")
         if self.failure:
             raise DeviceFault(self.name, self.failure)
+
+
+NOTIFIERS: list[Notifier] = []  # of the test
+
+
+@pytest.fixture(autouse=True)
+def _ended_notifiers() -> Iterator[None]:
+    yield
+    while NOTIFIERS:
+        NOTIFIERS.pop().close()
 
 
 class Bench:
@@ -58,6 +69,7 @@ class Bench:
         watches = tuple(Watch(self._rule(index), 0.0, action) for index, action in enumerate(actions))
         stop, hold = (lambda fault, name=name: self.log.append(f"{name} {fault.rule}") for name in ("stop", "hold"))
         notifier = Notifier(command, limit_s, self.clock)
+        NOTIFIERS.append(notifier)
         self.guard = Guard(
             self.safety,
             watches,

@@ -21,7 +21,7 @@ from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.recording.disks import ext4, run
 from tests.system.conftest import require_aravis
-from tests.system.test_guard_run import Watcher
+from tests.system.test_guard_run import Watcher, telling
 from tests.system.test_run import at_step
 
 SOAK = """
@@ -98,10 +98,18 @@ async def happens(watcher: Watcher, kind: str) -> None:
         await watcher.until(lambda: kind in {event.kind for event in watcher.events})
 
 
+async def says(path: Path, text: str) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while not (path.exists() and text in path.read_text()):
+            await asyncio.sleep(0.05)
+
+
 async def test_a_disk_that_hangs_withdraws_the_heat_and_the_run_goes_on_when_it_is_back(
-    disk: Path, order: Callable[..., Order], simulator: Callable[..., object]
+    disk: Path, tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
-    ordered = order(SOAK, **FAST)
+    """Somebody is told while it hangs."""
+    told = tmp_path / "told"
+    ordered = telling(order(SOAK, **FAST), told)
     await asyncio.to_thread(simulator, ordered.config, False)
     async with heating(ordered, disk / "out") as (task, watcher):
         watcher.events.clear()
@@ -109,6 +117,7 @@ async def test_a_disk_that_hangs_withdraws_the_heat_and_the_run_goes_on_when_it_
         try:
             await happens(watcher, "guard.not_recorded")
             await heater_is(ordered, 0)
+            await says(told, "is not on the disk yet")
             assert [event.kind for event in watcher.events if event.kind == "guard_late"] == []
         finally:
             run("fsfreeze", "-u", disk)
