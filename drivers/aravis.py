@@ -126,6 +126,16 @@ class GigeDevice:
         """Write a String or Enumeration feature."""
         self._call("arv_camera_set_string", feature.encode(), value.encode())
 
+    def entries(self, feature: str) -> tuple[str, ...]:
+        """What an Enumeration feature offers now, in the camera's order."""
+        count = ctypes.c_uint()
+        names = self._call("arv_camera_dup_available_enumerations_as_strings", feature.encode(), ctypes.byref(count))
+        try:
+            found = ctypes.cast(names, ctypes.POINTER(ctypes.c_char_p))
+            return tuple((found[index] or b"").decode(errors="replace") for index in range(count.value))
+        finally:
+            self._library.call("g_free", names)  # the array; the names are the feature's own
+
     def set_boolean(self, feature: str, value: bool) -> None:
         """Write a Boolean feature."""
         self._call("arv_camera_set_boolean", feature.encode(), value)

@@ -44,6 +44,7 @@ ARAVIS_FUNCTIONS = {
     "arv_camera_set_string": "v PSSE",
     "arv_camera_set_boolean": "v PSbE",
     "arv_camera_is_feature_available": "b PSE",
+    "arv_camera_dup_available_enumerations_as_strings": "P PS*E",
     "arv_camera_gv_set_stream_options": "v Pi",
     "arv_camera_gv_set_packet_size_adjustment": "v Pi",
     "arv_camera_gv_set_packet_size": "v PiE",
@@ -79,7 +80,7 @@ GOBJECT_FUNCTIONS = {
     "g_signal_connect_data": "L PSPPPi",
     "g_signal_handler_disconnect": "v PL",
 }
-GLIB_FUNCTIONS = {"g_error_free": "v P", "g_quark_to_string": "S u"}
+GLIB_FUNCTIONS = {"g_free": "v P", "g_error_free": "v P", "g_quark_to_string": "S u"}
 
 C_TYPES: dict[str, Any] = {
     "P": ctypes.c_void_p,

@@ -127,6 +127,11 @@ class Camera:
             return (bad_reading(channel, "degC", time_ns, reason, cause),)
         return (Reading(channel, value_degC, "degC", time_ns),)
 
+    async def temperature_place(self) -> str:
+        """Which feature shows the temperature, and what the camera offers for its selector, in words; "" when none was
+        found: `read` then says why."""
+        return await self._call(self._usable().temperature_place)
+
     async def _grab_triggered(self, connection: Connection, exposure_s: float, due_ns: int) -> Shot:
         for _ in range(ATTEMPTS):
             shot = await self._call(connection.trigger, exposure_s, due_ns)

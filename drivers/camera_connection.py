@@ -29,11 +29,13 @@ from drivers.camera_settings import (
     BYTES_PER_PIXEL,
     NO_CONTROL_HINT,
     CameraSettings,
+    TemperatureFeature,
     apply_settings,
     find_temperature,
     read_identity,
     read_temperature,
     set_exposure,
+    temperature_place,
 )
 from drivers.clock import NS_PER_S, Clock, block_until, seconds_ns
 from drivers.interface import Cause, Refused
@@ -131,7 +133,7 @@ class Connection:
             self._period_ns = seconds_ns(1 / self.effective.frame_rate_hz)
             self._exposure_asked_s = settings.exposure_s
             self._exposure_s = self.effective.exposure_s
-            self._temperature, self._no_temperature = find_temperature(self._device, settings.temperature)
+            self._temperature, self._no_temperature = self._find_temperature()
         except BaseException:
             self._device.close()
             raise
@@ -219,10 +221,25 @@ class Connection:
         return begin_ns + seconds_ns(self._exposure_s)
 
     def temperature(self) -> tuple[float, str, Cause]:
-        """The camera's temperature in degC and "", or NaN, the reason and who says so."""
+        """The camera's temperature in degC and "", or NaN, the reason and who says so. A place that was not found is
+        looked for again: a camera may refuse its selector for a while."""
+        try:
+            if self._temperature is None:
+                self._temperature, self._no_temperature = self._find_temperature()
+        except AravisError as error:
+            return math.nan, str(error), "wire"
         if self._temperature is None:
             return math.nan, self._no_temperature, "device"
         return read_temperature(self._device, self._temperature)
+
+    def temperature_place(self) -> str:
+        """Where the temperature is read, and what else the camera offers, in words; "" when it was not found."""
+        return "" if self._temperature is None else temperature_place(self._device, self._temperature)
+
+    def _find_temperature(self) -> tuple[TemperatureFeature | None, str]:
+        if not self._settings.has_temperature:
+            return None, "the configuration says that this camera has no temperature"
+        return find_temperature(self._device, self._settings.temperature)
 
     def _discard(self) -> None:
         """Give back every finished frame unused."""

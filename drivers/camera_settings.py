@@ -69,8 +69,8 @@ class CameraSettings:
     address: IP. serial_number: refused when another camera answers; None takes any. width_px, height_px: from the
     sensor's first pixel; None the whole sensor. trigger: one frame per software trigger, or frames at frame_rate_hz all
     the time (constant self-heating). packet_size: bytes of an IP packet; None lets Aravis find it. heartbeat_s: the
-    camera frees itself after so long without us. temperature: None looks for the usual features. resend: lost packets
-    are asked for again.
+    camera frees itself after so long without us. temperature: None looks for the usual features, unless the camera is
+    said to have none (has_temperature). resend: lost packets are asked for again.
     """
 
     address: str
@@ -86,6 +86,7 @@ class CameraSettings:
     packet_delay_ns: int = 0
     heartbeat_s: float = 3.0
     temperature: TemperatureFeature | None = None
+    has_temperature: bool = True
     resend: bool = True
     buffers: int = 6
 
@@ -283,7 +284,10 @@ def _receive_buffer_bytes(payload_bytes: int) -> int:
 
 
 def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> tuple[TemperatureFeature | None, str]:
-    """The place to read the temperature from, its selector set; or None and why there is none."""
+    """The place to read the temperature from, its selector set; or None and why there is none.
+
+    AravisError when the camera does not answer: then nothing is known about it.
+    """
     for place in (wanted,) if wanted else USUAL_TEMPERATURES:
         try:
             if place.feature is not None and not device.available(place.feature):
@@ -291,10 +295,32 @@ def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> t
             if place.selector is not None and place.entry is not None:
                 device.set_string(place.selector, place.entry)  # once: selector and value are two transactions
         except AravisError as error:
-            return None, str(error)
+            if is_silence(error):
+                raise
+            return None, f"{_named(place)} cannot be read ({error}){_offered(device, place)}"
         return place, ""
     names = [place.feature or "" for place in ((wanted,) if wanted else USUAL_TEMPERATURES)]
     return None, f"the camera has no {' and no '.join(names)}"
+
+
+def temperature_place(device: GigeDevice, place: TemperatureFeature) -> str:
+    """Where that is, and what the camera offers for its selector, in words."""
+    return f"{_named(place)}{_offered(device, place)}"
+
+
+def _named(place: TemperatureFeature) -> str:
+    if place.feature is None:
+        return f"register {place.register or 0:#x}"
+    return place.feature if place.selector is None else f"{place.feature} of {place.selector} {place.entry!r}"
+
+
+def _offered(device: GigeDevice, place: TemperatureFeature) -> str:
+    """What the camera offers for the selector, as the end of a sentence; "" when there is none, or it does not say."""
+    try:
+        entries = device.entries(place.selector) if place.selector is not None else ()
+    except AravisError:
+        return ""
+    return f"; for {place.selector} the camera offers {', '.join(entries)}" if entries else ""
 
 
 def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[float, str, Cause]:

@@ -25,7 +25,7 @@ from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Fault, Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
 from stand.guarding.permits import PermitLimits
-from stand.guarding.rules import VITAL, Announcements, recorded, watches
+from stand.guarding.rules import VITAL, Announcements, camera_measured, recorded, watches
 from stand.hub import Hub
 from stand.poller import Poller
 from stand.running.equilibrium import EquilibriumLimits
@@ -63,10 +63,11 @@ class Assembly:
         hold: Callable[[Fault], None] | None = None,
         release: Callable[[], None] | None = None,
         recording: Recording | None = None,
+        frames_to_come: Callable[[], bool] = lambda: False,
     ) -> Guard:
-        """The guard with the configured rules, those of `recording` among them; on a fault it calls `stop`, or `hold`
-        where waiting is enough, and `release` when a hold has ended by itself. From now on nothing is permitted without
-        it."""
+        """The guard with the configured rules, those of `recording` and of a camera with `frames_to_come` among them;
+        on a fault it calls `stop`, or `hold` where waiting is enough, and `release` when a hold has ended by itself.
+        From now on nothing is permitted without it."""
         announced, stand = Announcements(), self.stand
         self.hub.subscribe(announced.receive)
         guard = Guard(
@@ -74,6 +75,7 @@ class Assembly:
             (
                 *watches(self.config, announced),
                 Watch(intrusion(lambda: stand.permits.intrusions), action="hold"),
+                *camera_measured(self.config, frames_to_come),
                 *(recorded(self.config, recording) if recording is not None else ()),
             ),
             self.hub,
@@ -193,4 +195,5 @@ def camera_settings(camera: CameraConfig) -> CameraSettings:
         packet_size=camera.packet_size,
         heartbeat_s=camera.heartbeat_s,
         temperature=temperature,
+        has_temperature=camera.has_temperature,
     )

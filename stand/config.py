@@ -217,7 +217,8 @@ class EquilibriumConfig(Document):
 
 
 class CameraConfig(Document):
-    """The GigE Vision camera, by IP address. boot_s: from its supply being switched on until it answers."""
+    """The GigE Vision camera, by IP address. boot_s: from its supply being switched on until it answers.
+    has_temperature: whether it measures its own temperature; false has to be said, a run needs no GOOD one then."""
 
     address: IpAddress
     serial_number: str | None = Field(default=None, pattern=r"^[ -~]{1,16}$")  # as the bootstrap register holds it
@@ -231,9 +232,16 @@ class CameraConfig(Document):
     packet_size: int | None = Field(default=None, ge=220, le=16112)
     heartbeat_s: float = Field(default=3.0, ge=1.5, le=60)  # Aravis asks once a second
     temperature: CameraTemperatureConfig | None = None
+    has_temperature: bool = True
     boot_s: float = Field(default=8.0, ge=0, le=600)
     equilibrium: EquilibriumConfig = EquilibriumConfig()
     poll_s: PollPeriod_s = 1.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.temperature is not None and not self.has_temperature:
+            raise ValueError("has_temperature is false, yet temperature says where it is; leave one of them out")
+        return self
 
 
 class LimitsConfig(Document):
@@ -330,6 +338,10 @@ class StandConfig(Document):
         slowest_s = max(self.regulator.poll_s, self.thermometers.poll_s, self.camera.poll_s)
         if slowest_s * 2 > self.guard.stale_after_s:
             raise ValueError(f"guard.stale_after_s must be at least twice the slowest safety poll ({slowest_s} s)")
+        if self.camera.poll_s * 2 > self.guard.camera_temperature_s:
+            raise ValueError(
+                f"guard.camera_temperature_s must be at least twice camera.poll_s ({self.camera.poll_s} s)"
+            )
         slowest_s = max(self.regulator.poll_s, self.relays.poll_s)
         if slowest_s * 2 > self.guard.keys_s:
             raise ValueError(f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)")

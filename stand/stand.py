@@ -300,6 +300,11 @@ class Stand:
         self._camera_supplied = True
         self.equilibrium.begin()
 
+    @property
+    def camera_supplied(self) -> bool:
+        """Whether the camera's supply is on and the camera has been opened since."""
+        return self._camera_supplied
+
     def lose_equilibrium(self, reason: str) -> None:
         """The camera's supply was or may have been off: whoever runs a plan calls `restore_camera` where it wants the
         camera on, and soaks it anew."""

@@ -379,6 +379,10 @@ def _silent_camera(laboratory: Laboratory, value: object) -> None:
     laboratory.camera.faults.silent_gvcp = laboratory.camera.faults.silent_gvsp = bool(value)
 
 
+def _hide_temperature(laboratory: Laboratory, value: object) -> None:
+    laboratory.camera.faults.temperature = "zero" if value else None
+
+
 def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
     laboratory.camera.faults.no_stream_channel = bool(value)
     if value:
@@ -420,6 +424,7 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "flap.jam": _flap_jam,  # feedback counts at which it stops
     "camera.sensor_degC": _overheat_camera,  # its sensor chip stays at this
     "camera.no_stream_channel": _camera_without_stream,  # it restarts, and does not offer one until this is undone
+    "camera.no_temperature": _hide_temperature,  # it shows 0 degC
     "camera.loss": _camera_loss,  # share of stream packets lost
     "camera.silent": _silent_camera,  # neither answers nor sends
 }

@@ -76,6 +76,7 @@ class GuardConfig(Document):
 
     keys_s: how long the unit and we may differ about running, permits and the set-point. flap_open_s: how long the flap
     may be open outside captures, flap_capture_s in all. disk_low_s: how long the recorder may refuse frames.
+    camera_temperature_s: how long a powered camera with frames to come may have no temperature.
     pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
     hours. notify: a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may
     take. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
@@ -105,6 +106,7 @@ class GuardConfig(Document):
     flap_open_s: float = Field(default=300.0, gt=0, le=36000)
     flap_capture_s: float = Field(default=2700.0, gt=0, le=36000)
     disk_low_s: float = Field(default=900.0, ge=0, le=36000)
+    camera_temperature_s: float = Field(default=60.0, gt=0, le=36000)
     notify: tuple[Annotated[str, Field(min_length=1)], ...] = Field(default=(), max_length=100)
     notify_limit_s: float = Field(default=10.0, gt=0, le=60)
     accept: tuple[str, ...] = ()

@@ -214,6 +214,19 @@ def paused(is_paused: Callable[[], bool]) -> Rule:
     return rule
 
 
+def camera_temperature_bad(channel: str, frames_to_come: Callable[[], bool]) -> Rule:
+    """The camera says that it has no temperature, while it is powered and frames are to come: no model of drift can use
+    those. One that does not answer at all is lost, which is another matter."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        reading = readings.known(channel)
+        if reading is not None and reading.quality is Quality.BAD and frames_to_come():
+            return Fault("camera_temperature_bad", f"{channel} is BAD: {reading.reason}")
+        return None
+
+    return rule
+
+
 def frames_stopped(reason: Callable[[], str]) -> Rule:
     """The recorder takes no more frames; `reason()` says why, "" while it does."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from experiments.steps import Capture
 from stand.config import StandConfig
 from stand.guarding.felt_air import CameraLimits, FeltLimits, GraniteLimits, camera_feels, granite_feels
@@ -11,6 +13,7 @@ from stand.guarding.heat_given import HeatFeltLimits, heat_not_felt, too_much_he
 from stand.guarding.interlocks import (
     Recording,
     Watch,
+    camera_temperature_bad,
     disagreement,
     flap_open,
     folder_lost,
@@ -189,3 +192,11 @@ def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
         Watch(folder_lost(recording), action="hold"),
         Watch(not_recorded(recording, config.recording.durable_within_s), action="hold", ends_itself=True),
     )
+
+
+def camera_measured(config: StandConfig, frames_to_come: Callable[[], bool]) -> tuple[Watch, ...]:
+    """The paper's T is the camera's own temperature; none is asked of a camera that is configured to have none."""
+    if not config.camera.has_temperature:
+        return ()
+    rule = camera_temperature_bad(CAMERA, frames_to_come)
+    return (Watch(rule, config.guard.camera_temperature_s, "hold", ends_itself=True),)

@@ -46,6 +46,9 @@ SAFE_RANGES = (
     SafeRange("guard.keys_s", " s", "a set-point changed by hand would be followed for so long", high=120),
     SafeRange("guard.flap_open_s", " s", "an open flap lets the chamber's air at the optics and the room", high=3600),
     SafeRange("guard.disk_low_s", " s", "it would be heated for so long without recording frames", high=1800),
+    SafeRange(
+        "guard.camera_temperature_s", " s", "frames without the camera's temperature fit no model of drift", high=300
+    ),
     SafeRange("recording.stop_frames_below_GB", " GB", "telemetry would find the disk full", low=0.5),
     SafeRange("bus.timeout_s", " s", "the guard could wait longer for a silent unit than a permit lives", high=2),
 )

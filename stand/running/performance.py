@@ -26,6 +26,7 @@ from stand.remote.control import handlers, serve
 from stand.remote.status import StatusBoard
 from stand.running.camera_gap import doubt
 from stand.running.camera_offset import OffsetGap, OffsetWatch
+from stand.running.camera_temperature import FramesToCome
 from stand.running.flap_care import keep_shut_in_holds
 from stand.running.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.running.journal import Again, Cleared, Ended, Entry, Gap, Journal
@@ -238,7 +239,11 @@ def _guard(work: Performance, log: Logbook) -> Guard:
         gate.hold(INTERLOCK)
         log.tripped(fault)
 
-    return work.assembly.guard(trip, hold, lambda: gate.clear(INTERLOCK), work.recorder)
+    done = frozenset[str]() if work.before is None else work.before.progress.done
+    stand = work.assembly.stand
+    frames = FramesToCome(lambda: stand.camera_supplied, work.order.recipe.plan(), done)
+    work.assembly.hub.subscribe(frames)
+    return work.assembly.guard(trip, hold, lambda: gate.clear(INTERLOCK), work.recorder, frames.is_due)
 
 
 def _forget_cleared(guard: Guard, work: Performance, reason: str, held: bool) -> None:

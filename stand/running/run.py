@@ -20,6 +20,7 @@ from stand.recording.disk import FILES_LINE, Disk
 from stand.recording.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from stand.recording.salvage import Salvaged, salvage_unfinished
 from stand.recording.settings import SessionInfo
+from stand.running.camera_temperature import check_temperature
 from stand.running.claim import claimed
 from stand.running.performance import Performance, perform
 from stand.running.resume import Interruption
@@ -300,6 +301,8 @@ async def _open(assembly: Assembly, *, camera_on: bool) -> None:
     await stand.test_dead_man()
     if camera_on:
         await stand.power_camera(on=True)
+        has_temperature = assembly.config.camera.has_temperature
+        await check_temperature(devices.camera, assembly.hub, assembly.clock, has_temperature=has_temperature)
 
 
 async def _close(assembly: Assembly) -> None:

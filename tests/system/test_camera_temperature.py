@@ -1,0 +1,159 @@
+"""The camera's own temperature over the wire: there before the first step, held for when it goes, excused when the
+configuration says that there is none."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from drivers.clock import NS_PER_S
+from drivers.interface import Reading, bad_reading
+from experiments.steps import Capture, PlannedStep, Role, Soak
+from stand.commandline.commands import app
+from stand.config import load_config, packaged
+from stand.guarding.rules import camera_measured
+from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
+from stand.recording.session import Session
+from stand.running.camera_temperature import FramesToCome
+from stand.running.run import run_virtual
+from stand.running.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_run import at_step, fault
+
+CAPTURES = """
+name: captures
+experiments:
+  - calibration: {equilibrium_s: 300, linear_mm: [0], rotary_deg: [0, 5], frames_per_position: 2}
+"""
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+@pytest.mark.parametrize(
+    ("temperature", "sentence"),
+    [
+        (
+            {"entry": "sensor"},
+            "DeviceTemperature of DeviceTemperatureSelector 'sensor' cannot be read",
+        ),
+        (
+            {"entry": "Sensor", "min_degC": 100},
+            "is outside 100..120 (DeviceTemperature of DeviceTemperatureSelector 'Sensor'",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("_aravis")
+def test_a_night_whose_camera_shows_no_temperature_is_refused_before_the_first_step(
+    tmp_path: Path, config_text: Callable[..., str], temperature: dict[str, object], sentence: str
+):
+    recipe, config = tmp_path / "recipe.yaml", tmp_path / "stand.yaml"
+    recipe.write_text(CAPTURES)
+    config.write_text(config_text(camera={"temperature": temperature}))
+    arguments = ["run", str(recipe), "--config", str(config), "--virtual-time", "--out", str(tmp_path / "sessions")]
+    refused = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert refused.exit_code != 0
+    assert "camera: its temperature is BAD before the first step" in refused.stderr
+    assert sentence in refused.stderr
+    assert "for DeviceTemperatureSelector the camera offers Sensor, Mainboard" in refused.stderr
+    assert "camera.has_temperature: false" in refused.stderr
+    assert not list(tmp_path.glob("sessions/*"))
+
+
+@pytest.mark.usefixtures("_aravis")
+async def test_a_temperature_that_goes_holds_the_run_until_it_is_back(tmp_path: Path, order: Callable[..., Order]):
+    ordered, events, tasks = order(CAPTURES), list[Event](), list[asyncio.Task[None]]()
+
+    def follow(item: Item) -> None:
+        if not isinstance(item, Event):
+            return
+        events.append(item)
+        if item.kind == "guard.camera_temperature_bad":
+            tasks.append(asyncio.create_task(fault(ordered, "camera.no_temperature", False)))
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(follow)
+        break_it = at_step(
+            "Soak", lambda: tasks.append(asyncio.create_task(fault(ordered, "camera.no_temperature", True)))
+        )
+        break_it(hub)
+
+    directory = await run_virtual(ordered, tmp_path / "out", None, watch)
+    await asyncio.gather(*tasks)
+    (held,) = [event for event in events if event.kind == "guard.camera_temperature_bad"]
+    assert (held.level, held.data) == ("error", {"rule": "camera_temperature_bad", "action": "hold"})
+    assert held.text == "camera.temperature is BAD: the camera shows exactly 0 degC, for 60 s"
+    (over,) = [event for event in events if event.kind == "hold_ended"]
+    assert over.data["rule"] == "camera_temperature_bad"
+    session = Session.open(directory)
+    times_ns, camera_degC = session.readings("camera.temperature")
+    bad_ns = times_ns[camera_degC != camera_degC]
+    assert 55 <= (held.time_ns - bad_ns[0]) / NS_PER_S <= 75
+    assert [meta.camera_degC > 20 for _, meta in session.frame_metas] == [True] * 4
+
+
+@pytest.mark.usefixtures("_aravis")
+async def test_a_camera_that_is_configured_to_have_no_temperature_is_not_asked_for_one(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    directory = await run_virtual(
+        order(CAPTURES, camera={"has_temperature": False}), tmp_path / "out", None, lambda hub: None
+    )
+    session = Session.open(directory)
+    kinds = [event.kind for event in session.events()]
+    assert "no_camera_temperature" in kinds
+    assert "guard.camera_temperature_bad" not in kinds
+    assert session.frame_count == 4
+    assert not (session.readings("camera.temperature")[1] > -300).any()
+
+
+def test_no_temperature_is_asked_of_a_camera_that_is_off_lost_or_has_taken_its_last_frame():
+    config, hub = load_config(packaged("", "simulated")), Hub()
+    (watch,) = camera_measured(config, lambda: is_due)
+    now_ns, is_due = 0, True
+
+    def held(reading: Reading) -> bool:
+        nonlocal now_ns
+        found = False
+        for _ in range(20):
+            now_ns += 5 * NS_PER_S
+            hub.publish(Batch("camera", now_ns, (reading,)))
+            found = watch.check(hub, now_ns) is not None or found
+        return found
+
+    bad, lost = (bad_reading("camera.temperature", "degC", 0, "why", cause) for cause in ("device", "wire"))
+    assert not held(lost)
+    assert held(bad)
+    assert not held(Reading("camera.temperature", 30.0, "degC", 0))
+    assert not held(lost)
+    is_due = False
+    assert not held(bad)
+
+
+def test_frames_are_to_come_until_the_last_capture_of_the_plan_is_done():
+    is_powered, capture = False, Capture(1, 1.0, 0.1, Role.CALIBRATION, 20.0)
+    plan = [PlannedStep(0, "a", Soak(1.0)), PlannedStep(1, "b", capture), PlannedStep(2, "c", capture)]
+    frames = FramesToCome(lambda: is_powered, plan, {"b"})
+    assert not frames.is_due()
+    is_powered = True
+    assert frames.is_due()
+    frames(StepMark(0, "c", 2, "Capture", StepState.STARTED))
+    assert frames.is_due()
+    frames(StepMark(0, "c", 2, "Capture", StepState.DONE))
+    assert not frames.is_due()
+    frames(StepMark(0, "c", 2, "Capture", StepState.STARTED))  # done again
+    assert frames.is_due()
+
+
+def test_a_camera_without_a_temperature_must_not_say_where_it_is(tmp_path: Path):
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["camera"] |= {"has_temperature": False, "temperature": {"entry": "Sensor"}}
+    config = tmp_path / "stand.yaml"
+    config.write_text(yaml.safe_dump(data))
+    with pytest.raises(Exception, match="has_temperature is false, yet temperature says where it is"):
+        load_config(config)
