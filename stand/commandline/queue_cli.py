@@ -147,7 +147,7 @@ def _cells(entry: Entry, turn: int | None) -> tuple[str, ...]:
     return (
         str(entry.id),
         "" if turn is None else str(turn),
-        entry.recipe,
+        one_line(entry.recipe),
         entry.state,
         date_time(entry.added_ns),
         took,

@@ -19,7 +19,7 @@ from drivers.interface import ConfigError, SessionError
 from stand.aside import aside
 from stand.commandline.session_report import NotReported, check_reportable, report_session
 from stand.commandline.session_text import salvage_line
-from stand.config import StandConfig
+from stand.config import StandConfig, load_config, packaged
 from stand.estimating.estimate import PricedStep, price
 from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
@@ -103,16 +103,21 @@ def run(
 @app.command("resume")
 def resume_run(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="The session of a run that did not end.")],
+    config: Annotated[
+        str, typer.Option("--config", help="This stand's configuration: a file, or the name of an installed one.")
+    ] = "simulated",
     clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
     attended: AttendedOption = False,
     report: ReportOption = False,
 ) -> None:
     """Go on with a run that was killed or interrupted, in its session: what is done is not done again.
 
-    Example: stand resume sessions/20260101T180000Z-thermal-cycle
+    Recipe, seed, target and camera settings are the session's; programs, files, addresses and limits are this stand's.
+
+    Example: stand resume sessions/20260101T180000Z-thermal-cycle --config laboratory.yaml
     """
     with _run_errors():
-        before = interruption(directory, clear=clear)
+        before = interruption(directory, load_config(packaged("", config)), clear=clear)
         order = replace(before.order, attended=attended)
         before = replace(before, order=order)
         try:

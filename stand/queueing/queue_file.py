@@ -13,9 +13,9 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from drivers.documents import Document
 from drivers.interface import SessionError
@@ -37,6 +37,13 @@ class State(StrEnum):
     INTERRUPTED = "interrupted"
 
 
+def _folder_name(name: str) -> str:
+    """A session's folder lies in the recording directory, whatever the file says."""
+    if name in (".", "..") or "/" in name or "\\" in name or not name.isprintable() or len(name.encode()) > 255:
+        raise ValueError("expected the name of a folder in the recording directory")
+    return name
+
+
 class Entry(Document):
     """One run. The texts are those of the files when it was added: a later edit does not change what is queued.
 
@@ -55,7 +62,7 @@ class Entry(Document):
     added_ns: int
     began_ns: int | None = None
     ended_ns: int | None = None
-    session: str = ""
+    session: Annotated[str, AfterValidator(_folder_name)] = ""
     reason: str = ""
     fruitless_starts: int = Field(default=0, ge=0)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from drivers.interface import ConfigError, SessionError, StandError, StandTripped
 from stand.aside import aside
 from stand.commandline.session_report import NotReported, check_reportable, report_session
+from stand.config import StandConfig
 from stand.estimating.estimate import price
 from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
@@ -38,7 +39,7 @@ async def run_entry(
     if session is not None and await asyncio.to_thread(_is_complete, session):
         return session  # killed between its end and the note of it
     order = order_of(entry)
-    before = None if session is None else await asyncio.to_thread(_interruption, session)
+    before = None if session is None else await asyncio.to_thread(_interruption, session, order.config)
     watch = _Watch(frozenset() if before is None else before.progress.done, notes.step_done)
     try:
         with _followed(directory, order, before, tell) as follow:
@@ -108,10 +109,10 @@ def _followed(
             yield Follow(steps, later(report), later(tell), before.progress.done, before.progress.earned_s)
 
 
-def _interruption(session: Path) -> Interruption:
+def _interruption(session: Path, own: StandConfig) -> Interruption:
     try:
-        return interruption(session)
-    except SessionError as error:
+        return interruption(session, own)
+    except (SessionError, ConfigError) as error:
         raise Halt(str(error)) from error
 
 

@@ -1,8 +1,8 @@
 """What a session says of a run that did not come to its end, and whether it may go on.
 
 The journal tells which steps are done, the recording what they have left: a step whose end is recorded is done, and a
-frame counts when its image and its description are both on the disk. Configuration, recipe and target are those that
-were attached to the session, whatever today's files are.
+frame counts when its image and its description are both on the disk. Recipe, seed and target are those of the session,
+whatever today's files are; the stand is this one (stand.running.own_stand).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Literal, cast
 
 from drivers.interface import SessionError
 from experiments.steps import Capture, PlannedStep
+from stand.config import StandConfig
 from stand.hub import StepState
 from stand.order_files import parse_order
 from stand.recipe import Recipe
@@ -25,6 +26,7 @@ from stand.recording.settings import SessionInfo
 from stand.running.camera_gap import CameraBefore, camera_before
 from stand.running.cold_start import cold_start
 from stand.running.journal import Again, Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
+from stand.running.own_stand import Difference, default_stand, on_this_stand
 from stand.running.scheduler import Progress
 from stand.running.session_setup import Order
 from stand.running.set_up import SetUp
@@ -51,7 +53,8 @@ class Interruption:
     last_ns: the last instant on the disk. seed: of the simulated laboratory. ended: how it ended, "" when it was
     killed. tripped: what an operator has cleared. salvaged: what had to be finished first. camera: what the session
     tells of it. again: ids of the steps of an interrupted warm-up that are done again, its capture last, which had
-    `superseded` frames. utc_offset_ns: UTC minus the stand's clock at last_ns, as it is recorded.
+    `superseded` frames. utc_offset_ns: UTC minus the stand's clock at last_ns, as it is recorded. differences: between
+    the configuration of the session and that of this stand, with which it goes on.
     """
 
     directory: Path
@@ -69,27 +72,31 @@ class Interruption:
     again: tuple[str, ...] = ()
     superseded: int = 0
     utc_offset_ns: int = 0
+    differences: tuple[Difference, ...] = ()
 
     def release(self) -> None:
         """Give the session free for another daemon; may be called twice."""
         self.journal.release()
 
 
-def interruption(directory: Path, *, clear: bool = False) -> Interruption:
-    """What is needed to go on with the run recorded in `directory`; its unfinished segments are salvaged.
+def interruption(directory: Path, own: StandConfig | None = None, *, clear: bool = False) -> Interruption:
+    """What is needed to go on with the run recorded in `directory` on this stand, the installed simulated one when no
+    `own` is given; its unfinished segments are salvaged.
 
-    SessionError when a daemon is running it, it is complete, it tripped and `clear` is not given, or journal, recording
-    and this version of the program do not belong together.
+    ConfigError when only one of the two stands is simulated. SessionError when a daemon is running it, it is complete,
+    it tripped and `clear` is not given, or journal, recording and this version of the program do not belong together.
     """
     journal, entries = Journal.open(directory)
     try:
-        return _interruption(directory, journal, entries, clear)
+        return _interruption(directory, journal, entries, own or default_stand(), clear)
     except BaseException:
         journal.release()
         raise
 
 
-def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear: bool) -> Interruption:
+def _interruption(
+    directory: Path, journal: Journal, entries: list[Entry], own: StandConfig, clear: bool
+) -> Interruption:
     first = entries[0] if entries else None
     if not isinstance(first, Begun):
         raise SessionError(f"{directory}: its run had not begun when it was killed; begin a new run")
@@ -102,6 +109,9 @@ def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear
     salvaged = tuple(salvage_unfinished(directory.resolve().parent))
     session = Session.open(directory)
     order = _order(session, first)
+    info = _info(session.metadata)
+    config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
+    order = replace(order, config=config)
     found = _found(session, entries, order.recipe)
     last_ns = max(entries[-1].time_ns, glance(directory).end_ns or 0)
     progress = replace(found.progress, until_ns=last_ns)
@@ -111,7 +121,7 @@ def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear
     return Interruption(
         directory,
         order,
-        _info(session.metadata),
+        info,
         journal,
         progress,
         set_up,
@@ -124,6 +134,7 @@ def _interruption(directory: Path, journal: Journal, entries: list[Entry], clear
         found.again,
         found.superseded,
         session.utc.at(last_ns),
+        differences,
     )
 
 

@@ -167,6 +167,8 @@ async def _told(job: _Job, directory: Path, clock: Clock, time: _Time | None, st
     if accepted := job.order.config.accepted():
         hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
     assembly.notifier.start()
+    for difference in () if job.before is None else job.before.differences:
+        hub.publish(Event(clock.now_ns(), "warning", "stand_differs", str(difference), difference.data()))
     try:
         recorder = await _performed(job, directory, assembly, time, stop, early)
         _check_outcome(directory, recorder, assembly)

@@ -166,7 +166,7 @@ async def test_the_compressor_rests_whatever_the_system_clock_does_between_two_d
             first.send_signal(signal.SIGINT)
             off = await host.until(lambda state: state["compressor_on"] == 0, "the compressor is off")
         host.moves(0, step_s)
-        with host.daemon("resume", str(host.session())) as going_on:
+        with host.daemon("resume", str(host.session()), "--config", str(tmp_path / "config.yaml")) as going_on:
             on = await host.until(lambda state: state["compressor_on"] == 1, "the compressor runs again")
             assert going_on.poll() is None
         assert rest_s - 1 <= (on["now_ns"] - off["now_ns"]) / NS_PER_S <= rest_s + 20

@@ -1,0 +1,121 @@
+"""A session that is resumed brings its experiment, never its stand: it may be somebody else's, and what it names would
+be run and opened here.
+
+The programs that are run, the files and folders, the addresses, and whatever protects the stand are those of this
+stand's own configuration. Of the session's remain recipe, seed and target, and what its frames depend on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.interface import ConfigError
+from stand.config import StandConfig, load_config, packaged
+
+# Of the camera and the recording: frames before and after the interruption belong together.
+_CAMERA = (
+    "pixel_format",
+    "width_px",
+    "height_px",
+    "exposure_s",
+    "gain_dB",
+    "trigger",
+    "frame_rate_hz",
+    "temperature",
+    "has_temperature",
+)
+_RECORDING = ("frame_encoding", "whole_every_s")
+_LONGEST_VALUE = 200  # characters of a value that a sentence shows
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What the session's configuration has at `path`, and what this stand's has, as JSON-able values."""
+
+    path: str
+    session: object
+    stand: object
+
+    def __str__(self) -> str:
+        return f"{self.path} is {_shown(self.stand)} as on this stand, not {_shown(self.session)} as in the session"
+
+    def data(self) -> dict[str, object]:
+        """For the recording."""
+        return {"path": self.path, "session": self.session, "stand": self.stand}
+
+
+def default_stand() -> StandConfig:
+    """Of whoever names no configuration: the installed simulated one, as for a new run."""
+    return load_config(packaged("", "simulated"))
+
+
+def on_this_stand(
+    recorded: StandConfig, own: StandConfig, session: Path, *, is_virtual: bool
+) -> tuple[StandConfig, tuple[Difference, ...]]:
+    """The configuration with which a session is resumed here, and how it differs from the recorded one.
+
+    In virtual time the session's own laboratory is simulated, which has no addresses to mistake: only programs, files
+    and folders are this stand's. ConfigError when one stand is real and the other simulated.
+    """
+    if is_virtual:
+        config = _in_virtual_time(recorded, own)
+    else:
+        _check_kind(recorded, own, session)
+        config = own.model_copy(
+            update={
+                "target": recorded.target,
+                "camera": own.camera.model_copy(update={name: getattr(recorded.camera, name) for name in _CAMERA}),
+                "recording": own.recording.model_copy(
+                    update={name: getattr(recorded.recording, name) for name in _RECORDING}
+                ),
+            }
+        )
+    before, now = (dict(_leaves(each.model_dump(mode="json"))) for each in (recorded, config))
+    found = (Difference(path, before.get(path), now.get(path)) for path in dict.fromkeys((*before, *now)))
+    return config, tuple(each for each in found if each.session != each.stand)
+
+
+def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
+    simulated = own if own.simulation is not None else default_stand()
+    notified = {"notify": own.guard.notify, "notify_limit_s": own.guard.notify_limit_s}
+    maps = {
+        name: getattr(recorded, name).model_copy(update={"registers": getattr(simulated, name).registers})
+        for name in ("regulator", "relays", "thermometers")
+    }
+    state_file = {"state_file": simulated.compressor.state_file}
+    return recorded.model_copy(
+        update={
+            **maps,
+            "guard": recorded.guard.model_copy(update=notified),
+            "compressor": recorded.compressor.model_copy(update=state_file),
+            "recording": recorded.recording.model_copy(update={"directory": own.recording.directory}),
+            "flap": recorded.flap.model_copy(update={"backend": simulated.flap.backend}),
+        }
+    )
+
+
+def _check_kind(recorded: StandConfig, own: StandConfig, session: Path) -> None:
+    if (recorded.simulation is None) != (own.simulation is None):
+        kinds = {True: "a real stand", False: "a simulated one"}
+        raise ConfigError(
+            f"{session}: was recorded on {kinds[recorded.simulation is None]}, and {own.name!r} is "
+            f"{kinds[own.simulation is None]}; give this stand's configuration with --config"
+        )
+
+
+def _leaves(values: Mapping[str, object], above: str = "") -> Iterator[tuple[str, object]]:
+    """Every value that is no mapping, by its path; an empty mapping counts as one."""
+    for name, value in values.items():
+        path = f"{above}{name}"
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{path}.")  # pyright: ignore[reportUnknownArgumentType]
+        else:
+            yield path, value
+
+
+def _shown(value: object) -> str:
+    text = "not given" if value is None else json.dumps(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."

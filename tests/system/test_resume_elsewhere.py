@@ -1,0 +1,185 @@
+"""A session from somebody else is resumed: its experiment goes on, on this stand, and nothing that it names is run."""
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from drivers.interface import ConfigError, StandTripped
+from stand.commandline.commands import app
+from stand.config import StandConfig, load_config, packaged
+from stand.queueing.queue_file import QUEUE_NAME
+from stand.recording.session import Session
+from stand.running.own_stand import on_this_stand
+from stand.running.resume import interruption
+from stand.running.run import Interrupted, resume, run_real, run_virtual
+from stand.running.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_real_time import BRIEF
+from tests.system.test_resume import findable
+from tests.system.test_run import at_step, fault
+
+CAPTURES = """
+name: captures
+experiments:
+  - calibration: {equilibrium_s: 30, linear_mm: [0], rotary_deg: [0], frames_per_position: 2}
+"""
+FAST = {
+    "regulator": {"poll_s": 0.5},
+    "relays": {"self_test_s": 0.6},
+    "camera": {"boot_s": 1.0, "poll_s": 0.5},
+}
+LIMIT_S = 90.0
+
+
+@pytest.fixture
+def _aravis() -> None:
+    require_aravis()
+
+
+def config_of(tmp_path: Path, name: str = "laboratory", **sections: dict[str, object]) -> StandConfig:
+    """An installed configuration with some entries of its sections replaced."""
+    data = yaml.safe_load(packaged("", name).read_text())
+    for section, entries in sections.items():
+        data.setdefault(section, {}).update(entries)
+    file = tmp_path / "changed.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return load_config(file)
+
+
+def stopped(kind: str = "Soak") -> Callable[..., None]:
+    return at_step(kind, lambda: os.kill(os.getpid(), signal.SIGINT))
+
+
+@pytest.mark.usefixtures("_aravis")
+def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_said_and_recorded(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    """The resumed run trips, of which the session's notify program would be told; then it is resumed to its end."""
+    trace, state, tasks = tmp_path / "was-run", tmp_path / "compressor.json", list[asyncio.Task[None]]()
+    hostile = order(
+        CAPTURES,
+        guard={"notify": ["/bin/sh", "-c", f"touch {trace}"]},
+        compressor={"state_file": str(state)},
+    )
+    with pytest.raises(Interrupted):
+        asyncio.run(run_virtual(hostile, tmp_path / "out", None, stopped()))
+    (directory,) = (tmp_path / "out").iterdir()
+    assert not trace.exists()  # an operator who stops a run knows
+
+    def broken() -> None:
+        tasks.append(asyncio.get_running_loop().create_task(fault(hostile, "thermometer.open", "air")))
+
+    before = findable(interruption(directory))
+    assert "touch" in before.order.config_text  # what is recorded stays as it was
+    with pytest.raises(StandTripped, match=r"thermometers\.air is BAD"):
+        asyncio.run(resume(before, at_step("Soak", broken)))
+    resumed = CliRunner().invoke(app, ["resume", str(directory), "--clear"])
+    assert resumed.exit_code == 0, resumed.output
+    said = [line for line in resumed.stderr.splitlines() if "as on this stand" in line]
+    assert len(said) == 2
+    assert 'guard.notify is [] as on this stand, not ["/bin/sh", "-c"' in said[0]
+    assert "compressor.state_file is not given as on this stand, not" in said[1]
+    session = Session.open(directory)
+    recorded = [event.data for event in session.events() if event.kind == "stand_differs"]
+    assert [data["path"] for data in recorded] == ["guard.notify", "compressor.state_file"] * 2
+    assert recorded[0]["stand"] == []
+    assert session.frame_count == 2
+    assert not trace.exists()
+
+
+@pytest.mark.usefixtures("_aravis")
+async def test_a_session_of_a_stand_at_other_addresses_is_resumed_at_those_of_this_one(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    ordered = order(BRIEF, **FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    async with asyncio.timeout(LIMIT_S):
+        with pytest.raises(Interrupted):
+            await run_real(ordered, tmp_path / "out", stopped())
+    (directory,) = (tmp_path / "out").glob("*-brief")
+    own = config_of(tmp_path, "simulated", guard={"max_air_degC": 64.0})
+    before = interruption(directory, own)
+    before.release()
+    config = before.order.config
+    assert config.bus == own.bus
+    assert config.axes == own.axes
+    assert config.camera.address == own.camera.address
+    assert config.guard == own.guard
+    paths = [difference.path for difference in before.differences]
+    assert {"bus.address", "axes.linear.address", "camera.address", "guard.max_air_degC", "simulation.control"} <= set(
+        paths
+    )
+    with pytest.raises(ConfigError, match="was recorded on a simulated one, and 'laboratory-stand' is a real stand"):
+        interruption(directory, config_of(tmp_path))
+
+
+def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp_path: Path):
+    own = config_of(tmp_path)
+    session = config_of(
+        tmp_path,
+        bus={"address": "tcp:192.168.1.99:502"},
+        relays={"channels": {"heater_enable": 2, "compressor": 1, "camera_power": 0}},
+        regulator={"registers": "/tmp/somebody.yaml"},
+        flap={"backend": "somebodys.module", "backend_address": "tcp:192.168.1.99:1"},
+        camera={"exposure_s": 0.2, "address": "192.168.1.98", "temperature": {"entry": "Mainboard"}},
+        recording={"directory": "/somewhere", "frame_encoding": "raw"},
+        guard={"notify": ["/bin/rm", "-r", "/"], "max_camera_degC": 99.0},
+        limits={"chamber_degC": [-10, 59]},
+        compressor={"state_file": "/etc/passwd", "min_off_s": 181},
+    )
+    config, differences = on_this_stand(session, own, tmp_path, is_virtual=False)
+    kept = {
+        "camera": own.camera.model_copy(update={"exposure_s": 0.2, "temperature": session.camera.temperature}),
+        "recording": own.recording.model_copy(update={"frame_encoding": "raw"}),
+    }
+    assert config == own.model_copy(update=kept)
+    said = [str(difference) for difference in differences]
+    assert "bus.address is" in said[0]
+    assert len(said) == len({difference.path for difference in differences}) == 13
+    assert 'guard.notify is [] as on this stand, not ["/bin/rm", "-r", "/"] as in the session' in said
+
+
+def test_the_same_configuration_does_not_differ(tmp_path: Path):
+    own = config_of(tmp_path)
+    assert on_this_stand(own, own, tmp_path, is_virtual=False) == (own, ())
+
+
+def test_a_simulated_session_never_reaches_a_real_flap_or_file(tmp_path: Path):
+    """Also where this stand is a real one."""
+    session = config_of(
+        tmp_path, "simulated", flap={"backend": "somebodys.module"}, relays={"registers": "/tmp/somebody.yaml"}
+    )
+    config, differences = on_this_stand(session, config_of(tmp_path), tmp_path, is_virtual=True)
+    assert config.flap.backend == "drivers.sim.usb"
+    assert config.relays.registers == "waveshare-relay"
+    assert {difference.path for difference in differences} == {"relays.registers", "flap.backend"}
+
+
+@pytest.mark.parametrize(
+    "session",
+    ["../elsewhere", "..", ".", "/etc", "a/b", "a\\b", "a\x1b[2J", "a\nb", "a\0b", "x" * 256, 7, None, ["a"]],
+)
+def test_a_queue_that_names_another_folder_is_refused_and_nothing_is_run(tmp_path: Path, session: object):
+    out, recipe = tmp_path / "sessions", tmp_path / "recipe.yaml"
+    recipe.write_text(CAPTURES)
+    added = CliRunner().invoke(app, ["queue", "add", str(recipe), "--out", str(out)])
+    assert added.exit_code == 0, added.output
+    file = out / QUEUE_NAME
+    queue = json.loads(file.read_text())
+    queue["entries"][0] |= {"session": session, "state": "interrupted"}
+    file.write_text(json.dumps(queue))
+    before = sorted(tmp_path.rglob("*"))
+    for command in (["start", "--virtual-time"], ["list"]):
+        refused = CliRunner().invoke(app, ["queue", *command, "--out", str(out)], catch_exceptions=False)
+        assert refused.exit_code == 1
+        (line,) = refused.stderr.splitlines()
+        assert f"{file}: is damaged (entries.0.session: " in line
+        assert refused.stdout == ""
+    assert {path for path in tmp_path.rglob("*") if not path.name.startswith(".")} <= set(before)
