@@ -30,7 +30,7 @@ from compensation.drift.validation import evaluate, table
 from compensation.files import check_writable
 from compensation.finding.found import finder
 from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found, read_image
-from compensation.markers.table import DetectedImage, write_detections
+from compensation.markers.table import CENTRES, DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
 from compensation.report.extras import Extras
 from compensation.report.report import can_be_fitted, check_report_writable, write_report
@@ -77,6 +77,9 @@ def detect_images(
 ) -> None:
     """Find the target's markers: a CSV row per marker and image, with covariance and flags.
 
+    x_px, y_px is the centre of the marker's outline in the image; disc_x_px, disc_y_px the image of the disc's centre,
+    by the homography of the target: use it for positions in space, or where the target is tilted.
+
     Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
     """
     with one_line_errors():
@@ -92,6 +95,7 @@ def detect_images(
                     yield image
 
             write_detections(out, chosen, counted())
+        typer.echo(CENTRES)
         for failure in failures:
             typer.echo(f"not found in {one_line(failure)}", err=True)
 

@@ -1,4 +1,9 @@
-"""The table of `compensate detect`: one CSV row per marker and image, markers without a centre included."""
+"""The table of `compensate detect`: one CSV row per marker and image, markers without a centre included.
+
+Two centres of each marker, both with covariance: x_px, y_px is the centre of its outline in the image, an ellipse, and
+what follows a drift; disc_x_px, disc_y_px is the image of the disc's own centre, which lies elsewhere as soon as the
+target is tilted, and belongs to the target's coordinates in space.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +14,15 @@ from pathlib import Path
 
 from compensation.files import whole_file
 from compensation.markers.detection import Detection, Flag
+from compensation.markers.eccentricity import Float, disc_centres
 from compensation.target import Target
 
 COLUMNS = (
     "image", "time_ns", "marker", "row", "column", "x_px", "y_px", "var_x_px2", "cov_xy_px2", "var_y_px2", "flags",
+    "disc_x_px", "disc_y_px", "disc_var_x_px2", "disc_cov_xy_px2", "disc_var_y_px2",
 )  # fmt: skip
+
+CENTRES = "x_px, y_px: centres of the outlines in the image; disc_x_px, disc_y_px: images of the discs' own centres"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,12 +53,22 @@ def flags_text(flags: int) -> str:
 
 
 def _rows(image: DetectedImage, target: Target) -> Iterator[tuple[object, ...]]:
-    """The image's rows; 1e-6 px and 7 digits of the variances are far below the noise."""
+    """The image's rows."""
     found = image.detection
+    discs_px, discs_px2 = disc_centres(found, target)
     time_ns = "" if image.time_ns is None else image.time_ns
-    for number in range(1, target.count + 1):
-        (x, y), covariance = found.centres_px[number - 1], found.covariance_px2[number - 1]
-        variances = (f"{value:.6e}" for value in (covariance[0, 0], covariance[0, 1], covariance[1, 1]))
-        row, column = target.row_column(number)
-        flags = flags_text(int(found.flags[number - 1]))
-        yield image.image, time_ns, number, row, column, f"{x:.6f}", f"{y:.6f}", *variances, flags
+    for index in range(target.count):
+        row, column = target.row_column(index + 1)
+        yield (
+            *(image.image, time_ns, index + 1, row, column),
+            *_cells(found.centres_px[index], found.covariance_px2[index]),
+            flags_text(int(found.flags[index])),
+            *_cells(discs_px[index], discs_px2[index]),
+        )
+
+
+def _cells(centre_px: Float, covariance_px2: Float) -> tuple[str, ...]:
+    """1e-6 px and 7 digits of the variances are far below the noise."""
+    x, y = centre_px
+    variances = (covariance_px2[0, 0], covariance_px2[0, 1], covariance_px2[1, 1])
+    return (f"{x:.6f}", f"{y:.6f}", *(f"{value:.6e}" for value in variances))

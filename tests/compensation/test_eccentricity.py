@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.markers.detection import detect
-from compensation.markers.eccentricity import disc_centres_px, ellipse_centre_offset_px
+from compensation.markers.detection import detect, nothing_found
+from compensation.markers.eccentricity import disc_centres, disc_centres_px, ellipse_centre_offset_px
 from compensation.target import load_target
 
 from .rendered import Scene, photograph, project, render, true_centres_px
@@ -52,3 +52,27 @@ def test_the_camera_gives_the_offset_of_each_ellipse_with_distortion_too(scene):
     offset_px = ellipse_centre_offset_px(lambda points_mm: project(scene, points_mm), PAPER)
     assert rms_mpx(offset_px) > 10
     np.testing.assert_allclose(offset_px, true_centres_px(scene) - middles_px(scene), atol=2e-5)
+
+
+def test_the_discs_centres_are_as_uncertain_as_the_outlines():
+    scene, rng = TILTED[45], np.random.default_rng(5)
+    centres_px = true_centres_px(scene)
+    centres_px[7] = np.nan
+    seen = dataclasses.replace(nothing_found(PAPER), centres_px=centres_px)
+    noise_px = rng.normal(scale=0.02, size=(1000, len(centres_px), 2))  # above that of a camera
+    draws_px = np.array(
+        [disc_centres(dataclasses.replace(seen, centres_px=centres_px + each), PAPER)[0] for each in noise_px]
+    )
+    own_px = draws_px - noise_px
+    known = np.arange(len(centres_px)) != 7
+    added_px2 = draws_px.var(axis=0) - noise_px.var(axis=0)
+    assert np.abs(added_px2[known]).max() < 0.01 * 0.02**2
+    assert own_px[:, known].std(axis=0).max() < 0.1 * 0.02
+    assert np.isnan(draws_px[:, 7]).all()
+
+
+def test_an_image_without_the_target_has_no_discs_either():
+    centres_px, covariance_px2 = disc_centres(nothing_found(PAPER), PAPER)
+    assert np.isnan(centres_px).all()
+    assert np.isnan(covariance_px2).all()
+    assert (centres_px.shape, covariance_px2.shape) == ((54, 2), (54, 2, 2))

@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from compensation.markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image, read_image
+from compensation.markers.eccentricity import disc_centres
 from compensation.markers.table import COLUMNS, DetectedImage, flags_text, write_detections
 from compensation.target import OddMarker, Target, load_target
 from drivers.interface import SessionError
@@ -286,7 +287,8 @@ def test_the_table_has_a_row_per_marker_with_the_agreed_columns(tmp_path: Path):
     write_detections(tmp_path / "out.csv", PAPER, [DetectedImage("a.png", None, found), DetectedImage("7", 123, found)])
     rows = list(csv.DictReader((tmp_path / "out.csv").read_text(encoding="utf-8").splitlines()))
     assert tuple(rows[0]) == COLUMNS
-    assert ",".join(COLUMNS) == "image,time_ns,marker,row,column,x_px,y_px,var_x_px2,cov_xy_px2,var_y_px2,flags"
+    outline = "image,time_ns,marker,row,column,x_px,y_px,var_x_px2,cov_xy_px2,var_y_px2,flags"
+    assert ",".join(COLUMNS) == f"{outline},disc_x_px,disc_y_px,disc_var_x_px2,disc_cov_xy_px2,disc_var_y_px2"
     assert len(rows) == 108
     assert [rows[9][key] for key in ("image", "time_ns", "marker", "row", "column", "flags")] == [
         "a.png", "", "10", "1", "0", "OK",
@@ -294,7 +296,10 @@ def test_the_table_has_a_row_per_marker_with_the_agreed_columns(tmp_path: Path):
     assert rows[54]["time_ns"] == "123"
     assert [float(rows[9]["x_px"]), float(rows[9]["y_px"])] == pytest.approx(found.centres_px[9], abs=1e-6)
     assert float(rows[9]["cov_xy_px2"]) == pytest.approx(found.covariance_px2[9, 0, 1], rel=1e-6)
-    assert rows[53]["x_px"] == "nan"
+    discs_px, discs_px2 = disc_centres(found, PAPER)
+    assert [float(rows[9]["disc_x_px"]), float(rows[9]["disc_y_px"])] == pytest.approx(discs_px[9], abs=1e-6)
+    assert float(rows[9]["disc_var_y_px2"]) == pytest.approx(discs_px2[9, 1, 1], rel=1e-6)
+    assert rows[53]["x_px"] == rows[53]["disc_x_px"] == rows[53]["disc_var_x_px2"] == "nan"
     assert "MISSING" in rows[53]["flags"].split("|")
 
 
