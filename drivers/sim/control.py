@@ -3,7 +3,7 @@
     {"do": "advance", "now_ns": N}              -> {"now_ns": N}       virtual time moves to N
     {"do": "state"}                             -> {"now_ns": N, "air_degC": ...}   the plant's true state
     {"do": "optics"}                            -> {"centres_px": [[x, y], ...]}   noise-free marker centres
-    {"do": "fault", "name": S, "value": V}      -> {"name": S}         one of drivers.sim.laboratory.FAULTS
+    {"do": "fault", "name": S, "value": V}      -> {"name": S}         one of drivers.sim.laboratory_faults.FAULTS
     {"do": "quit"}                              -> {}                  the laboratory ends
 
 Anything wrong is answered with {"error": sentence}.
@@ -15,7 +15,8 @@ import json
 from collections.abc import Callable
 
 from drivers.sim.faults import LinkFaults
-from drivers.sim.laboratory import FAULTS, Laboratory
+from drivers.sim.laboratory import Laboratory
+from drivers.sim.laboratory_faults import FAULTS, inject
 from drivers.sim.wire import Lines, TcpWire
 
 
@@ -54,7 +55,7 @@ class Control:
             case {"do": "fault", "name": str(name), "value": value}:
                 if name not in FAULTS:
                     raise ValueError(f"no fault {name!r}; there are {', '.join(sorted(FAULTS))}")
-                self._laboratory.inject(name, value)
+                inject(self._laboratory, name, value)
                 return {"name": name}
             case _:
                 raise ValueError(f"cannot understand {request}")

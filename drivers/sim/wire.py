@@ -93,23 +93,33 @@ class TcpWire:
     def __init__(self, host: str, port: int, make_engine: Callable[[], Engine], faults: LinkFaults) -> None:
         self._make_engine = make_engine
         self._faults = faults
-        self._server = socket.create_server((host, port))
-        self.port: int = self._server.getsockname()[1]
-        self.address = f"tcp:{host}:{self.port}"
+        self._host = host
         self._connections: set[socket.socket] = set()
         self._lock = threading.Lock()
-        threading.Thread(target=self._accept, name=f"tcp {self.port}", daemon=True).start()
+        self._server = self._listening(port)
+        self.port: int = self._server.getsockname()[1]
+        self.address = f"tcp:{host}:{self.port}"
 
-    def _accept(self) -> None:
+    def plug(self) -> None:
+        """Listen again, at the same port."""
+        self.close()
+        self._server = self._listening(self.port)
+
+    def _listening(self, port: int) -> socket.socket:
+        server = socket.create_server((self._host, port))
+        threading.Thread(target=self._accept, args=(server,), name=f"tcp {port}", daemon=True).start()
+        return server
+
+    def _accept(self, server: socket.socket) -> None:
         while True:
             try:
-                connection, _ = self._server.accept()
+                connection, _ = server.accept()
             except OSError:
                 return
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with self._lock:
                 self._connections.add(connection)
-            threading.Thread(target=self._serve, args=(connection,), name=f"tcp {self.port}", daemon=True).start()
+            threading.Thread(target=self._serve, args=(connection,), name="tcp connection", daemon=True).start()
 
     def _serve(self, connection: socket.socket) -> None:
         engine = self._make_engine()
@@ -121,7 +131,7 @@ class TcpWire:
             self._connections.discard(connection)
 
     def close(self) -> None:
-        """Stop listening and drop every connection."""
+        """Stop listening and drop every connection; may be called twice."""
         with contextlib.suppress(OSError):
             self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()

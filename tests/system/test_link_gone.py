@@ -1,0 +1,159 @@
+"""The link to heater, compressor and regulator is gone while the stand is made safe: tried until they confirm, or until
+an operator, or the limit, ends that; what is not safe is the last word."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import NS_PER_S
+from drivers.interface import StandTripped
+from stand.hub import Event, Hub
+from stand.recording.session import Session
+from stand.running.run import Interrupted, run_virtual
+from stand.running.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_guard_run import LONG_SOAK, Watcher, check_safe
+from tests.system.test_run import at_step, fault
+from tests.system.test_run_ends import break_now
+from tests.system.test_unrecorded_heat import FAST, SOAK, heater_is, plant
+
+LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
+QUICK = {"timeout_s": 0.1}
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+class Cut:
+    """A run whose link is gone from its first soak on, and what is then done, on the stand's time."""
+
+    def __init__(self, order: Order) -> None:
+        self.order = order
+        self.watcher = Watcher()
+        self.tasks: list[asyncio.Task[None]] = []
+
+    def watch(self, then: Callable[[], Coroutine[None, None, None]]) -> Callable[[Hub], None]:
+        def cut() -> None:
+            break_now(self.order, "bus.unplugged", True)
+            self.tasks.append(asyncio.create_task(then()))
+
+        def follow(hub: Hub) -> None:
+            hub.subscribe(self.watcher)
+            at_step("Soak", cut)(hub)
+
+        return follow
+
+    async def trying(self, times: int) -> None:
+        """Return when it has been said so often that the stand is not safe."""
+        await self.watcher.until(lambda: len(self.said()) >= times)
+
+    def said(self) -> list[Event]:
+        return [event for event in self.watcher.events if event.data.get("unconfirmed") and "still" in event.text]
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+async def test_it_is_made_safe_when_the_link_is_back(tmp_path: Path, order: Callable[..., Order]):
+    cut = Cut(order(LONG_SOAK, bus=QUICK))
+
+    async def then() -> None:
+        interrupt()
+        await cut.trying(2)
+        break_now(cut.order, "bus.unplugged", False)
+
+    with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
+        await run_virtual(cut.order, tmp_path / "out", None, cut.watch(then))
+    await asyncio.gather(*cut.tasks)
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    check_safe(session)
+    first_s, second_s = (event.time_ns / NS_PER_S for event in cut.said())
+    assert second_s - first_s == pytest.approx(60, abs=2)
+    for device in ("relays", "regulator"):
+        assert all(f"{device} did not confirm its safe state" in event.text for event in cut.said())
+    assert "confirmed_safe" in [event.kind for event in session.events()]
+
+
+async def test_a_second_signal_a_minute_later_ends_the_wait_and_earlier_ones_do_not(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    cut = Cut(order(LONG_SOAK, bus=QUICK))
+
+    async def then() -> None:
+        interrupt()
+        await cut.watcher.wait(20)
+        interrupt()
+        await cut.trying(1)  # after a minute
+        interrupt()
+
+    with pytest.raises(Interrupted, match="stopped by the operator; NOT SAFE: re") as caught:
+        await run_virtual(cut.order, tmp_path / "out", None, cut.watch(then))
+    await asyncio.gather(*cut.tasks)
+    assert "relays did not confirm its safe state" in str(caught.value)
+    assert "regulator did not confirm its safe state" in str(caught.value)
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    begun = next(mark for mark in session.steps() if mark.kind == "Soak")
+    assert 60 <= (session.events()[-1].time_ns - begun.time_ns) / NS_PER_S < 90
+    assert len(cut.said()) == 1
+
+
+async def test_without_an_operator_the_wait_ends_at_its_limit(tmp_path: Path, order: Callable[..., Order]):
+    """The guard has found that nothing is read any more; 10 min, here 130 s."""
+    cut = Cut(order(LONG_SOAK, bus=QUICK, guard={"safe_limit_s": 130}))
+
+    async def nothing() -> None:
+        return
+
+    with pytest.raises(StandTripped, match="NOT SAFE: re"):
+        await run_virtual(cut.order, tmp_path / "out", None, cut.watch(nothing))
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    trip = next(event for event in session.events() if event.kind.startswith("guard."))
+    last_ns = max(item.time_ns for item in session.items())
+    assert 130 <= (last_ns - trip.time_ns) / NS_PER_S < 160
+    assert len(cut.said()) >= 2
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("comes_back", "ending"), [(True, "the stand is safe"), (False, "NOT SAFE: re")])
+async def test_as_a_command_in_real_time_it_ends_with_that_word_and_its_exit_code(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object], comes_back: bool, ending: str
+):
+    ordered = order(SOAK, **FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "config.yaml", "--out", tmp_path / "out"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        async with asyncio.timeout(LIMIT_S):
+            while await plant(ordered, "heater_W") == 0:
+                await asyncio.sleep(0.05)
+        await fault(ordered, "bus.unplugged", True)
+        process.send_signal(signal.SIGINT)
+        await heater_is(ordered, 0)  # by the board's own timer
+        await asyncio.sleep(5)
+        process.send_signal(signal.SIGTERM)  # too early
+        if comes_back:
+            await fault(ordered, "bus.unplugged", False)
+        else:
+            await asyncio.sleep(62)
+            assert process.poll() is None
+            process.send_signal(signal.SIGINT)
+        assert await asyncio.to_thread(process.wait, LIMIT_S) == 130
+        said = process.stderr.read()
+    finally:
+        process.kill()
+        process.wait(LIMIT_S)
+        process.stderr.close()
+    assert f"stopped by the operator; {ending}" in said.splitlines()[-1]
+    assert ("still trying: re" in said) is not comes_back
+    assert await plant(ordered, "heater_enabled") == 0
