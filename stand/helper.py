@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -84,6 +85,7 @@ class Helper:
         finally:
             for _, theirs in pairs:
                 theirs.close()
+        self._ended = ended
         self._life = pairs[0][0]
         self._lines = {name: Line(ours, ended) for name, (ours, _) in zip(lines, pairs[1:], strict=True)}
 
@@ -91,6 +93,12 @@ class Helper:
     def pid(self) -> int:
         """Of the process."""
         return self._process.pid
+
+    @property
+    def ended(self) -> str:
+        """Why there is no process any more, as a sentence; "" while there is one."""
+        status = self._process.poll()
+        return "" if status is None else f"{self._ended} ({_how(status)})"
 
     def line(self, name: str) -> Line:
         """The line of that name."""
@@ -108,3 +116,7 @@ class Helper:
             self._process.returncode = 0  # nobody waits for it any more, and Python need not warn of that
             return False
         return True
+
+
+def _how(status: int) -> str:
+    return f"killed by {signal.Signals(-status).name}" if status < 0 else f"status {status}"

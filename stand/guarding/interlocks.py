@@ -262,6 +262,11 @@ class Recording(Protocol):
         """Why the session's folder is not there any more; "" while it is."""
         ...
 
+    @property
+    def writer_ended(self) -> str:
+        """Why the process that writes the session is not there any more; "" while it is."""
+        ...
+
 
 def not_recorded(recording: Recording, durable_within_s: float) -> Rule:
     """Readings, frames or events are not on the disk in time: nobody will know what the heat was for."""
@@ -282,5 +287,15 @@ def folder_lost(recording: Recording) -> Rule:
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         return Fault("folder_lost", recording.folder_lost) if recording.folder_lost else None
+
+    return rule
+
+
+def recording_ended(recording: Recording) -> Rule:
+    """Nothing will be recorded any more in this run: somebody has killed the process that writes the session."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        ended = recording.writer_ended
+        return Fault("recording_ended", f"{ended}; nothing is recorded any more") if ended else None
 
     return rule

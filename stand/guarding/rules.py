@@ -22,6 +22,7 @@ from stand.guarding.interlocks import (
     over_temperature,
     paused,
     permit_missing,
+    recording_ended,
     reported_fault,
     stage_alarm,
     stopped_while_permitted,
@@ -187,8 +188,9 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
 
 def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
     """Heat only while it is recorded. A disk that hangs or refuses may work again by itself; a folder that somebody has
-    moved does not come back by itself."""
+    moved does not come back by itself. A run whose writer was killed has ended: `stand resume` goes on with it."""
     return (
+        Watch(recording_ended(recording)),
         Watch(folder_lost(recording), action="hold"),
         Watch(not_recorded(recording, config.recording.durable_within_s), action="hold", ends_itself=True),
     )

@@ -116,6 +116,11 @@ class Recorder:
         return self._homes.lost
 
     @property
+    def writer_ended(self) -> str:
+        """Why the process that touches the disk is not there any more, as a sentence; "" while nothing is wrong."""
+        return "" if self.disk is None else self.disk.ended
+
+    @property
     def disk_free_bytes(self) -> int:
         """As it was found at the last commit; nobody waits for the disk."""
         return self._space.free_bytes

@@ -148,9 +148,10 @@ def test_a_disk_process_that_was_killed_is_a_refusal_and_the_daemon_says_so(tmp_
         daemon.until(lambda frames, messages, age_s, lost: frames >= 10)
         os.kill(daemon.disk_pid, signal.SIGKILL)
         daemon.until(lambda frames, messages, age_s, lost: age_s > 0.5)
-        code, said, _, _ = daemon.end(signal.SIGTERM)
+        code, said, frames, _ = daemon.end(signal.SIGTERM)
         assert code == 3
         assert "the process that writes the session to the disk has ended" in said
+        check(tmp_path / "s", frames)
 
 
 def test_a_folder_that_was_renamed_under_a_daemon_is_seen_within_a_commit(tmp_path):

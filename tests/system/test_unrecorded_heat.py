@@ -14,8 +14,11 @@ from pathlib import Path
 import pytest
 
 from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import StandError
+from drivers.interface import StandError, StandTripped
+from stand.recording.disk_process import MODULE
+from stand.recording.salvage import salvage_session
 from stand.recording.session import Session
+from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_real
 from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
@@ -151,6 +154,33 @@ async def test_a_stop_while_the_disk_hangs_makes_safe_and_leaves(
             run("fsfreeze", "-u", disk)
     assert (safe_ns - begun_ns) / NS_PER_S < 10.0
     assert (left_ns - safe_ns) / NS_PER_S < 15.0  # 5 s where nothing else keeps the machine busy
+
+
+def disk_process() -> int:
+    """The id of the process that writes the session for this one."""
+    children = [pid for task in Path("/proc/self/task").iterdir() for pid in (task / "children").read_text().split()]
+    commands = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0") for pid in children}
+    (pid,) = [int(pid) for pid, command in commands.items() if MODULE in command]
+    return pid
+
+
+async def test_a_run_whose_disk_process_was_killed_ends_safe_with_all_that_was_acknowledged(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    ordered = order(SOAK, **FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    async with heating(ordered, tmp_path / "out") as (task, watcher):
+        os.kill(disk_process(), signal.SIGKILL)
+        with pytest.raises(StandTripped, match=r"writes the session to the disk has ended.*; the stand is safe"):
+            await asyncio.wait_for(task, LIMIT_S)
+        await heater_is(ordered, 0)
+        assert [event.data["action"] for event in watcher.events if event.kind == "guard.recording_ended"] == ["abort"]
+    (directory,) = (tmp_path / "out").glob("2*")
+    assert salvage_session(directory)
+    assert "run.start" in [event.kind for event in Session.open(directory).events()]
+    before = interruption(directory)
+    before.release()
+    assert before.progress.done or before.progress.earned_s
 
 
 @pytest.mark.parametrize("how", ["removed", pytest.param("renamed", marks=pytest.mark.nightly)])
