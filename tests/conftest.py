@@ -18,10 +18,11 @@ _TOGETHER = {"tests/system/test_camera_wire.py", "tests/system/test_kill_recordi
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Ctrl-C is for the programs that the tests start, too when the tests themselves run in the background of a shell,
-    which has them ignore it and pass that on."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Ctrl-C and a closed terminal are for the programs that the tests start, too when the tests themselves run in the
+    background of a shell or under nohup, which have them ignore these signals and pass that on."""
+    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, usual)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -55,5 +56,23 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     class Units(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             return _unit(nodeid)
+
+        def remove_node(self, node: Any) -> str | None:
+            """A test whose worker died has failed; xdist would run it again until no worker is left."""
+            waiting = [test for unit in self.assigned_work[node].values() for test, done in unit.items() if not done]
+            for unit in self.assigned_work[node].values():
+                if waiting and waiting[0] in unit:
+                    unit[waiting[0]] = True
+            super().remove_node(node)
+            return waiting[0] if waiting else None
+
+        def _reschedule(self, node: Any) -> None:
+            """A worker begins a test when it knows the one after it, or that there is none: the successor of a dead
+            worker, to which xdist gives one unit, would wait for ever."""
+            super()._reschedule(node)
+            while self.workqueue and not node.shutting_down and self._pending_of(self.assigned_work[node]) < 2:
+                self._assign_work_unit(node)
+            if not self.workqueue and not node.shutting_down and self._pending_of(self.assigned_work[node]) < 2:
+                node.shutdown()
 
     return Units(config, log)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from compensation.target import Target
-from drivers.clock import NS_PER_S, Clock, boot_of, utc_offset_ns
+from drivers.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
 from drivers.documents import parse_document
 from drivers.interface import SessionError, StandTripped
 from stand.assembly import Assembly
@@ -37,9 +37,12 @@ from stand.running.session_setup import Order
 from stand.running.settling_watch import SettlingWatch
 from stand.running.stop import OPERATOR, Stop
 from stand.running.tasks import cancelled, cause_of, failure_text, watched
+from stand.running.virtual_hold import end_endless_holds
 
 # The recorder's events that hold a run, and those that let it go on.
 _HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
+# A run in virtual time that is held for so many times the longest pause ends.
+_VIRTUAL_PAUSES = 2
 _RELEASING = {"frames_resumed": DISK_LOW, "telemetry_saved_again": NOT_RECORDED}
 
 
@@ -75,6 +78,9 @@ async def perform(work: Performance) -> None:
         watchers.append(asyncio.create_task(guard.run()))
         watchers.append(asyncio.create_task(assembly.stand.keeper.run()))
         watchers.append(asyncio.create_task(keep_shut_in_holds(assembly.stand, assembly.hub, assembly.clock)))
+        if isinstance(assembly.clock, VirtualClock):
+            limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
+            watchers.append(asyncio.create_task(end_endless_holds(assembly.stand.gate, assembly.clock, limit_h)))
         stop.started()
         await watched(scheduler.run(work.order.recipe.plan()), [*work.background, *watchers])
         ended = Ended(0, "complete", "complete")

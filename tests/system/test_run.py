@@ -9,14 +9,14 @@ import pickle
 import resource
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drivers.clock import seconds_ns
-from drivers.interface import ConfigError, SessionError, StandTripped, Unreachable
+from drivers.interface import ConfigError, SessionError, StandError, StandTripped, Unreachable
 from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
 from stand.recording.session import Session
 from stand.running.run import Interrupted, run_virtual
@@ -248,21 +248,59 @@ async def test_a_compressor_that_dropped_by_itself_rests_before_it_starts_again(
     assert min(rests_s) >= 270  # min_off_s 300, seen by a poll every 10 s after a drop during the silence
 
 
-async def test_frames_the_disk_refuses_are_counted_and_end_the_run_with_a_sentence(
+def refusing_from_the_first_capture(until: Callable[[Item], bool]) -> Callable[[Hub], None]:
+    """The kernel refuses files beyond 1 MB from then on, as a full disk would; telemetry still fits."""
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+
+    def watch(hub: Hub) -> None:
+        def lift(item: Item) -> None:
+            if until(item):
+                resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+        at_step("Capture", lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard)))(hub)
+        hub.subscribe(lift)
+
+    return watch
+
+
+@pytest.fixture
+def _file_size_restored() -> Iterator[None]:
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+
+@pytest.mark.usefixtures("_file_size_restored")
+async def test_frames_the_disk_refuses_are_counted_and_hold_the_run_until_it_takes_frames_again(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    """The kernel refuses files beyond 1 MB from the first capture on, as a full disk would; telemetry still fits."""
-    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    watch = at_step("Capture", lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard)))
-    try:
-        with pytest.raises(SessionError, match="complete, but 5 frames were lost"):
-            await run_virtual(order(), tmp_path / "out", None, watch)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    watch = refusing_from_the_first_capture(
+        until=lambda item: isinstance(item, Event) and item.kind == "guard.not_recorded"
+    )
+    with pytest.raises(SessionError, match="complete, but 2 frames were lost"):
+        await run_virtual(order(), tmp_path / "out", None, watch)
+    session = Session.open(next((tmp_path / "out").iterdir()))
+    assert session.frame_count == 3
+    kinds = [event.kind for event in session.events()]
+    assert [kind for kind in kinds if kind in ("frames_dropped", "guard.not_recorded", "hold_ended", "run.end")] == [
+        "frames_dropped",
+        "guard.not_recorded",
+        "hold_ended",
+        "run.end",
+    ]
+
+
+@pytest.mark.usefixtures("_file_size_restored")
+async def test_a_virtual_run_whose_disk_never_takes_frames_ends_with_a_sentence(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    watch = refusing_from_the_first_capture(until=lambda item: False)
+    with pytest.raises(StandError, match=r"held for 1 h of virtual time .*, and nobody let it go on"):
+        await run_virtual(order(guard={"pause_limit_h": 0.5}), tmp_path / "out", None, watch)
     session = Session.open(next((tmp_path / "out").iterdir()))
     assert session.frame_count == 0
-    assert [event.text for event in session.events() if event.kind == "run.end"] == ["complete"]
-    assert any("5 in all" in event.text for event in session.events() if event.kind == "frames_dropped")
+    assert next(event.text for event in session.events() if event.kind == "run.end").startswith("failed: held for 1 h")
+    assert any("2 in all" in event.text for event in session.events() if event.kind == "frames_dropped")
 
 
 async def test_a_second_laboratory_at_the_same_addresses_is_refused_with_a_reason(

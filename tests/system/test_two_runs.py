@@ -85,14 +85,16 @@ async def test_a_second_run_touches_nothing_until_the_first_has_ended(
     async with Laboratory(tmp_path / "config.yaml") as laboratory:
         first = stand(*run, out)
         await until(lambda: bool(running_sessions(out)), first)
-        while not await laboratory.heater_is_on():
-            assert first.poll() is None
-            await asyncio.sleep(0.02)
+        async with asyncio.timeout(LIMIT_S):
+            while not await laboratory.heater_is_on():
+                assert first.poll() is None
+                await asyncio.sleep(0.02)
         (session,) = out.iterdir()
         laboratory.heater_was_on.clear()
         second = stand(*run, other)
-        while second.poll() is None:
-            await laboratory.heater_is_on()
+        async with asyncio.timeout(LIMIT_S):
+            while second.poll() is None:
+                await laboratory.heater_is_on()
         assert second.returncode == 1
         said = second.communicate()[1]
         in_use = rf"error: [a-z]+: [^\n]* is in use by session {session} \(pid {first.pid}\); nothing was touched\n"
