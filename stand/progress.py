@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from typing import Protocol
 
@@ -16,6 +16,7 @@ from drivers.clock import NS_PER_S, WallClock
 
 # Plain output: a line each time this share of the work is done, so that a log stays readable.
 _PLAIN_STEP = 0.1
+_LATE_NS = 3 * NS_PER_S
 
 
 class Report(Protocol):
@@ -34,6 +35,32 @@ def progress(title: str, total: float) -> Generator[Report]:
             yield report
     else:
         yield _PlainLines(title, total)
+
+
+@contextmanager
+def late_progress(title: str, total: float) -> Generator[Report]:
+    """As `progress`, from the moment on when the work has taken long enough for somebody to wait."""
+    with ExitStack() as stack:
+        yield _Late(title, total, stack)
+
+
+class _Late:
+    def __init__(self, title: str, total: float, stack: ExitStack) -> None:
+        self._title = title
+        self._total = total
+        self._stack = stack
+        self._plain = _PlainLines(title, total, first=0.0)
+        self._clock = WallClock()
+        self._start_ns = self._clock.now_ns()
+        self._report: Report | None = None
+
+    def __call__(self, done: float, text: str) -> None:
+        if self._report is None:
+            if self._clock.now_ns() - self._start_ns < _LATE_NS:
+                return
+            is_seen = sys.stderr.isatty()
+            self._report = self._stack.enter_context(_bar(self._title, self._total)) if is_seen else self._plain
+        self._report(done, text)
 
 
 @contextmanager
@@ -72,10 +99,12 @@ def _left_text(elapsed_s: float, share: float) -> str:
 
 
 class _PlainLines:
-    def __init__(self, title: str, total: float) -> None:
+    """A line at the share `first`, and each time another tenth is done."""
+
+    def __init__(self, title: str, total: float, first: float = _PLAIN_STEP) -> None:
         self._title = title
         self._total = max(total, 1e-9)
-        self._next = _PLAIN_STEP
+        self._next = first
         self._clock = WallClock()
         self._start_ns = self._clock.now_ns()
 

@@ -31,7 +31,7 @@ from stand.commandline.session_text import (
 )
 from stand.exit_codes import FAILED, one_line_errors
 from stand.hub import Event, Hub, Item, StepMark
-from stand.progress import Report, progress
+from stand.progress import Report, late_progress, progress
 from stand.recording.export import export
 from stand.recording.instants import parse_instant
 from stand.recording.inventory import State, inventory
@@ -55,8 +55,6 @@ app = typer.Typer(
 SessionArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a recorded session.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to make; it must not exist.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
-
-_SHOWN_FROM_BYTES = 100_000_000  # reading less is done before a bar can be looked at
 
 
 @app.command("list")
@@ -156,7 +154,7 @@ def verify_session(directory: SessionArgument, as_json: JsonOption = False) -> N
     with one_line_errors():
         files = inventory(_session_in(directory))
         total_bytes = sum(file.size_bytes for file in files if file.state is State.FINISHED)
-        with _progress_of("verify", total_bytes, total_bytes) as report:
+        with late_progress("verify", total_bytes) as report:
             found = verify(directory, report)
         if as_json:
             typer.echo(json.dumps(verify_json(found), indent=2))
@@ -167,14 +165,9 @@ def verify_session(directory: SessionArgument, as_json: JsonOption = False) -> N
             raise typer.Exit(FAILED)
 
 
-@contextmanager
-def _progress_of(title: str, total: float, size_bytes: float) -> Generator[Report]:
-    """Progress of work on so many bytes, shown when it takes long enough to be looked at."""
-    if size_bytes < _SHOWN_FROM_BYTES:
-        yield lambda done, text: None
-        return
-    with progress(title, total) as report:
-        yield report
+def _part_of(report: Report, done_bytes: int, size_bytes: int) -> Callable[[float, str], None]:
+    """Takes the share that is done of one session of that size, behind those before it."""
+    return lambda share, text: report(done_bytes + share * size_bytes, one_line(text))
 
 
 @app.command()
@@ -190,13 +183,12 @@ def salvage(
         sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
         done: list[Salvaged] = []
         done_bytes = 0
-        with _progress_of("salvage", sum(sizes.values()), sum(sizes.values())) as report:
+        with late_progress("salvage", sum(sizes.values())) as report:
             for path, size_bytes in sizes.items():
-                for salvaged in salvage_session(path):
+                for salvaged in salvage_session(path, _part_of(report, done_bytes, size_bytes)):
                     typer.echo(one_line(salvage_line(salvaged)))
                     done.append(salvaged)
                 done_bytes += size_bytes
-                report(done_bytes, one_line(path.name))
         if not done:
             typer.echo("nothing to salvage")
         if any(salvaged.kept for salvaged in done):
@@ -289,8 +281,7 @@ def export_session(
     """
     with one_line_errors():
         _check_new(out, directory)
-        size_bytes = glance(_session_in(directory)).size_bytes
-        with _session_to_use(directory) as session, _progress_of("export", 1.0, size_bytes) as report:
+        with _session_to_use(directory) as session, late_progress("export", 1.0) as report:
             tables = table_format if telemetry else None
             export(session, out, frames=frames, telemetry=tables, report=report)
         typer.echo(out)

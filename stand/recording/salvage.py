@@ -12,7 +12,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -39,6 +39,7 @@ from stand.recording.layout import (
 from stand.recording.locks import lock
 from stand.recording.opening import Opening, opening_of, segments_of
 from stand.recording.segment_check import check_segment
+from stand.recording.share_done import ReportShare, ShareDone, no_report
 from stand.recording.sink import sync_folder
 from stand.recording.walk import StoredMessage, Survey, stored_messages, survey
 from stand.recording.wire import Source
@@ -65,28 +66,35 @@ class Salvaged:
     kept: Path | None
 
 
-def salvage_session(directory: Path) -> list[Salvaged]:
+def salvage_session(directory: Path, report: ReportShare = no_report) -> list[Salvaged]:
     """Finish every unfinished segment and every finished one that is damaged. SessionError when there is no session,
     or when the disk refuses: then the segment at hand is as it was and those before it are salvaged."""
     folders = [directory / series for series in (TELEMETRY, FRAMES) if (directory / series).is_dir()]
     if not folders:
         raise SessionError(f"{directory}: not a session: it has neither {TELEMETRY} nor {FRAMES}")
-    return [done for folder in folders for done in _salvage_folder(folder, finished_too=True)]
+    return _salvage_folders(folders, True, report)
 
 
-def salvage_unfinished(root: Path) -> list[Salvaged]:
+def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salvaged]:
     """Finish the unfinished segments of every session below `root`, without a look at the finished ones. SessionError
     as above."""
     left = {path.parent for pattern in (UNFINISHED, TEMPORARY) for path in root.glob(f"*/*/*{pattern}")}
     folders = [folder for folder in sorted(left, reverse=True) if folder.name in COMPRESSION]  # telemetry is first
-    return [done for folder in folders for done in _salvage_folder(folder, finished_too=False)]
+    return _salvage_folders(folders, False, report)
 
 
-def _salvage_folder(folder: Path, finished_too: bool) -> Iterator[Salvaged]:
+def _salvage_folders(folders: Iterable[Path], finished_too: bool, report: ReportShare) -> list[Salvaged]:
+    found = [(folder, segments_of(folder)) for folder in folders]
+    wanted = [path for _, paths in found for path in paths if finished_too or path.name.endswith(UNFINISHED)]
+    share = ShareDone(wanted, report)
+    return [done for folder, _ in found for done in _salvage_folder(folder, finished_too, share)]
+
+
+def _salvage_folder(folder: Path, finished_too: bool, share: ShareDone) -> Iterator[Salvaged]:
     for copy in folder.glob(f"*{TEMPORARY}"):
         _remove_left_over(copy)
     for number in sorted({int(path.name.partition(".")[0]) for path in segments_of(folder)}):
-        yield from _salvage_number(folder / f"{number:04d}{FINISHED}", finished_too)
+        yield from _salvage_number(folder / f"{number:04d}{FINISHED}", finished_too, share)
 
 
 def _remove_left_over(copy: Path) -> None:
@@ -96,19 +104,21 @@ def _remove_left_over(copy: Path) -> None:
             copy.unlink()
 
 
-def _salvage_number(finished: Path, finished_too: bool) -> Iterator[Salvaged]:
+def _salvage_number(finished: Path, finished_too: bool, share: ShareDone) -> Iterator[Salvaged]:
     """The finished segment of a number first: the unfinished one beside it is compared with what it holds."""
     part = finished.with_name(finished.name.replace(FINISHED, UNFINISHED))
     has_part = part.is_file()
-    if finished.is_file() and (finished_too or has_part) and not _is_sound(finished):
-        yield _salvage_segment(finished)
+    if finished.is_file() and (finished_too or has_part) and not _is_sound(finished, share):
+        yield _salvage_segment(finished, share)
+    share.finished(finished)
     if has_part:
-        yield _salvage_segment(part)
+        yield _salvage_segment(part, share)
+        share.finished(part)
 
 
-def _is_sound(path: Path) -> bool:
+def _is_sound(path: Path, share: ShareDone) -> bool:
     """Whether every byte of a finished segment is as it was written."""
-    return not check_segment(path, lambda message: None, lambda read_bytes: None).damages
+    return not check_segment(path, lambda message: None, share.within(path)).damages
 
 
 @contextmanager
@@ -175,14 +185,14 @@ class _Original:
         return self.path != self.finished and not self.found.damages and not self.unknown
 
 
-def _salvage_segment(path: Path) -> Salvaged:
+def _salvage_segment(path: Path, share: ShareDone) -> Salvaged:
     """One segment; SessionError when the disk refuses."""
     finished = path.with_name(f"{path.name.partition('.')[0]}{FINISHED}")
     with _refusing(path), _locked(path) as fd:
         if fd is None:
             return Salvaged(path, None, 0, 0, BEING_RECORDED, None)
         source = Source(fd)
-        found = survey(source)
+        found = survey(source, report=share.within(path))
         original = _Original(path, finished, source, found, opening_of(path, found))
         if path != finished and finished.exists():
             return _salvage_beside(original)

@@ -81,7 +81,7 @@ def _last_written(source: Source, begin: int) -> int:
     end = source.size
     while end > begin:
         window = max(begin, end - _WINDOW_BYTES)
-        if data := source.read(window, end - window).rstrip(b"\0"):
+        if source.next_data(window) < end and (data := source.read(window, end - window).rstrip(b"\0")):
             return window + len(data)
         end = window
     return begin

@@ -13,7 +13,7 @@ import errno
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from stand.recording.damage import DAMAGE
+from stand.recording.doubt import Doubt
 from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
 from stand.recording.proof import Contents, claim_of, proven
 from stand.recording.summary import read_summary
@@ -94,9 +95,13 @@ class Survey:
         return sum(gap.end - gap.begin for gap in self.damages)
 
 
-def survey(source: Source, to_first_chunk: bool = False) -> Survey:
-    """Walk through the file, or only until its first sound chunk."""
-    walk = _Walk(source)
+def _no_report(read_bytes: int) -> None:
+    """Nobody watches."""
+
+
+def survey(source: Source, to_first_chunk: bool = False, report: Callable[[int], None] = _no_report) -> Survey:
+    """Walk through the file, or only until its first sound chunk; `report` gets the number of bytes read so far."""
+    walk = _Walk(source, report)
     walk.run(to_first_chunk)
     return walk.found
 
@@ -124,9 +129,11 @@ class _Proven(NamedTuple):
 class _Walk:
     """The walk through one file."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, report: Callable[[int], None]) -> None:
         self.found = Survey()
         self._source = source
+        self._report = report
+        self._doubt = Doubt(source)
         self._blocks = Blocks()
         self._index_begin: int | None = None
         self._sound_attachments: dict[str, Attachment] = {}  # those before the first damage
@@ -142,6 +149,7 @@ class _Walk:
                     break
             self._take(record)
             offset = record.end
+            self._report(offset)
             if self._index_begin == offset and self._take_index(offset):
                 break
         if not self.found.chunks:
@@ -156,13 +164,17 @@ class _Walk:
         claim = claim_of(head)
         if claim is None or offset + RECORD.size + claim.length > self._source.size:
             return None
+        cost_bytes = 0
         try:
-            if claim.opcode == Opcode.CHUNK:  # before its bytes are read: a false one may claim very many
-                chunk_head(head[RECORD.size :], claim.length)
+            chunk = chunk_head(head[RECORD.size :], claim.length) if claim.opcode == Opcode.CHUNK else None
+            if not self._doubt.can_be_true(offset, claim, chunk):
+                return None
+            cost_bytes = max(claim.length, chunk.size_bytes if chunk else 0)
             content = proven(claim.opcode, self._source.read(offset + RECORD.size, claim.length))
         except DAMAGE as error:
             if isinstance(error, OSError):
                 raise
+            self._doubt.note_false(cost_bytes)
             return None
         return _Proven(offset, offset + RECORD.size + claim.length, content)
 
@@ -174,11 +186,14 @@ class _Walk:
 
     def _candidates(self, begin: int, pattern: re.Pattern[bytes]) -> Iterator[int]:
         """Places from `begin` on that look like the head of a record."""
-        for window in range(begin, self._source.size, WINDOW_BYTES):
+        window = begin
+        while (window := self._source.next_data(window)) < self._source.size:
+            self._report(window)
             data = self._source.read(window, WINDOW_BYTES + _HEAD_BYTES)
             for match in pattern.finditer(data):
                 if match.start() < WINDOW_BYTES:
                     yield window + match.start()
+            window += WINDOW_BYTES
 
     def _note_gap(self, gap: Gap) -> None:
         if gap.begin == self._index_begin and gap.end == self._source.size:

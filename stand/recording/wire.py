@@ -5,6 +5,7 @@ Reader, salvage and verification all read through here, so that what one of them
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import struct
@@ -41,6 +42,16 @@ class Source:
     def read(self, offset: int, length: int) -> bytes:
         """The bytes there, fewer at the end of the file; raises OSError."""
         return os.pread(self._fd, length, offset)
+
+    def next_data(self, offset: int) -> int:
+        """The first place from `offset` on that is not in a hole of a sparse file, which reads as zeros; the size when
+        there is none."""
+        if offset >= self.size:
+            return self.size
+        try:
+            return min(self.size, os.lseek(self._fd, offset, os.SEEK_DATA))
+        except OSError as error:
+            return self.size if error.errno == errno.ENXIO else offset  # a disk that knows of no holes has none
 
     def file(self) -> BinaryIO:
         """The same file for those who seek in it; it stays open when that is closed."""

@@ -18,6 +18,7 @@ from experiments.steps import Capture, PlannedStep
 from stand.config import StandConfig
 from stand.hub import StepState
 from stand.order_files import parse_order
+from stand.progress import late_progress
 from stand.recipe import Recipe
 from stand.recording.overview import glance
 from stand.recording.salvage import Salvaged, salvage_unfinished
@@ -106,7 +107,8 @@ def _interruption(
     tripped = _tripped(entries)
     if tripped and not clear:
         raise SessionError(f"{directory}: the stand tripped: {tripped}; look into it, then resume with --clear")
-    salvaged = tuple(salvage_unfinished(directory.resolve().parent))
+    with late_progress("salvage", 1.0) as report:
+        salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
     order = _order(session, first)
     info = _info(session.metadata)

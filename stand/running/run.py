@@ -16,6 +16,7 @@ from stand.commandline.session_text import salvage_line
 from stand.guarding.safe_ranges import accepted_text
 from stand.hub import Event, Hub, Item
 from stand.one_cpu import one_cpu
+from stand.progress import late_progress
 from stand.recording.disk import FILES_LINE, Disk
 from stand.recording.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from stand.recording.salvage import Salvaged, salvage_unfinished
@@ -49,7 +50,8 @@ class _Job:
         """What earlier runs that were killed have left unfinished, finished before anything moves."""
         if self.before is not None:
             return self.before.salvaged
-        return tuple(await asyncio.to_thread(salvage_unfinished, self.out))
+        with late_progress("salvage", 1.0) as report:
+            return tuple(await asyncio.to_thread(salvage_unfinished, self.out, report))
 
     def directory(self, clock: Clock) -> Path:
         """The session's folder."""
