@@ -18,6 +18,7 @@ from compensation.command_line import one_line_errors
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.history import recorded_history, states_at
 from compensation.drift.model_file import load_model
+from compensation.drift.paper_model import PaperModel
 from compensation.drift.states import States
 from compensation.files import check_writable, whole_file
 from compensation.markers.detection import read_image
@@ -69,6 +70,7 @@ def apply_model(
                 raise ConfigError(f"{source}: give the camera's temperature with --camera-degC")
             check_writable(out)
             image = read_image(source)
+            used = _without_history(used)
             states = States.at_degC(camera_degC, 1, used.memory)
             write_image(out, corrected_image(image, used, states), form, image.dtype)
             _warn(middle_flags(used, states))
@@ -101,10 +103,10 @@ def _correct_points(
     if session is not None:
         _refuse(("--camera-degC", camera_degC), why="the session tells it")
         states = _recorded_states(model, Session.open(session), times(source, rows))
-    elif camera_degC is not None:
-        states = States.at_degC(camera_degC, len(rows), model.memory)
-    elif rows and CAMERA in rows[0]:
-        states = States.at_degC(numbers(source, rows, CAMERA), len(rows), model.memory)
+    elif camera_degC is not None or (rows and CAMERA in rows[0]):
+        model = _without_history(model)
+        degC = numbers(source, rows, CAMERA) if camera_degC is None else camera_degC
+        states = States.at_degC(degC, len(rows), model.memory)
     else:
         raise ConfigError(f"{source}: has no column {CAMERA}; give --session, or --camera-degC")
     _check_known(model, xy_px, states)
@@ -112,6 +114,24 @@ def _correct_points(
     outside = int((model.flags(xy_px, states) != 0).sum())
     if outside:
         typer.echo(f"warning: {outside} of {len(rows)} points are outside the model's valid range", err=True)
+
+
+def _without_history(model: DriftModel) -> DriftModel:
+    """The form of the model that needs the camera's temperature only, which is said when it is not the one in use;
+    ConfigError when the file has none."""
+    if isinstance(model, PaperModel):
+        return model
+    if not isinstance(model.other, PaperModel):
+        raise ConfigError(
+            f"a model of the form {model.form} needs the thermal state, which nothing here tells; give --session"
+        )
+    left, usual = (" and ".join(f"{px:.3f}" for px in one.discrepancy_px) for one in (model.other, model))
+    typer.echo(
+        f"the camera's temperature alone: corrected with the paper's form of the model ({model.other.title}), which "
+        f"leaves {left} px along x and y; with the history of a session (--session) the thermal form leaves {usual} px",
+        err=True,
+    )
+    return model.other
 
 
 def _recorded_states(model: DriftModel, session: Session, time_ns: Sequence[int]) -> States:

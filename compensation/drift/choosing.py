@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from drivers.interface import SessionError
 
 Form = Literal["paper", "thermal"]
 FORMS: tuple[Form, ...] = ("paper", "thermal")
+Fitted = TypeVar("Fitted")
 
 
 def fit(observations: Observations, degree: int | None = None, form: Form | None = None) -> DriftModel:
@@ -25,19 +27,27 @@ def fit(observations: Observations, degree: int | None = None, form: Form | None
 
     form: None takes the paper's unless the thermal one is better by more than one standard error at temperatures left
     out; sessions without the telemetry that the thermal form needs have the paper's. degree: of the paper's form, which
-    it implies. SessionError when the sessions cannot support what was asked for, or a degree was given for thermal.
+    it implies. The model has the form that was not taken as `other`, where the sessions support it. SessionError when
+    they cannot support what was asked for, or a degree was given for thermal.
     """
     check_request(degree, form)
     if form == "thermal":
         _check_histories(observations)
-        return fit_thermal(observations)
+        thermal = fit_thermal(observations)
+        return replace(thermal, other=_or_none(lambda: fit_paper(observations)))
     paper = fit_paper(observations, degree)
-    if form == "paper" or degree is not None or not _has_histories(observations):
-        return paper
+    # When it was not asked for, what the paper's form lacks stands in the report.
+    thermal = _or_none(lambda: fit_thermal(observations)) if _has_histories(observations) else None
+    if thermal is None or form == "paper" or degree is not None:
+        return replace(paper, other=thermal)
+    return _better(paper, thermal)
+
+
+def _or_none(fitted: Callable[[], Fitted]) -> Fitted | None:
     try:
-        return _better(paper, fit_thermal(observations))
+        return fitted()
     except SessionError:
-        return paper  # it was not asked for, and what the paper's form lacks stands in the report
+        return None
 
 
 def check_request(degree: int | None, form: Form | None) -> None:
@@ -54,7 +64,9 @@ def _better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
     is_thermal = _comparable(*in_use) and 0 not in as_good_as_best([one.fold_squares for one in in_use])
     form = "thermal" if is_thermal else "paper"
     rows = tuple(one.model_copy(update={"chosen": one.chosen and one.form == form}) for one in both)
-    return replace(thermal, candidates=rows) if is_thermal else replace(paper, candidates=rows)
+    if is_thermal:
+        return replace(thermal, candidates=rows, other=paper)
+    return replace(paper, candidates=rows, other=thermal)
 
 
 def _comparable(one: Candidate, other: Candidate) -> bool:

@@ -42,6 +42,11 @@ class DriftModel(Protocol):
         ...
 
     @property
+    def other(self) -> DriftModel | None:
+        """The other form, fitted to the same frames; None when they could not support it."""
+        ...
+
+    @property
     def title(self) -> str:
         """The form in words."""
         ...

@@ -1,8 +1,12 @@
-"""Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null."""
+"""Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null.
+
+A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,7 +26,7 @@ from drivers.documents import Document
 from drivers.interface import SessionError
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 Positive = Annotated[int, Field(gt=0)]
 Rows = tuple[tuple[float, ...], ...]
@@ -32,7 +36,7 @@ class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Literal[2] = SCHEMA_VERSION
+    schema_version: Literal[2, 3] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]
@@ -56,6 +60,7 @@ class PaperFile(_File):
     coefficients_px: tuple[tuple[float, ...], tuple[float, ...]]
     coefficient_covariance_px2: tuple[Rows, Rows]
     scores: tuple[DegreeScore, ...]
+    other: ThermalFile | None = None
 
 
 class TermFile(Document):
@@ -79,6 +84,7 @@ class ThermalFile(_File):
     ambient_range_degC: Pair
     rate_range_K_per_h: Pair
     least_on_s: float | None
+    other: PaperFile | None = None
 
 
 _ANY: TypeAdapter[PaperFile | ThermalFile] = TypeAdapter(
@@ -95,7 +101,7 @@ def load_model(path: Path) -> DriftModel:
     """The model in a file that `save_model` wrote, number for number; SessionError when it is anything else."""
     try:
         file = _ANY.validate_json(path.read_text(encoding="utf-8"), strict=True)
-        return _paper(file) if isinstance(file, PaperFile) else _thermal(file)
+        return _model(file)
     except (OSError, UnicodeDecodeError) as error:
         raise SessionError(f"{path}: cannot be read ({error})") from error
     except ValidationError as error:
@@ -104,6 +110,20 @@ def load_model(path: Path) -> DriftModel:
         raise SessionError(f"{path}: not a drift model of this program ({where}: {fault['msg']})") from error
     except ValueError as error:
         raise SessionError(f"{path}: not a drift model of this program ({error})") from error
+
+
+def _model(file: PaperFile | ThermalFile) -> DriftModel:
+    """With its other form; ValueError when its parts, or the two, do not fit together."""
+    model = _paper(file) if isinstance(file, PaperFile) else _thermal(file)
+    if file.other is None:
+        return model
+    other = _model(file.other)
+    if other.other is not None:
+        raise ValueError("other: has another form itself")
+    for name in ("camera_serial", "session_ids", "target_name", "image_size"):
+        if getattr(other, name) != getattr(model, name):
+            raise ValueError(f"other: its {name} is {getattr(other, name)}, not {getattr(model, name)}")
+    return replace(model, other=other)
 
 
 def _document(model: DriftModel) -> PaperFile | ThermalFile:
@@ -120,6 +140,7 @@ def _document(model: DriftModel) -> PaperFile | ThermalFile:
         "hull_px": model.hull_px.tolist(),
         "discrepancy_px": model.discrepancy_px.tolist(),
         "candidates": model.candidates,
+        "other": None if model.other is None else _document(model.other),
     }
     match model:
         case PaperModel():

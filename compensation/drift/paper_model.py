@@ -14,7 +14,16 @@ import numpy as np
 from pydantic import Field
 
 from compensation.drift.candidates import Candidate
-from compensation.drift.drift_model import Flags, Mask, Outside, Situation, place_flags, range_flags, states_of
+from compensation.drift.drift_model import (
+    DriftModel,
+    Flags,
+    Mask,
+    Outside,
+    Situation,
+    place_flags,
+    range_flags,
+    states_of,
+)
 from compensation.drift.polynomial import Float, Scaling, design
 from compensation.drift.states import Memory
 from drivers.documents import Document
@@ -47,7 +56,7 @@ class PaperModel:
     unexplained at temperatures not fitted, one standard deviation, marker noise taken off. hull_px (H, 2): convex hull
     of the training markers. reference_degC: the camera's temperature at the reference, reference_chamber_degC the
     set-point. reference_centres_px (N, 2): of the first session with reference frames, NaN for a marker never seen.
-    scores: of every degree tried. candidates: the table of choice, of every form tried.
+    scores: of every degree tried. candidates: the table of choice, of every form tried. other: as in DriftModel.
     """
 
     degree: int
@@ -65,6 +74,7 @@ class PaperModel:
     camera_serial: str
     session_ids: tuple[str, ...]
     software_version: str
+    other: DriftModel | None = None
 
     @property
     def form(self) -> str:

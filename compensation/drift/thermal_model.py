@@ -12,7 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensation.drift.candidates import Candidate, Pair
-from compensation.drift.drift_model import Flags, Mask, Outside, Situation, place_flags, range_flags, states_of
+from compensation.drift.drift_model import (
+    DriftModel,
+    Flags,
+    Mask,
+    Outside,
+    Situation,
+    place_flags,
+    range_flags,
+    states_of,
+)
 from compensation.drift.lags import Float
 from compensation.drift.states import SETTLED_TAUS, Memory, States
 from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
@@ -40,7 +49,7 @@ class ThermalModel:
     reference_features (H,): subtracted, so that the shift at the reference is about 0. discrepancy_px (2,): what the
     form leaves unexplained at temperatures not fitted, one standard deviation, marker noise taken off. has_warm_up:
     whether a warm-up was among the training frames; without one there are no lags of the power. hull_px,
-    reference_..., candidates: as in PaperModel.
+    reference_..., candidates, other: as in PaperModel.
     """
 
     terms: tuple[Term, ...]
@@ -61,6 +70,7 @@ class ThermalModel:
     camera_serial: str
     session_ids: tuple[str, ...]
     software_version: str
+    other: DriftModel | None = None
 
     @property
     def form(self) -> str:

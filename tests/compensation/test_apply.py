@@ -6,6 +6,7 @@ import itertools
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from compensation.apply.export import export, runtime_model
 from compensation.cli import app
 from compensation.drift.drift_model import DriftModel, Outside
 from compensation.drift.history import recorded_history, states_at
-from compensation.drift.model_file import save_model
+from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import Scaling, exponents
 from compensation.drift.states import States, ThermalState
@@ -26,6 +27,7 @@ from compensation.drift.terms import Kind, Origin, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
 from compensation.markers.detection import detect
 from compensation.observations import session_target
+from drivers.interface import SessionError
 from stand.recording.session import Session
 
 from .conftest import Recorded
@@ -272,6 +274,66 @@ def test_a_folder_that_is_there_is_not_written_into(recorded: Recorded, files: d
         "apply", files["paper"], recorded.path, "-o", tmp_path / "there", status=2
     )
     assert not list((tmp_path / "there").iterdir())
+
+
+def test_a_camera_temperature_alone_is_enough_for_the_form_that_needs_no_history(
+    recorded: Recorded, files: dict[str, Path], tmp_path: Path
+):
+    both, out = tmp_path / "both.json", tmp_path / "out.csv"
+    save_model(replace(thermal(), other=paper()), both)
+    points, photo = tmp_path / "points.csv", tmp_path / "photo.png"
+    for text, options in (
+        ("x_px,y_px\n100,200\n", ("--camera-degC", 40)),
+        ("x_px,y_px,camera_degC\n100,200,40\n", ()),
+    ):
+        points.write_text(text)
+        printed = run("apply", both, points, *options, "-o", out)
+        assert printed.startswith("the camera's temperature alone: corrected with the paper's form of the model")
+        assert "leaves 0.020 and 0.030 px along x and y" in printed
+        assert printed.count("\n") == 1
+        expected = paper().correct(np.array([[100.0, 200.0]]), 40.0)[0]
+        (row,) = table(out)
+        assert [float(row[f"{axis}_reference_px"]) for axis in "xy"] == pytest.approx(expected, abs=1e-6)
+    cv2.imwrite(str(photo), Session.open(recorded.path).frame(4).image)
+    for name in ("both", "paper"):
+        run("apply", tmp_path / f"{name}.json", photo, "--camera-degC", 44, "-o", tmp_path / f"{name}.tiff")
+    assert (tmp_path / "both.tiff").read_bytes() == (tmp_path / "paper.tiff").read_bytes()
+    refused = run("apply", files["thermal"], photo, "--camera-degC", 44, "-o", tmp_path / "none.tiff", status=2)
+    assert "a model of the form thermal needs the thermal state" in refused
+
+
+def test_a_session_is_corrected_with_the_form_in_use_and_so_is_an_export(
+    recorded: Recorded, files: dict[str, Path], tmp_path: Path
+):
+    save_model(replace(thermal(), other=paper()), tmp_path / "both.json")
+    run("detect", recorded.path, "-o", tmp_path / "found.csv")
+    for name in ("both", "thermal"):
+        model = tmp_path / f"{name}.json"
+        run("apply", model, tmp_path / "found.csv", "--session", recorded.path, "-o", tmp_path / f"{name}.csv")
+        run("export", model, "-o", tmp_path / name)
+    assert (tmp_path / "both.csv").read_bytes() == (tmp_path / "thermal.csv").read_bytes()
+    assert (tmp_path / "both" / "drift.json").read_bytes() == (tmp_path / "thermal" / "drift.json").read_bytes()
+    assert files["thermal"].exists()
+
+
+def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_path: Path):
+    path = tmp_path / "model.json"
+    for model, other in ((thermal(), paper(2)), (paper(2), thermal())):
+        save_model(replace(model, other=other), path)
+        loaded = load_model(path)
+        assert (loaded.form, loaded.other and loaded.other.form) == (model.form, other.form)
+        states = States.at_degC(40.0, len(POINTS))
+        for one, two in ((loaded, model), (loaded.other, other)):
+            assert one is not None
+            np.testing.assert_array_equal(one.shift(POINTS, states.camera_degC), two.shift(POINTS, states.camera_degC))
+    data = json.loads(path.read_text())
+    old = {name: value for name, value in data.items() if name != "other"} | {"schema_version": 2}
+    path.write_text(json.dumps(old))
+    assert load_model(path).other is None
+    for changed in ({"camera_serial": "TS-0002"}, {"other": old}):
+        path.write_text(json.dumps(data | {"other": data["other"] | changed}))
+        with pytest.raises(SessionError, match=r"model\.json: not a drift model of this program \(other"):
+            load_model(path)
 
 
 def test_export_says_what_it_has_written(files: dict[str, Path], tmp_path: Path):

@@ -64,9 +64,12 @@ def test_what_is_asked_for_without_a_form_is_the_one_that_predicts_better(night:
     assert {one.form for one in model.candidates} == {"paper", "thermal"}
     assert [one.form for one in model.candidates if one.chosen] == ["thermal"]
     assert all(one.bic is not None and np.isfinite(one.bic) for one in model.candidates if one.form == "thermal")
-    assert fit(night[0], form="paper").form == "paper"
-    assert fit(night[0], degree=2).form == "paper"
-    assert fit(without_histories(quadratic, 0.005)).form == "paper"
+    assert model.other is not None
+    np.testing.assert_array_equal(getattr(model.other, "coefficients", None), fit_paper(night[0]).coefficients)
+    asked = fit(night[0], degree=2)
+    assert (asked.form, asked.other and asked.other.form) == ("paper", "thermal")
+    alone = fit(without_histories(quadratic, 0.005))
+    assert (alone.form, alone.other) == ("paper", None)
 
 
 @pytest.mark.parametrize("air_degC", [15.0, 34.0])
@@ -158,7 +161,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
             np.testing.assert_equal(getattr(loaded, name), getattr(thermal, name), err_msg=name)
     assert loaded.valid.__repr__() == thermal.valid.__repr__()
     data = json.loads((tmp_path / "model.json").read_text())
-    assert (data["form"], data["schema_version"]) == ("thermal", 2)
+    assert (data["form"], data["schema_version"]) == ("thermal", 3)
     (tmp_path / "model.json").write_text(json.dumps({**data, "reference_features": [0.0]}))
     with pytest.raises(SessionError, match="reference_features: shape"):
         load_model(tmp_path / "model.json")
