@@ -15,7 +15,7 @@ from compensation.calibration.pinhole import NAMES
 from compensation.calibration.positions import observe_positions
 from compensation.calibration.table import TableSigma
 from compensation.command_line import TargetOption, named_target, one_line_errors
-from compensation.files import check_writable, write_whole
+from compensation.files import check_folder_writable, check_writable, write_whole
 from compensation.observations import session_target
 from compensation.report.calibration_report import report_page
 from stand.progress import progress
@@ -28,7 +28,7 @@ def calibrate_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded calibration.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The camera file (JSON) to write.")],
     export: Annotated[
-        Path | None, typer.Option(help="A folder for the OpenCV, ROS, Kalibr and mrcal files of the pinhole.")
+        Path | None, typer.Option(help="A folder, new or not, for the OpenCV, ROS, Kalibr and mrcal files.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="A page (HTML) with residuals and uncertainty.")] = None,
     target: TargetOption = None,
@@ -49,9 +49,11 @@ def calibrate_session(
     Example: compensate calibrate sessions/20260101T180000Z-calibration -o camera.json --export exports
     """
     with one_line_errors():
-        for path in (out, report, *([] if export is None else [export / name for name in EXPORTS])):
+        for path in (out, report):
             if path is not None:
                 check_writable(path)
+        if export is not None:
+            check_folder_writable(export, EXPORTS)
         opened = Session.open(session)
         used = named_target(target) or session_target(opened)
         sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
@@ -60,6 +60,26 @@ def check_writable(path: Path) -> None:
     """SessionError when nothing could be written to `path`: to be told before the work, not after it."""
     _check_place(path)
     _temporary(path).unlink()
+
+
+def make_folder(path: Path) -> None:
+    """The folder, with those above it, unless it is there; SessionError when the place refuses."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be made ({error.strerror})") from error
+
+
+def check_folder_writable(path: Path, names: Iterable[str]) -> None:
+    """SessionError when files of these names could not be written into the folder, which need not be there yet: to be
+    told before the work. Nothing is made."""
+    if path.is_dir():
+        for name in names:
+            check_writable(path / name)
+        return
+    above = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+    if os.path.lexists(path) or not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise SessionError(f"{path}: cannot be made")
 
 
 def _check_place(path: Path) -> None:

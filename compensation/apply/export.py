@@ -11,8 +11,7 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.polynomial import exponents
 from compensation.drift.thermal_model import ThermalModel
-from compensation.files import write_whole
-from drivers.interface import SessionError
+from compensation.files import make_folder, write_whole
 
 MODEL_NAME, MODULE_NAME = "drift.json", "drift_runtime.py"
 
@@ -22,10 +21,7 @@ def export(model: DriftModel, folder: Path) -> tuple[Path, Path]:
 
     SessionError when the place refuses.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SessionError(f"{folder}: cannot be made ({error.strerror})") from error
+    make_folder(folder)
     written = folder / MODEL_NAME, folder / MODULE_NAME
     module = importlib.resources.files("compensation.apply") / MODULE_NAME
     write_whole(written[0], json.dumps(runtime_model(model), indent=1, allow_nan=False) + "\n")

@@ -17,7 +17,7 @@ import yaml
 from compensation.calibration.least_squares import Float, minimise
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.uncertainty import grid_pixels
-from compensation.files import write_whole
+from compensation.files import make_folder, write_whole
 
 _GRID_COLUMNS = 33
 
@@ -120,7 +120,8 @@ EXPORTS: Mapping[str, Callable[[Pinhole, str, float], str]] = {
 
 
 def write_exports(folder: Path, lens: Pinhole, name: str, rms_px: float) -> None:
-    """Write every export into an existing folder; SessionError when the place refuses."""
+    """Write every export into the folder, made when it is missing; SessionError when the place refuses."""
+    make_folder(folder)
     for file, writer in EXPORTS.items():
         write_whole(folder / file, writer(lens, name, rms_px))
 

@@ -101,6 +101,7 @@ def test_a_camera_radtan_can_hold_stays_as_it_is():
     assert refit.lens.vector == pytest.approx(plain.vector, rel=1e-6)
 
 
-def test_a_folder_that_is_not_there_is_refused(tmp_path: Path):
-    with pytest.raises(SessionError, match="cannot be written"):
-        write_exports(tmp_path / "none", BROWN, "camera", 0.003)
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(SessionError, match="cannot be made"):
+        write_exports(tmp_path / "file" / "exports", BROWN, "camera", 0.003)

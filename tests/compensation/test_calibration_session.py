@@ -137,7 +137,6 @@ def test_positions_are_what_the_axes_reported_at_rest_and_frames_are_averaged(re
 
 def test_calibrate_writes_the_camera_its_exports_and_a_report(recorded: Recorded, tmp_path: Path):
     out, exports, report = tmp_path / "camera.json", tmp_path / "exports", tmp_path / "report.html"
-    exports.mkdir()
     result = run(recorded.path, "-o", out, "--export", exports, "--report", report, "--rotary-arcmin", "0.02")
     assert result.exit_code == 0, result.output
     camera = CameraFile.load(out)
@@ -189,7 +188,10 @@ def test_bad_input_is_refused_with_a_sentence_and_leaves_nothing(recorded: Recor
     cases = [
         ([tmp_path, "-o", out], "not a session"),
         ([recorded.path, "-o", tmp_path / "none" / "camera.json"], "cannot be written"),
-        ([recorded.path, "-o", out, "--export", tmp_path / "none"], "cannot be written"),
+        (
+            [recorded.path, "-o", out, "--export", next((recorded.path / "telemetry").iterdir()) / "exports"],
+            "cannot be made",
+        ),
         ([recorded.path, "-o", out, "--target", "dots"], "installed targets"),
         ([recorded.path, "-o", out, "--model", "fisheye"], "fisheye"),
         ([recorded.path, "-o", out, "--linear-um", "0"], "--linear-um"),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from compensation.files import check_writable, whole_file, write_whole
+from compensation.files import check_folder_writable, check_writable, make_folder, whole_file, write_whole
 from drivers.interface import SessionError
 
 
@@ -66,3 +66,20 @@ def test_a_file_is_replaced_when_the_block_has_ended_and_not_before(tmp_path: Pa
         assert out.read_text() == "older"
     assert out.read_bytes() == b"a\r\nb\n"
     assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_folder_is_made_when_it_is_needed_and_not_before(tmp_path: Path):
+    wanted = tmp_path / "a" / "b"
+    check_folder_writable(wanted, ["x"])
+    assert not list(tmp_path.iterdir())
+    make_folder(wanted)
+    make_folder(wanted)
+    check_folder_writable(wanted, ["x"])
+    (wanted / "x").mkdir()
+    with pytest.raises(SessionError, match="it is a folder"):
+        check_folder_writable(wanted, ["x"])
+    (tmp_path / "file").touch()
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    for path in (tmp_path / "file", tmp_path / "file" / "b", tmp_path / "dangling"):
+        with pytest.raises(SessionError, match="cannot be made"):
+            check_folder_writable(path, ["x"])
