@@ -25,7 +25,7 @@ test: setup
 
 nightly: setup
 	@sh .ci/system-packages $(PEER_PACKAGES)
-	$(BIN)/pytest -m nightly
+	$(BIN)/pytest -m nightly -o faulthandler_timeout=5400
 
 bench: setup
 	$(BIN)/python -m tests.bench
