@@ -37,7 +37,7 @@ async def until(condition: Callable[[], bool]) -> None:
 async def test_after_a_stop_heat_waits_for_readings_taken_since(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
-    """The thermometers' replies are lost from the stop on: until one comes the heater's relay is not armed, and drops."""
+    """The thermometers' replies are lost from the stop on: until one comes the heater's relay drops, not armed."""
     ordered = order(SOAK, **{**FAST, "bus": {"timeout_s": 0.1}, "recording": {"telemetry_commit_s": 0.2}})
     await asyncio.to_thread(simulator, ordered.config, False)
     with gateway(ordered) as (between, through):
