@@ -21,7 +21,7 @@ from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.states import States
 from compensation.files import check_writable, whole_file
-from compensation.markers.detection import read_image
+from compensation.markers.image_file import read_image
 from drivers.interface import ConfigError, SessionError
 from stand.progress import progress
 from stand.recording.session import Session

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -29,7 +30,8 @@ from compensation.drift.paper_model import MAX_DEGREE
 from compensation.drift.validation import evaluate, table
 from compensation.files import check_writable
 from compensation.finding.found import finder
-from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found, read_image
+from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found
+from compensation.markers.image_file import read_image
 from compensation.markers.table import CENTRES, DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
 from compensation.report.extras import Extras
@@ -39,7 +41,8 @@ from compensation.target import Target
 from compensation.validate_cli import validate_session
 from compensation.validation3d.reading import load_validation
 from drivers.interface import ConfigError
-from stand.progress import progress
+from stand.progress import Report, late_progress, progress
+from stand.recording.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from stand.recording.session import Session
 from stand.usage import OneLineUsage, one_line
 
@@ -60,6 +63,10 @@ FormOption = Annotated[
     Form | None, typer.Option(help="The paper's polynomial or the thermal form; else chosen by cross-validation.")
 ]
 
+MegapixelsOption = Annotated[
+    float, typer.Option("--max-megapixels", min=0.001, max=2000.0, help="Larger images are refused, unread.")
+]
+
 _DEFAULT_TARGET = "paper-9x6"
 
 app.command("budget")(budget_of_session)
@@ -74,6 +81,7 @@ def detect_images(
     sources: Annotated[list[Path], typer.Argument(metavar="SESSION|IMAGE...", help="Sessions and image files.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")],
     target: TargetOption = None,
+    max_megapixels: MegapixelsOption = GREATEST_MEGAPIXELS,
 ) -> None:
     """Find the target's markers: a CSV row per marker and image, with covariance and flags.
 
@@ -82,19 +90,13 @@ def detect_images(
 
     Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
     """
-    with one_line_errors():
+    with one_line_errors(), images_up_to(max_megapixels):
         check_writable(out)
         opened = [_open(path) for path in sources]
         chosen = _detection_target(opened, target)
         failures: list[str] = []
-        with progress("find markers", sum(_count(source) for source in opened)) as report:
-
-            def counted() -> Iterator[DetectedImage]:
-                for done, image in enumerate(_detections(opened, chosen, failures), 1):
-                    report(done, image.image)
-                    yield image
-
-            write_detections(out, chosen, counted())
+        with late_progress("find markers", sum(_count(source) for source in opened)) as report:
+            write_detections(out, chosen, _detections(opened, chosen, failures, report))
         typer.echo(CENTRES)
         for failure in failures:
             typer.echo(f"not found in {one_line(failure)}", err=True)
@@ -192,7 +194,9 @@ def _count(source: Session | Path) -> int:
     return source.frame_count if isinstance(source, Session) else 1
 
 
-def _detections(sources: Sequence[Session | Path], target: Target, failures: list[str]) -> Iterator[DetectedImage]:
+def _detections(
+    sources: Sequence[Session | Path], target: Target, failures: list[str], report: Report
+) -> Iterator[DetectedImage]:
     """Every image in turn; where the target is not found all its markers are missing, and `failures` grows by a line.
 
     DetectionError when it is found nowhere.
@@ -202,17 +206,24 @@ def _detections(sources: Sequence[Session | Path], target: Target, failures: lis
     for source in sources:
         previous: Detection | None = None
         for name, time_ns, image in _images(source, several):
+            watch = partial(_report_part, report, images, name)
             images += 1
             try:
                 # Photographs need not be of one pose: only frames of a session are tracked.
-                found = detect(image, target, previous)
+                found = detect(image, target, previous, watch=watch)
                 previous = found if isinstance(source, Session) else None
             except DetectionError as error:
                 failures.append(f"{name}: {error}")
                 found = nothing_found(target)
+            report(images, name)
             yield DetectedImage(name, time_ns, found)
     if len(failures) == images:
         raise DetectionError(f"{failures[0] if failures else 'there are no images'}")
+
+
+def _report_part(report: Report, done: int, name: str, part: float) -> None:
+    """Part of one image, behind those before it."""
+    report(done + part, name)
 
 
 def _images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | None, Image]]:

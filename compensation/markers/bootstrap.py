@@ -24,6 +24,7 @@ _LEAST_SIDE_PX = 4
 _ENOUGH_PX = 12
 """Across the smallest disc that is looked for: images with more are reduced, which takes a fifth of the time."""
 _GREATEST_ASPECT = 3.2
+_ROWS = 512
 _NEIGHBOUR_AREA_RATIO = 1.6
 
 Float = NDArray[np.float64]
@@ -86,8 +87,12 @@ def _darker_than_around(image: Image, largest_px: float, full_scale: int) -> NDA
     smooth = (window // 2 | 1, window // 2 | 1)
     top = cv2.blur(cv2.dilate(coarse, box).astype(np.float32), smooth)
     bottom = cv2.blur(cv2.erode(coarse, box).astype(np.float32), smooth)
-    middle = np.where(top - bottom < _LEAST_CONTRAST * full_scale, 0, (top + bottom) / 2)
-    threshold = cv2.resize(middle.astype(image.dtype), (width, height), interpolation=cv2.INTER_LINEAR)
+    middle = np.empty(top.shape, image.dtype)
+    for row in range(0, len(top), _ROWS):  # of 70 megapixels each array of floats is 280 MB
+        high, low = top[row : row + _ROWS], bottom[row : row + _ROWS]
+        middle[row : row + _ROWS] = np.where(high - low < _LEAST_CONTRAST * full_scale, 0, (high + low) / 2)
+    del top, bottom
+    threshold = cv2.resize(middle, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(cv2.compare(image, threshold, cv2.CMP_LT), dtype=np.uint8)
 
 

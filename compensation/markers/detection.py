@@ -10,9 +10,9 @@ The centre is that of the ellipse in the image. For a tilted target this is not 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -37,7 +37,6 @@ __all__ = [
     "detect",
     "grey_image",
     "nothing_found",
-    "read_image",
 ]
 
 Float = NDArray[np.float64]
@@ -76,17 +75,23 @@ class Detection:
         return int(np.isfinite(self.centres_px[:, 0]).sum())
 
 
+def _unwatched(part: float) -> None:
+    """Nobody watches."""
+
+
 def detect(
     image: NDArray[np.uint8] | NDArray[np.uint16],
     target: Target,
     previous: Detection | None = None,
     noise: Noise | None = None,
+    watch: Callable[[float], None] = _unwatched,
 ) -> Detection:
     """The target's markers in a grey (height, width) or colour (height, width, 3; B G R) image, which is only read.
 
     previous: the frame before, for speed and to keep the orientation; when the target has moved too far it is searched
     for again. noise: the camera's; without it covariances come from the residuals, and chi is relative to this image's
-    median marker. Raises DetectionError when the target cannot be identified beyond doubt.
+    median marker. watch: gets the part of a search that is done, 0 to 1. Raises DetectionError when the target cannot
+    be identified beyond doubt.
     """
     grey = grey_image(image)
     if previous is not None:
@@ -97,7 +102,7 @@ def detect(
                 tracked = _fit(grey, target, previous.state, noise)
                 if tracked is not None and _has_followed(tracked, previous):
                     return tracked
-    return _search(grey, target, None if previous is None else previous.homography, noise)
+    return _search(grey, target, None if previous is None else previous.homography, noise, watch)
 
 
 def nothing_found(target: Target) -> Detection:
@@ -127,28 +132,14 @@ def grey_image(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:
     raise ValueError(f"an image has the shape (height, width) or (height, width, 3), not {image.shape}")
 
 
-def read_image(path: Path) -> Image:
-    """A grey image (height, width) from a file, 8 or 16 bits; raises DetectionError when it cannot be read."""
-    try:
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise DetectionError(f"{path}: cannot be read ({error.strerror})") from error
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise DetectionError(f"{path}: not an image, or damaged")
-    try:
-        return grey_image(image)  # pyright: ignore[reportArgumentType] - checked there
-    except ValueError as error:
-        raise DetectionError(f"{path}: {error}") from error
-
-
-def _search(grey: Image, target: Target, previous: Float | None, noise: Noise | None) -> Detection:
+def _search(
+    grey: Image, target: Target, previous: Float | None, noise: Noise | None, watch: Callable[[float], None]
+) -> Detection:
     """Look for the target at every scale it may have; the failure that came nearest is the one reported."""
     nearest: DetectionError | None = None
-    for size_px in disc_sizes_px(target, grey.shape):
+    sizes_px = list(disc_sizes_px(target, grey.shape))
+    for tried, size_px in enumerate(sizes_px):
+        watch(tried / len(sizes_px))
         candidates = find_candidates(grey, target, size_px)
         try:
             identified = identify(candidates, target, previous)

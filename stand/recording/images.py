@@ -11,6 +11,7 @@ from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from drivers.interface import Frame, SessionError
+from stand.recording.image_limit import size_fault
 from stand.recording.messages import timestamp
 from stand.recording.png import ImageArray, decode_png, encode_png
 from stand.recording.raw import encode_raw
@@ -71,6 +72,8 @@ def _from_raw(raw: RawImage) -> ImageArray:
     dtype = RAW_DTYPE.get(raw.encoding)
     if dtype is None:
         raise SessionError(f"a recorded image has the encoding {raw.encoding!r}; mono8 and mono16 are known")
+    if fault := size_fault(raw.width, raw.height):
+        raise SessionError(f"a recorded image {fault}")
     row_bytes = raw.width * dtype.itemsize
     data = raw.data  # protobuf copies it at every access
     if not data or raw.step != row_bytes or len(data) != row_bytes * raw.height:

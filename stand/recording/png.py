@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interface import SessionError
+from stand.recording.image_limit import size_fault
 
 ImageArray = NDArray[np.uint8] | NDArray[np.uint16]
 Windows = NDArray[np.int32]
@@ -36,7 +37,6 @@ AVERAGE = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG)
 ABOVE = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
 
 WINDOWS_KEYWORD = b"Windows"
-GREATEST_IMAGE_px = 1 << 28
 MOST_WINDOWS = 10_000
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -162,10 +162,8 @@ def _header(body: memoryview) -> Header:
     header = Header(*HEADER.unpack(body))
     if header.colour_type != 0 or header.bit_depth not in (8, 16) or any(header[4:]):
         raise SessionError("a recorded image is not a plain grey PNG of 8 or 16 bit")
-    if not 0 < header.width_px * header.height_px <= GREATEST_IMAGE_px:
-        raise SessionError(
-            f"a recorded image claims {header.width_px} x {header.height_px} px; up to {GREATEST_IMAGE_px} px are read"
-        )
+    if fault := size_fault(header.width_px, header.height_px):
+        raise SessionError(f"a recorded image {fault}")
     return header
 
 

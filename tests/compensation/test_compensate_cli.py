@@ -211,7 +211,7 @@ def test_bad_input_to_fit_and_report_is_refused_with_a_sentence(recorded: Record
 def test_an_interrupted_command_leaves_older_files_as_they_were(
     recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("compensation.finding.piece.detect", interrupted)

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image, read_image
+from compensation.markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image
 from compensation.markers.eccentricity import disc_centres
+from compensation.markers.image_file import read_image
 from compensation.markers.table import COLUMNS, DetectedImage, flags_text, write_detections
 from compensation.target import OddMarker, Target, load_target
 from drivers.interface import SessionError

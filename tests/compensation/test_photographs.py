@@ -13,8 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation import cli
-from compensation.markers.detection import Detection, detect, read_image
+from compensation.markers.detection import Detection, detect
 from compensation.markers.grid import project
+from compensation.markers.image_file import read_image
 from compensation.target import load_target
 
 ROOT = Path(__file__).parents[2]

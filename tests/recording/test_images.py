@@ -188,7 +188,7 @@ def text(value):
     ("parts", "says"),
     {
         "a million pixels square": ([header(10**6, 10**6), PIXELS, END], "claims 1000000 x 1000000 px"),
-        "half a gigabyte of nothing": ([header(1 << 14, 1 << 14, 16, 0, 0, 0, 0), PIXELS, END], "too little data"),
+        "120 megabytes of nothing": ([header(10_000, 6_000, 16, 0, 0, 0, 0), PIXELS, END], "too little data"),
         "no width": ([header(0, 9), PIXELS, END], "claims 0 x 9 px"),
         "colour": ([header(14, 9, 8, 2, 0, 0, 0), PIXELS, END], "plain grey"),
         "two bit": ([header(14, 9, 2, 0, 0, 0, 0), PIXELS, END], "plain grey"),
