@@ -11,10 +11,9 @@ import json
 import os
 import signal
 import sys
-import threading
-from types import FrameType
 
 from drivers.documents import parse_document
+from drivers.ending import Ending
 from drivers.interface import ConfigError
 from drivers.sim.control import serve_control
 from drivers.sim.laboratory import Laboratory, LaboratorySpec
@@ -24,24 +23,18 @@ _ORPHAN_LIMIT_S = 60
 
 def main() -> int:
     """Build the laboratory, serve it, take it down."""
-    stop, parent = threading.Event(), os.getppid()
-
-    def end(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, end)
+    ending, parent = Ending((signal.SIGTERM, signal.SIGINT)), os.getppid()
     try:
         spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
         laboratory = Laboratory(spec)
     except (ConfigError, OSError) as error:
         print(f"{error}", file=sys.stderr)  # noqa: T201 - the process' answer to who started it
         return 2
-    control = serve_control(laboratory, stop.set)
+    control = serve_control(laboratory, ending.ask)
     addresses = {**laboratory.addresses, "control": control.address}
     print(json.dumps(addresses), flush=True)  # noqa: T201 - the process' answer to who started it
     orphaned_s = 0
-    while not stop.wait(1.0) and orphaned_s < _ORPHAN_LIMIT_S:
+    while not ending.wait(1.0) and orphaned_s < _ORPHAN_LIMIT_S:
         orphaned_s += os.getppid() != parent
     control.close()
     laboratory.close()

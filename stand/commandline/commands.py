@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from drivers.clock import NS_PER_S, WallClock
+from drivers.ending import Ending
 from experiments.steps import kind_of, parameters_of
 from stand.commandline import control_cli, queue_cli, run_cli, session_cli
 from stand.config import load_config, packaged
@@ -84,11 +85,10 @@ def simulate(
     """
     with one_line_errors():
         stand_config = load_config(packaged("", config))
-        simulator = Simulator(laboratory_of(stand_config, virtual=False, seed=None))
-        # Blocked only now, or the simulator would inherit it; unblocked, SIGTERM would end us and leave it behind.
-        signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+        laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
+        simulator = Simulator(laboratory)
         typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
-        signal.sigwait(_ENDING)
+        ending.wait()
         simulator.stop()
 
 

@@ -82,9 +82,12 @@ async def test_an_interrupt_leaves_the_stand_safe_and_the_session_readable(
 async def test_a_simulated_laboratory_that_is_ended_leaves_nothing_behind(
     tmp_path: Path, order: Callable[..., Order], number: signal.Signals
 ):
+    """Also when other threads, here those of OpenBLAS, could be handed the signal."""
     ordered = order(BRIEF)
     command = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "stand.cli", "simulate", str(tmp_path / "config.yaml"), stderr=asyncio.subprocess.PIPE
+        *(sys.executable, "-m", "stand.cli", "simulate", str(tmp_path / "config.yaml")),
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "4"},
     )
     assert command.stderr is not None
     assert b"answers; Ctrl-C ends it" in await command.stderr.readline()
