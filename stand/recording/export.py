@@ -1,5 +1,6 @@
 """A session as files that any program opens: PNG, text, CSV or Parquet.
 
+    OUT/README.txt                   what is where, and how cells are to be read
     OUT/session.json                 the metadata
     OUT/attachments/config.yaml ...  the attached files
     OUT/steps.csv, OUT/events.csv
@@ -58,6 +59,26 @@ STEP_COLUMNS = (
 EVENT_COLUMNS = (*TIME_COLUMNS, *(Column(name, "text") for name in ("level", "kind", "text", "data_json")))
 
 
+README = """What is here was exported from a recorded session of a thermal test stand by `stand session export`.
+
+session.json              what the session is: recipe, camera, operator, version, start
+attachments/              configuration, recipe and target, as they were recorded
+steps.csv, events.csv     what was done, and what happened
+telemetry/                one table for each topic; camera_meta describes every frame
+frames/000001.png, .txt   each frame in order of time, and the temperatures at its time; index.csv has all of these
+
+Times    time_ns is the stand's clock, in ns since 1970: it never steps, so take differences of it. time_utc is UTC as
+         the computer had it at that moment.
+Values   An empty cell is what the device does not measure; nan is what it could not measure, and remarks says why.
+         Units are in the names of the columns. A number is the shortest text that reads back as the same number.
+Texts    Cells of the CSV tables are safe for spreadsheets, whoever has recorded the session. A text that a spreadsheet
+         would take for a formula (its first character, spaces aside, is one of = + - @) has an apostrophe (') before
+         it: take that away to have the text as it was recorded. Control characters and those that turn the direction
+         of writing are left out; tabs and line ends are spaces. Numbers are never changed. Parquet tables, session.json
+         and attachments have all texts as they were recorded.
+"""
+
+
 def export(
     session: Session,
     out: Path,
@@ -100,6 +121,7 @@ class _Work:
 def _write_facts(session: Session, folder: Path) -> None:
     """What is small: metadata, attachments, steps and events."""
     utc = session.utc
+    (folder / "README.txt").write_text(README, encoding="utf-8")
     text = json.dumps(session.metadata, indent=2, ensure_ascii=False)
     (folder / "session.json").write_text(text + "\n", encoding="utf-8")
     attachments = folder / "attachments"

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType
 
 from drivers.clock import NS_PER_S
 from drivers.interface import Reading, SessionError, bad_reading
-from stand.hub import Batch
+from stand.hub import Batch, Event
 from stand.recording.export import export
 from stand.recording.images import CAMERA_IMAGE
 from stand.recording.instants import utc_text
@@ -207,9 +207,31 @@ async def test_a_frame_without_its_description_is_exported_with_what_is_known(tm
     assert (told["block_id"], told["step_id"]) == (" 1", "")
 
 
+async def test_its_readme_says_how_a_text_was_changed_and_what_was_recorded_can_be_had_again(tmp_path):
+    def hostile(time_ns, index):
+        yield Event(time_ns, "info", "note", "=cmd|'/C calc'!A0\x1b[2J")
+        yield Batch("regulator", time_ns, (Reading("regulator.pv", -1.5, "degC", time_ns),))
+
+    _, out = await exported(tmp_path, count=1, items=hostile)
+    readme = " ".join((out / "README.txt").read_text(encoding="utf-8").split())
+    assert "one of = + - @) has an apostrophe (') before it: take that away" in readme
+    assert "Control characters and those that turn the direction of writing are left out" in readme
+    (event,) = csv_rows(out / "events.csv")
+    assert event["text"].removeprefix("'") == "=cmd|'/C calc'!A0[2J"
+    assert event["text"].startswith("'")
+    (state,) = csv_rows(out / "telemetry" / "chamber_state.csv")
+    assert state["actual_degC"] == "-1.5"  # a number is no formula
+
+
 async def test_steps_events_metadata_and_attachments_are_there(tmp_path):
     session, out = await exported(tmp_path, count=2, frames=False, telemetry=None)
-    assert sorted(path.name for path in out.iterdir()) == ["attachments", "events.csv", "session.json", "steps.csv"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "README.txt",
+        "attachments",
+        "events.csv",
+        "session.json",
+        "steps.csv",
+    ]
     steps = csv_rows(out / "steps.csv")
     assert [(row["step_id"], row["state"]) for row in steps] == [
         (mark.step_id, mark.state.value) for mark in session.steps()
