@@ -43,6 +43,7 @@ from stand.recording.wire import (
     LENGTH,
     MESSAGE,
     RECORD,
+    RECORD_LIMIT_BYTES,
     ChunkHead,
     bytes_of,
     chunk_content,
@@ -51,6 +52,7 @@ from stand.recording.wire import (
 )
 
 _DATA_END_BYTES = RECORD.size + CRC.size
+_PART_LIMIT_BYTES = RECORD_LIMIT_BYTES + (1 << 24)  # the indexes of its messages stand behind a chunk
 
 
 class Damage(NamedTuple):
@@ -141,7 +143,6 @@ class _Walk:
     def run(self, report: Callable[[int], None]) -> None:
         """Read everything; raises one of DAMAGE when the index does not tell of the whole file."""
         places = self._places()
-        self._file.seek(0)
         self._part(0, places[0], self._header)
         for place, end in pairwise(places):
             self._part(place, end, self._record)
@@ -169,6 +170,9 @@ class _Walk:
     def _part(self, place: int, end: int, read: Callable[[int, bytes], None]) -> None:
         """Read the bytes of one record; damage in it is noted."""
         try:
+            if end - place > _PART_LIMIT_BYTES:
+                raise ValueError(f"a record claims {end - place} bytes")
+            self._file.seek(place)
             read(place, self._file.read(end - place))
         except DAMAGE as error:
             told = self._index.chunks.get(place)

@@ -26,7 +26,7 @@ MESSAGE_INDEX = struct.Struct("<HI")  # channel id, length of the entries
 MESSAGE_INDEX_ENTRY = struct.Struct("<QQ")  # log time, place in the chunk
 
 CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; whoever claims more is damaged
-INFLATED_LIMIT_BYTES = 1 << 26  # only telemetry is compressed, and its chunks are 1 MiB and a message
+INFLATED_LIMIT_BYTES = 1 << 24  # only telemetry is compressed, and its chunks are 1 MiB and a message
 RECORD_LIMIT_BYTES = CHUNK_LIMIT_BYTES + 1024
 
 _NAME_BYTES = {b"": 0, b"zstd": 4}
