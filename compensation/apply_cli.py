@@ -14,7 +14,7 @@ import typer
 from compensation.apply.export import export
 from compensation.apply.images import Form, corrected_image, middle_flags, write_image
 from compensation.apply.points import CAMERA, X, Y, numbers, outside_text, read_points, times, write_corrected
-from compensation.command_line import one_line_errors
+from compensation.command_line import Incomplete, one_line_errors, said_if
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.history import recorded_history, states_at
 from compensation.drift.model_file import load_model
@@ -25,6 +25,7 @@ from compensation.markers.image_file import read_image
 from drivers.interface import ConfigError, SessionError
 from stand.progress import progress
 from stand.recording.session import Session
+from stand.recording.using import open_whole
 
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")]
 CameraOption = Annotated[
@@ -47,6 +48,7 @@ def apply_model(
     form: Annotated[
         Form, typer.Option("--format", help="Of images: tiff is float32, png rounded to the original's bits.")
     ] = "tiff",
+    incomplete: Incomplete = False,
 ) -> None:
     """Put points or images where they would have been at the reference temperature.
 
@@ -59,11 +61,12 @@ def apply_model(
         used = load_model(model)
         if source.is_dir():
             _refuse(("--session", session), ("--camera-degC", camera_degC), why="a session tells its own temperatures")
-            _correct_session(used, Session.open(source), out, frames, form)
+            _correct_session(used, open_whole(source, said_if(incomplete)), out, frames, form)
         elif source.suffix.lower() == ".csv":
             _refuse(("--frames", frames), why="it selects frames of a session")
             check_writable(out)
-            _correct_points(used, source, out, session, camera_degC)
+            recorded = None if session is None else open_whole(session, said_if(incomplete))
+            _correct_points(used, source, out, recorded, camera_degC)
         else:
             _refuse(("--session", session), ("--frames", frames), why="one image has --camera-degC only")
             if camera_degC is None:
@@ -96,13 +99,13 @@ def _refuse(*options: tuple[str, object], why: str) -> None:
 
 
 def _correct_points(
-    model: DriftModel, source: Path, out: Path, session: Path | None, camera_degC: float | None
+    model: DriftModel, source: Path, out: Path, session: Session | None, camera_degC: float | None
 ) -> None:
     rows = read_points(source)
     xy_px = np.column_stack([numbers(source, rows, X), numbers(source, rows, Y)])
     if session is not None:
         _refuse(("--camera-degC", camera_degC), why="the session tells it")
-        states = _recorded_states(model, Session.open(session), times(source, rows))
+        states = _recorded_states(model, session, times(source, rows))
     elif camera_degC is not None or (rows and CAMERA in rows[0]):
         model = _without_history(model)
         degC = numbers(source, rows, CAMERA) if camera_degC is None else camera_degC

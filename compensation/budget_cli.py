@@ -10,16 +10,18 @@ import typer
 
 from compensation.budget.budget import Budget, budget, table
 from compensation.budget.geometry import load_geometry
-from compensation.command_line import TargetOption, named_target, one_line_errors
+from compensation.command_line import Incomplete, TargetOption, named_target, one_line_errors, said_if
 from compensation.observations import session_target
 from compensation.target import Target
 from stand.recording.session import Session
+from stand.recording.using import open_whole
 
 
 def budget_of_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded session.")],
     geometry: Annotated[str, typer.Option(help="The stand's geometry: a file, or the installed `paper`.")] = "paper",
     target: TargetOption = None,
+    incomplete: Incomplete = False,
 ) -> None:
     """The stand's error budget: refraction, granite, target and table, in um and px, with uncertainty.
 
@@ -27,7 +29,7 @@ def budget_of_session(
     """
     with one_line_errors():
         stand = load_geometry(geometry)
-        recorded = Session.open(session)
+        recorded = open_whole(session, said_if(incomplete))
         typer.echo(table(budget(recorded, named_target(target) or session_target(recorded), stand)))
 
 

@@ -14,12 +14,13 @@ from compensation.calibration.exports import EXPORTS, refit_radtan, write_export
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.positions import observe_positions
 from compensation.calibration.table import TableSigma
-from compensation.command_line import TargetOption, named_target, one_line_errors
+from compensation.command_line import Incomplete, TargetOption, named_target, one_line_errors, said_if
 from compensation.files import check_folder_writable, check_writable, write_whole
 from compensation.observations import session_target
 from compensation.report.calibration_report import report_page
 from stand.progress import progress
 from stand.recording.session import Session
+from stand.recording.using import open_whole
 
 _TABLE = TableSigma()
 
@@ -43,6 +44,7 @@ def calibrate_session(
     ),
     straightness_um: Annotated[float, typer.Option(min=0, help="Of the table across its axis; 0: straight.")] = 0.0,
     wobble_arcmin: Annotated[float, typer.Option(min=0, help="Of the table's tilt; 0: none.")] = 0.0,
+    incomplete: Incomplete = False,
 ) -> None:
     """Calibrate the camera: pinhole and ray model, with board and table adjusted within their uncertainties.
 
@@ -54,7 +56,7 @@ def calibrate_session(
                 check_writable(path)
         if export is not None:
             check_folder_writable(export, EXPORTS)
-        opened = Session.open(session)
+        opened = open_whole(session, said_if(incomplete))
         used = named_target(target) or session_target(opened)
         sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)
         with progress("find markers", opened.frame_count) as shown:

@@ -17,11 +17,13 @@ from compensation.command_line import (
     AcrossGap,
     Cache,
     Cluster,
+    Incomplete,
     TargetOption,
     Workers,
     installed_target,
     named_target,
     one_line_errors,
+    said_if,
 )
 from compensation.drift.choosing import Form, check_request
 from compensation.drift.choosing import fit as fit_model
@@ -44,6 +46,7 @@ from drivers.interface import ConfigError
 from stand.progress import Report, late_progress, progress
 from stand.recording.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from stand.recording.session import Session
+from stand.recording.using import open_whole
 from stand.usage import OneLineUsage, one_line
 
 app = typer.Typer(
@@ -82,6 +85,7 @@ def detect_images(
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")],
     target: TargetOption = None,
     max_megapixels: MegapixelsOption = GREATEST_MEGAPIXELS,
+    incomplete: Incomplete = False,
 ) -> None:
     """Find the target's markers: a CSV row per marker and image, with covariance and flags.
 
@@ -92,7 +96,7 @@ def detect_images(
     """
     with one_line_errors(), images_up_to(max_megapixels):
         check_writable(out)
-        opened = [_open(path) for path in sources]
+        opened = [_open(path, incomplete) for path in sources]
         chosen = _detection_target(opened, target)
         failures: list[str] = []
         with late_progress("find markers", sum(_count(source) for source in opened)) as report:
@@ -113,6 +117,7 @@ def fit(
     cluster: Cluster = None,
     cache: Cache = True,
     across_gap: AcrossGap = False,
+    incomplete: Incomplete = False,
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
@@ -122,7 +127,14 @@ def fit(
         check_request(degree, form)
         check_writable(out)
         found_by = finder(workers, cluster, use_cache=cache)
-        observations = observe_sessions(sessions, progress, named_target(target), found_by, across_gap=across_gap)
+        observations = observe_sessions(
+            sessions,
+            progress,
+            named_target(target),
+            found_by,
+            across_gap=across_gap,
+            incomplete=said_if(incomplete),
+        )
         model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
         save_model(model, out)
@@ -146,6 +158,7 @@ def report(
     cluster: Cluster = None,
     cache: Cache = True,
     across_gap: AcrossGap = False,
+    incomplete: Incomplete = False,
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
@@ -163,7 +176,9 @@ def report(
             positions=table_positions([Session.open(path).steps() for path in sessions]),
             validation=None if validation is None else load_validation(validation),
         )
-        observations = observe_sessions(sessions, progress, wanted, found_by, across_gap=across_gap)
+        observations = observe_sessions(
+            sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said_if(incomplete)
+        )
         has_cycle = can_be_fitted(observations)
         used = fit_model(observations) if given is None and has_cycle else given
         evaluation = None if used is None or not has_cycle else evaluate(used, observations)
@@ -171,10 +186,10 @@ def report(
         typer.echo("no thermal cycle: no model, drift alone" if evaluation is None else table(evaluation))
 
 
-def _open(path: Path) -> Session | Path:
+def _open(path: Path, incomplete: bool) -> Session | Path:
     """A folder is a session, a file is an image."""
     if path.is_dir():
-        return Session.open(path)
+        return open_whole(path, said_if(incomplete))
     if not path.exists():
         raise ConfigError(f"{path}: no such file or folder")
     return path

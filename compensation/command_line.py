@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,7 @@ import typer
 
 from compensation.target import Target, load_target
 from drivers.interface import ConfigError, StandError
-from stand.usage import tell
+from stand.usage import one_line, tell
 
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
@@ -23,6 +23,9 @@ AcrossGap = Annotated[
         "--across-gap",
         help="Use frames from before and after a gap together, though camera minus air has changed in it.",
     ),
+]
+Incomplete = Annotated[
+    bool, typer.Option("--incomplete", help="Use what is there of a session of which something is missing.")
 ]
 Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
 Cluster = Annotated[
@@ -45,6 +48,11 @@ def installed_target(name: str) -> Target:
 def named_target(name: str | None) -> Target | None:
     """The target of an option, None when it was not given."""
     return None if name is None else installed_target(name)
+
+
+def said_if(incomplete: bool) -> Callable[[str], None] | None:
+    """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
+    return (lambda text: typer.echo(one_line(f"warning: {text}"), err=True)) if incomplete else None
 
 
 @contextmanager

@@ -28,6 +28,7 @@ from drivers.interface import Frame, SessionError
 from stand.progress import Report
 from stand.recording.session import Session
 from stand.recording.superseded import begins_of, is_superseded
+from stand.recording.using import Say, open_whole
 from stand.recording.utc_offsets import UtcOffsets
 
 Float = NDArray[np.float64]
@@ -181,12 +182,14 @@ def observe_sessions(
     finder: Finder | None = None,
     *,
     across_gap: bool = False,
+    incomplete: Say | None = None,
 ) -> Observations:
     """All frames of all sessions, found once, with progress. target: instead of the ones attached to the sessions.
 
-    SessionError when a session has frames of two equilibria of the camera, unless `across_gap`.
+    SessionError when a session has frames of two equilibria of the camera, unless `across_gap`, or when something of it
+    is missing, unless `incomplete` takes the sentence that says what.
     """
-    sessions = [Session.open(path) for path in paths]
+    sessions = [open_whole(path, incomplete) for path in paths]
     check_sessions(sessions, across_gap=across_gap)
     targets = [target or session_target(session) for session in sessions]
     parts: list[Observations] = []

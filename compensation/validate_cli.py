@@ -9,7 +9,17 @@ import typer
 
 from compensation.budget.geometry import load_geometry
 from compensation.calibration.camera_file import CameraFile
-from compensation.command_line import AcrossGap, Cache, Cluster, TargetOption, Workers, named_target, one_line_errors
+from compensation.command_line import (
+    AcrossGap,
+    Cache,
+    Cluster,
+    Incomplete,
+    TargetOption,
+    Workers,
+    named_target,
+    one_line_errors,
+    said_if,
+)
 from compensation.drift.model_file import load_model
 from compensation.files import check_writable, write_whole
 from compensation.finding.found import finder
@@ -41,6 +51,7 @@ def validate_session(
     cluster: Cluster = None,
     cache: Cache = True,
     across_gap: AcrossGap = False,
+    incomplete: Incomplete = False,
 ) -> None:
     """How far the target at V0..V3 seems to move with temperature, before and after compensation, beside the paper's.
 
@@ -61,6 +72,7 @@ def validate_session(
             named_target(target),
             finder(workers, cluster, use_cache=cache),
             across_gap=across_gap,
+            incomplete=said_if(incomplete),
         )
         check_same(observations, file, drift)
         opened = Session.open(session)

@@ -33,14 +33,17 @@ from stand.exit_codes import FAILED, one_line_errors
 from stand.hub import Event, Hub, Item, StepMark
 from stand.progress import Report, late_progress, progress
 from stand.recording.export import export
+from stand.recording.glance import Glance, glance
 from stand.recording.instants import parse_instant
 from stand.recording.inventory import State, inventory
 from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.overview import Glance, glance, overview
+from stand.recording.overview import overview
 from stand.recording.replay import ReplayClock, replay, replay_and_record
+from stand.recording.run_word import Files, Run
 from stand.recording.salvage import Salvaged, salvage_session
 from stand.recording.session import Session
 from stand.recording.trim import trim
+from stand.recording.using import check_whole
 from stand.recording.verify import verify
 from stand.usage import OneLineUsage, one_line
 
@@ -54,6 +57,9 @@ app = typer.Typer(
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a recorded session.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to make; it must not exist.")]
+IncompleteOption = Annotated[
+    bool, typer.Option("--incomplete", help="Use what is there of a session of which something is missing.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
 
 
@@ -62,7 +68,8 @@ def list_sessions(
     directory: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the sessions are.")] = Path("sessions"),
     as_json: JsonOption = False,
 ) -> None:
-    """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, state.
+    """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, how the
+    run ended, and whether the files are sound.
 
     Example: stand session list /data/sessions
     """
@@ -93,8 +100,10 @@ def _table(sessions: list[Glance]) -> Table:
     for column in LIST_COLUMNS:
         table.add_column(column, justify="right" if column in ("duration", "frames", "size") else "left")
     for session in sessions:
-        *cells, state = list_row(session)
-        table.add_row(*map(Text, cells), Text(state, style="" if state == "complete" else "yellow"))
+        *cells, run, files = list_row(session)
+        run_style = "" if session.run in (Run.COMPLETE, Run.RUNNING) else "yellow"
+        files_style = "" if session.state is Files.SOUND else "yellow"
+        table.add_row(*map(Text, cells), Text(run, style=run_style), Text(files, style=files_style))
     return table
 
 
@@ -123,10 +132,10 @@ def _session_in(directory: Path) -> Path:
 
 
 @contextmanager
-def _session_to_use(directory: Path) -> Generator[Session]:
+def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
     """The session in `directory` for a command that takes all of it. SessionError when segments of it would be left
-    out because they are not finished; what is being recorded is left out with a warning. Damage that the command meets
-    becomes a sentence that says what helps."""
+    out because they are not finished, or when something of it is missing and not `incomplete`; what is being recorded
+    is left out with a warning. Damage that the command meets becomes a sentence that says what helps."""
     files = inventory(_session_in(directory))
     help_text = f"`stand session salvage {directory}`"
     left = [file.name for file in files if file.state is State.UNFINISHED]
@@ -135,19 +144,25 @@ def _session_to_use(directory: Path) -> Generator[Session]:
         are = "is" if len(left) == 1 else f"and {len(left) - 1} more are"
         raise SessionError(f"{directory}: {left[0]} {are} not finished and would be left out; {help_text} first")
     if growing:
-        warning = f"warning: {directory}: is being recorded; without what is not finished yet: {', '.join(growing)}"
-        typer.echo(one_line(warning), err=True)
+        _warn(f"{directory}: is being recorded; without what is not finished yet: {', '.join(growing)}")
     try:
-        yield Session.open(directory)
+        session = Session.open(directory)
+        check_whole(session, _warn if incomplete else None)
+        yield session
     except SessionError as error:
         if str(error).startswith((str(directory / TELEMETRY), str(directory / FRAMES))):
             raise SessionError(f"{error}; {help_text} recovers what is sound") from error
         raise
 
 
+def _warn(text: str) -> None:
+    typer.echo(one_line(f"warning: {text}"), err=True)
+
+
 @app.command("verify")
 def verify_session(directory: SessionArgument, as_json: JsonOption = False) -> None:
-    """Read every byte of a session and say what is damaged or missing; status 1 when anything is.
+    """Read every byte of a session and say what is damaged or missing; status 1 when anything is,
+    however the run ended.
 
     Example: stand session verify sessions/20260101T180000Z-thermal-cycle
     """
@@ -200,6 +215,7 @@ def replay_session(
     directory: SessionArgument,
     speed: Annotated[str, typer.Option(metavar="N|max", help="Times as fast as it was, or max.")] = "1",
     record: Annotated[Path | None, typer.Option(help="Record the replay as this new session.")] = None,
+    incomplete: IncompleteOption = False,
 ) -> None:
     """Publish a session again, at its own pace or faster; its steps and events are printed as they come.
 
@@ -210,7 +226,7 @@ def replay_session(
         if record is not None:
             _check_new(record, directory)
         seen = glance(_session_in(directory))
-        with _session_to_use(directory) as session, _replay_progress(seen, session) as watch:
+        with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session) as watch:
             if record is None:
                 asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
             else:
@@ -274,6 +290,7 @@ def export_session(
     ),
     frames: Annotated[bool, typer.Option("--frames/--no-frames", help="Images with their temperatures.")] = True,
     telemetry: Annotated[bool, typer.Option("--telemetry/--no-telemetry", help="Tables of every topic.")] = True,
+    incomplete: IncompleteOption = False,
 ) -> None:
     """A session as PNG files with their temperatures, and its telemetry as tables.
 
@@ -281,7 +298,7 @@ def export_session(
     """
     with one_line_errors():
         _check_new(out, directory)
-        with _session_to_use(directory) as session, late_progress("export", 1.0) as report:
+        with _session_to_use(directory, incomplete) as session, late_progress("export", 1.0) as report:
             tables = table_format if telemetry else None
             export(session, out, frames=frames, telemetry=tables, report=report)
         typer.echo(out)
@@ -295,6 +312,7 @@ def trim_session(
         "+0s"
     ),
     end: Annotated[str | None, typer.Option("--to", metavar="T", help="Not included; else the session's end.")] = None,
+    incomplete: IncompleteOption = False,
 ) -> None:
     """A part of a session as a new one. +1h30m counts from the session's start; step:12 is when step 12 began.
 
@@ -303,7 +321,7 @@ def trim_session(
     with one_line_errors():
         _check_new(out, directory)
         seen = glance(_session_in(directory))
-        with _session_to_use(directory) as session:
+        with _session_to_use(directory, incomplete) as session:
             typer.echo(trim(session, out, *_range(begin, end, session, seen)))
 
 

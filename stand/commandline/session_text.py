@@ -12,9 +12,10 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from stand.hub import Event, StepState
+from stand.recording.glance import Glance
 from stand.recording.instants import duration
 from stand.recording.inventory import State
-from stand.recording.overview import Frames, Glance, Overview, Step, Temperature
+from stand.recording.overview import Frames, Overview, Step, Temperature
 from stand.recording.salvage import BEING_RECORDED, Salvaged
 from stand.recording.utc_offsets import UtcOffsets
 from stand.recording.verify import Verification
@@ -23,7 +24,7 @@ from stand.usage import one_line
 WIDTH = 100
 _LABEL = 14
 _MOST = 20  # entries of a list before the rest is only counted
-LIST_COLUMNS = ("session", "recipe", "start (UTC)", "duration", "frames", "size", "devices", "state")
+LIST_COLUMNS = ("session", "recipe", "start (UTC)", "duration", "frames", "size", "devices", "run", "files")
 ENCODING = {CompressedImage.DESCRIPTOR.full_name: "PNG", RawImage.DESCRIPTOR.full_name: "raw"}
 
 
@@ -46,7 +47,8 @@ def list_row(seen: Glance) -> tuple[str, ...]:
         str(seen.frames),
         size(seen.size_bytes),
         "simulated" if seen.simulated else "real",
-        one_line(seen.state),
+        str(seen.run),
+        one_line(seen.state_text),
     )
 
 
@@ -67,9 +69,11 @@ def glance_json(seen: Glance, utc: UtcOffsets | None = None) -> dict[str, object
         "frames": seen.frames,
         "bytes": seen.size_bytes,
         "simulated": seen.simulated,
-        "state": seen.state,
+        "run": str(seen.run),
+        "files": str(seen.state),
         "segments": [{"file": file.name, "state": str(file.state), "bytes": file.size_bytes} for file in seen.files],
         "troubles": list(seen.troubles),
+        "missing": list(seen.missing),
     }
 
 
@@ -82,7 +86,7 @@ def info_lines(found: Overview) -> Iterator[str]:
     utc = found.utc
     parts = (
         _facts(found, utc),
-        _steps(found.steps, utc),
+        _steps(found, utc),
         _frames(found, utc),
         _temperatures(found.temperatures),
         (*_gaps(found, utc), *_events(found.events, utc)),
@@ -106,7 +110,9 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     told = seen.metadata.get
     name, known_as = seen.path.resolve().name, told("session_id", "")
     alias = f", recorded as {known_as}" if known_as not in ("", name) else ""
-    yield from _row("session", f"{name}  ({seen.state}){alias}")
+    yield from _row("session", f"{name}{alias}")
+    yield from _row("run", str(seen.run))
+    yield from _row("files", str(found.state))
     yield from _row("recipe", told("recipe", "?") + (", simulated devices" if seen.simulated else ""))
     if seen.begin_ns is not None and seen.end_ns is not None:
         span = f"{utc.date_time(seen.begin_ns)} to {utc.date_time(seen.end_ns)} UTC"
@@ -123,6 +129,8 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     yield from _row("attached", ", ".join(seen.attachments) or "nothing")
     for trouble in _limited(found.troubles):
         yield from _row("damaged", trouble)
+    for text in _limited(seen.missing):
+        yield from _row("missing", text)
     if found.troubles or seen.count(State.UNFINISHED):
         yield from _row("to do", f"stand session salvage {seen.path}")
 
@@ -147,11 +155,13 @@ def _limited(entries: Sequence[str]) -> list[str]:
     return [*entries[:_MOST], *([f"and {more} more"] if more > 0 else [])]
 
 
-def _steps(steps: Sequence[Step], utc: UtcOffsets) -> Iterator[str]:
-    done = [step for step in steps if step.state is StepState.DONE]
-    kinds = Counter(step.kind for step in steps)
+def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+    """Finished steps are counted against the plan, not against those that were begun."""
+    steps = found.steps
+    kinds = Counter(step.kind for step in steps if step.state is StepState.DONE)
     listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-    yield from _row("steps", f"{len(done)} of {len(steps)} done: {listed}" if steps else "none")
+    planned = "" if found.planned_steps is None else f" of {found.planned_steps}"
+    yield from _row("steps", f"{kinds.total()}{planned} done{f': {listed}' if listed else ''}" if steps else "none")
     told = {StepState.FAILED: "failed", StepState.STARTED: "has no end in the recording"}
     for step in steps:
         if step.state is not StepState.DONE:
@@ -226,7 +236,9 @@ def info_json(found: Overview) -> dict[str, object]:
     utc = found.utc
     return {
         **glance_json(found.glance, utc),
+        "files": str(found.state),
         "troubles": list(found.troubles),
+        "planned_steps": found.planned_steps,
         "attachments": list(found.glance.attachments),
         "ending": None if found.ending is None else found.ending.text,
         "steps": [
@@ -254,16 +266,16 @@ def verify_lines(found: Verification) -> Iterator[str]:
     """`stand session verify`: the findings, then what was read."""
     yield from map(one_line, map(str, found.findings))
     errors = sum(finding.severity == "error" for finding in found.findings)
-    verdict = "sound" if found.is_sound else f"NOT sound ({errors} {'error' if errors == 1 else 'errors'})"
+    count = f" ({errors} {'error' if errors == 1 else 'errors'})" if errors else ""
     yield (
-        f"{verdict}; {found.segments} segments, {found.messages} messages, {found.frames} frames, {size(found.bytes)} "
-        "read"
+        f"files {found.files}{count}; run {found.run}; {found.segments} segments, {found.messages} messages, "
+        f"{found.frames} frames, {size(found.bytes)} read"
     )
 
 
 def verify_json(found: Verification) -> dict[str, object]:
     """`stand session verify --json`."""
-    return {"sound": found.is_sound, **asdict(found)}
+    return {"sound": found.is_sound, "files": str(found.files), **asdict(found)}
 
 
 def table_lines(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:

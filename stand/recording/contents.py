@@ -14,6 +14,7 @@ from stand.recording.messages import FrameMeta
 from stand.recording.records import Message
 
 RUN_END = "run.end"  # kind of the event that tells how a run ended
+RUN_BEGINS = ("run.start", "run.resume")  # and of those that it began, or went on
 FrameKey = tuple[int, int]  # time_ns and sequence, which an image and its description share
 
 

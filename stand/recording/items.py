@@ -32,6 +32,20 @@ class RecordedImage:
     path: Path
 
 
+@dataclass(frozen=True, slots=True)
+class Description:
+    """A frame's description whose image is missing: the message as it was recorded."""
+
+    time_ns: int
+    sequence: int
+    data: bytes
+
+
+class UndescribedFrame(Frame):
+    """A frame whose description is missing: NaN and zeros stand for what only that would tell, and are not recorded
+    again."""
+
+
 class ImagesToCome:
     """The images that `items` has not given yet, found by the descriptions that stand for them."""
 
@@ -53,19 +67,21 @@ class ImagesToCome:
         while self._undescribed and (time_ns is None or self._undescribed[0] < time_ns):
             yield from map(self._read, self._places.pop(self._undescribed.popleft()))
 
-    def described_by(self, message: Message) -> Iterator[RecordedImage]:
-        """The image that the description in `message` stands for, none when it is lost; behind the last description
-        of that time whatever else was recorded then."""
+    def described_by(self, message: Message) -> Iterator[Frame | Description]:
+        """The image that the description in `message` stands for, the description alone when it is missing; behind the
+        last description of that time whatever else was recorded then."""
         places = self._places.get(message.time_ns, [])
         for place in places:
             image = self._read(place)
             if image.sequence == message.sequence:
                 places.remove(place)
-                yield image
+                yield frame_of(image)
                 break
+        else:
+            yield Description(message.time_ns, message.sequence, message.data)
         self._descriptions[message.time_ns] -= 1
         if not self._descriptions[message.time_ns]:
-            yield from map(self._read, self._places.pop(message.time_ns, []))
+            yield from map(frame_of, map(self._read, self._places.pop(message.time_ns, [])))
 
 
 def step_of(message: Message) -> StepMark:
@@ -107,11 +123,12 @@ def item_of(message: Message) -> Batch | StepMark | Event | None:
 
 
 def frame_of(recorded: RecordedImage) -> Frame:
-    """The frame of a recorded image; NaN for what only its description would tell. SessionError when it is damaged."""
+    """The frame of a recorded image, an UndescribedFrame when its description is missing. SessionError when it is
+    damaged."""
     with naming(recorded.path):
         image = decode_image(recorded.schema, recorded.data)
     meta = recorded.meta or _unknown(image.channel, recorded.sequence)
-    return Frame(
+    return (UndescribedFrame if recorded.meta is None else Frame)(
         channel=image.channel,
         image=image.pixels,
         time_ns=recorded.time_ns,

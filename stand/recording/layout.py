@@ -13,8 +13,13 @@ TEMPORARY = ".mcap.tmp"  # a copy that is being made; whoever made it and was ki
 DAMAGED = ".mcap.damaged"  # the original of a segment from which a salvage could not take everything
 SESSION_METADATA = "session"
 SEGMENT_METADATA = "segment"
+SALVAGE_METADATA = "salvage"  # of a segment that a salvage has made
 DEVICES = "devices"  # key of a channel's metadata: the names of the devices on its topic, with commas between
 SESSION_CRC = "session_crc32"
+# Of the files, in the record `session`. 2 (2026-11-22): the record says so; events have data; how the run ended is in
+# that of `run.end`, how long its plan is in that of `run.start` and `run.resume`; a copy says of what extent it is and
+# which holes it has. Sessions of format 1 say nothing of all that and are read as before.
+FORMAT = 2
 
 
 def segment_metadata(series: str, number: int, session: Mapping[str, str]) -> dict[str, str]:

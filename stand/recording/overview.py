@@ -1,144 +1,27 @@
-"""What a recorded session is, as far as it can be read: a glance from the ends of its files, an overview from all of
-its telemetry. Damage and unfinished segments are part of the answer, not a reason to give none.
+"""What a recorded session is, from all of its telemetry, as far as it can be read. Damage and unfinished segments are
+part of the answer, not a reason to give none.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from drivers.clock import NS_PER_S
 from drivers.interface import SessionError
 from stand.hub import Event, StepMark, StepState
-from stand.recording import messages
-from stand.recording.contents import RUN_END, Channel, Contents
-from stand.recording.damage import reading
+from stand.recording.contents import RUN_BEGINS, RUN_END, Channel, Contents
 from stand.recording.gaps import Silence, silences, told_blocks
+from stand.recording.glance import Glance, glance, within
 from stand.recording.images import decode_image
-from stand.recording.inventory import SegmentFile, State, inventory
-from stand.recording.items import event_of
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.records import FramePlace, frame_places, read_frame, read_head, telemetry_messages
-from stand.recording.summary import Summary, read_summary
-from stand.recording.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
-from stand.recording.walk import survey
-from stand.recording.wire import Source
-
-
-@dataclass(frozen=True, slots=True)
-class Glance:
-    """What names, sizes, heads and indexes tell. begin_ns and end_ns: log times of the first and the last message of
-    the finished segments, None when they hold none; `frames` are theirs, too. `troubles`: a sentence for each segment
-    that cannot be read. utc: to UTC near both ends; the steps of the system clock between them are not looked for."""
-
-    path: Path
-    files: tuple[SegmentFile, ...]
-    metadata: dict[str, str]
-    attachments: dict[str, str]
-    frames: int
-    begin_ns: int | None
-    end_ns: int | None
-    troubles: tuple[str, ...]
-    utc: UtcOffsets
-
-    @property
-    def size_bytes(self) -> int:
-        """All segments, also those that are not finished."""
-        return sum(file.size_bytes for file in self.files)
-
-    @property
-    def simulated(self) -> bool:
-        """The devices were fakes."""
-        return self.metadata.get("simulated") == "true"
-
-    def count(self, state: State) -> int:
-        """How many segments are in that state."""
-        return sum(file.state is state for file in self.files)
-
-    @property
-    def state(self) -> str:
-        """`complete`, or what it is instead."""
-        if self.troubles:
-            return f"damaged: {self.troubles[0]}"
-        told = {State.UNFINISHED: "unfinished", State.RECORDING: "being recorded", State.DAMAGED: "kept damaged"}
-        has_telemetry = any(file.series == TELEMETRY and file.state is not State.DAMAGED for file in self.files)
-        parts = [] if has_telemetry else ["telemetry missing"]
-        parts += [f"{count} {text}" for state, text in told.items() if (count := self.count(state))]
-        return ", ".join(parts) or "complete"
-
-
-def glance(path: Path) -> Glance:
-    """The session in `path` at a glance; SessionError when there is none. Costs a look at both ends of each segment."""
-    files = inventory(path)
-    if not files:
-        raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
-    troubles: list[str] = []
-    summaries: list[tuple[SegmentFile, Summary]] = []
-    for file in files:
-        if file.state is State.FINISHED:
-            try:
-                summaries.append((file, _summary(file.path)))
-            except SessionError as error:
-                troubles.append(_within(path, error))
-    metadata, attachments = _opening(files)
-    told = [summary.statistics for _, summary in summaries if summary.statistics.message_count]
-    return Glance(
-        path,
-        files,
-        metadata,
-        attachments,
-        sum(summary.statistics.message_count for file, summary in summaries if file.series == FRAMES),
-        min((statistics.message_start_time for statistics in told), default=None),
-        max((statistics.message_end_time for statistics in told), default=None),
-        tuple(troubles),
-        _utc([(file.path, summary) for file, summary in summaries if file.series == TELEMETRY]),
-    )
-
-
-def _utc(segments: list[tuple[Path, Summary]]) -> UtcOffsets:
-    """What the first segment of the telemetry and those of the last minutes say of UTC, as far as they can be read."""
-    ends_ns = [summary.statistics.message_end_time for _, summary in segments]
-    last_ns = max(ends_ns, default=0) - REPEATED_NS - NS_PER_S
-    events: list[Event] = []
-    for (path, _), end_ns in zip(segments, ends_ns, strict=True):
-        if path != segments[0][0] and end_ns < last_ns:
-            continue
-        with suppress(SessionError):
-            events += map(event_of, telemetry_messages(path, lambda channel: channel.topic == messages.EVENT))
-    return offsets_of(events)
-
-
-def _within(directory: Path, error: SessionError) -> str:
-    """Its sentence, with the file's name as it is within the session."""
-    return str(error).removeprefix(f"{directory}/")
-
-
-def _summary(path: Path) -> Summary:
-    with reading(path), path.open("rb") as file:
-        return read_summary(file, path.stat().st_size)
-
-
-def _opening(files: tuple[SegmentFile, ...]) -> tuple[dict[str, str], dict[str, str]]:
-    """Metadata `session` and the attachments, of the first segment that can tell them; empty when none can."""
-    for file in sorted(files, key=lambda file: file.state is not State.FINISHED):
-        try:
-            if file.state is State.FINISHED:
-                head = read_head(file.path)
-                return head.session, head.attachments
-            with file.path.open("rb") as opened:
-                found = survey(Source(opened.fileno()), to_first_chunk=True)
-        except (SessionError, OSError):
-            continue
-        if found.session is not None:
-            return found.session, {
-                name: entry.data.decode(errors="replace") for name, entry in found.attachments.items()
-            }
-    return {}, {}
+from stand.recording.inventory import SegmentFile, State
+from stand.recording.layout import FRAMES
+from stand.recording.records import FramePlace, frame_places, read_frame, telemetry_messages
+from stand.recording.run_word import Files
+from stand.recording.utc_offsets import UtcOffsets, offsets_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +80,18 @@ class Overview:
     events: tuple[Event, ...]
 
     @property
+    def state(self) -> Files:
+        """Whether the files are sound, by what was read."""
+        return Files.DAMAGED if self.troubles else self.glance.state
+
+    @property
+    def planned_steps(self) -> int | None:
+        """How many steps the plan of the run has, None when the recording does not tell; those of format 1 do not."""
+        begins = [event.data.get("steps") for event in self.events if event.kind in RUN_BEGINS]
+        told = begins[-1] if begins else None
+        return told if isinstance(told, int) else None
+
+    @property
     def ending(self) -> Event | None:
         """How the run ended, None when the recording does not tell."""
         return next((event for event in reversed(self.events) if event.kind == RUN_END), None)
@@ -225,7 +120,7 @@ class _Reading:
             for message in telemetry_messages(file.path, lambda channel: True):
                 self.contents.receive(message)
         except SessionError as error:
-            self.troubles.append(_within(self.directory, error))
+            self.troubles.append(within(self.directory, error))
 
 
 def overview(path: Path) -> Overview:
@@ -290,7 +185,7 @@ def _pixels(read: _Reading) -> str:
         place = read.places[0]
         pixels = decode_image(place.schema, read_frame(place).data).pixels
     except SessionError as error:
-        read.troubles.append(_within(read.directory, error))
+        read.troubles.append(within(read.directory, error))
         return ""
     height, width = pixels.shape
     return f"{width} x {height} px, {8 * pixels.itemsize} bit"

@@ -27,6 +27,7 @@ from stand.recording.disk import Disk
 from stand.recording.forms import SessionForm
 from stand.recording.homes import Beside, Homes, Kept
 from stand.recording.images import encode_image
+from stand.recording.items import Description
 from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.losses import DroppedReadings, Losses
 from stand.recording.restarts import restarted_step
@@ -82,7 +83,7 @@ class Recorder:
         self._encoder = TelemetryEncoder(devices)
         self._frames: asyncio.Queue[Frame] = asyncio.Queue(settings.queue_frames)
         self._frames_taken = 0
-        self._items: list[Item] = []  # telemetry since the last commit
+        self._items: list[Item | Description] = []  # telemetry since the last commit
         self._items_taken = 0
         self._losses = Losses()
         self._dropped = DroppedReadings()
@@ -258,6 +259,13 @@ class Recorder:
     def warn(self, kind: str, text: str) -> None:
         """An event of this kind with the next report; from any thread."""
         self._notices.append(Notice("warning", kind, text))
+
+    def keep_description(self, description: Description) -> None:
+        """A frame's description without its image, as the copy of a session that lost that image has it."""
+        if self._taking:
+            self._items.append(description)
+            self._items_taken += 1
+            self._waiting.item_published(self._clock.now_ns())
 
     def _receive(self, item: Item) -> None:
         """The hub's subscriber: enqueue, or count what does not fit."""

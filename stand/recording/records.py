@@ -21,7 +21,7 @@ from mcap.writer import MCAP0_MAGIC
 from drivers.interface import SessionError
 from stand.recording.damage import reading
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
-from stand.recording.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
+from stand.recording.layout import SALVAGE_METADATA, SEGMENT_METADATA, SESSION_METADATA, contradicts
 from stand.recording.messages import CLASSES
 from stand.recording.summary import ChunkPlace, Summary, read_summary
 from stand.recording.wire import (
@@ -60,10 +60,13 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """The first records of a segment."""
+    """The first records of a segment. place: the record `segment`, its place in the session; salvaged: the record
+    `salvage`, empty for a segment that its recorder finished itself."""
 
     session: dict[str, str]
     attachments: dict[str, str]
+    place: dict[str, str]
+    salvaged: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +137,7 @@ def _head(path: Path, file: BinaryIO) -> Head:
         raise SessionError(f"{path}: not a segment of a thermostand session")
     if contradicts(found.get(SEGMENT_METADATA, {}), session):
         raise ValueError("the session's metadata do not fit their CRC")
-    return Head(session, attachments)
+    return Head(session, attachments, found.get(SEGMENT_METADATA, {}), found.get(SALVAGE_METADATA, {}))
 
 
 def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[Message]:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,11 @@ from drivers.interface import Frame, SessionError
 from drivers.lane import Lane
 from stand.hub import Hub, Item
 from stand.recording.folder import new_folder
+from stand.recording.holes import holes_text
 from stand.recording.images import IMAGE_CLASS, ImageEncoding
+from stand.recording.items import Description
+from stand.recording.journal_lines import JOURNAL_NAME
+from stand.recording.layout import FORMAT
 from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
 from stand.recording.records import frame_places
 from stand.recording.session import Session
@@ -60,27 +65,35 @@ class ReplayClock:
         return self._wall.hold()
 
 
-async def replay(session: Session, hub: Hub, clock: Clock) -> None:
-    """Publish every item of the session on `hub`, each when `clock` has reached its time.
+def _nobody(_: Description) -> None:
+    """Descriptions whose image is missing are nothing that a stand publishes."""
+
+
+async def replay(session: Session, hub: Hub, clock: Clock, describe: Callable[[Description], None] = _nobody) -> None:
+    """Publish every item of the session on `hub`, each when `clock` has reached its time. `describe` gets the
+    descriptions whose images are missing, in their turn.
 
     The order is that of the recording. A frame was published after the middle of its exposure, which is its time; such
     an item comes at once, because the clock has passed it. Reading and decoding hold the clock, off the loop. Raises
     SessionError at the first item that cannot be read.
     """
-    items = session.items()
+    items = session.items_and_descriptions()
     lane = Lane("replay", clock)
     try:
         while portion := await lane.call(_portion, items):
             for item in portion:
                 await clock.sleep_until(item.time_ns)
-                hub.publish(item)
+                if isinstance(item, Description):
+                    describe(item)
+                else:
+                    hub.publish(item)
     finally:
         lane.close()
 
 
-def _portion(items: Iterator[Item]) -> list[Item]:
+def _portion(items: Iterator[Item | Description]) -> list[Item | Description]:
     """The next items, up to and with a frame; none at the end."""
-    portion: list[Item] = []
+    portion: list[Item | Description] = []
     for item in items:
         portion.append(item)
         if isinstance(item, Frame) or len(portion) >= PORTION_ITEMS:
@@ -94,9 +107,10 @@ async def replay_and_record(
     """Replay `session` and record it again as the session `out`, which must not exist; returns `out`.
 
     speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
-    has the same metadata (the session's id, too), attachments, devices and items: nothing in it tells of the replay,
-    because it is the same session in other segments. SessionError when it has no items, or cannot be read or written
-    whole, as on a disk that is slower than `speed`; `out` then does not appear.
+    has the same metadata (the session's id, too), attachments, devices, items and journal: nothing in it tells of
+    the replay, because it is the same session in other segments. What the original lacks, the copy's metadata tell
+    of, and an image or a description that lacks the other goes into the copy as it is. SessionError when it has no
+    items, or cannot be read or written whole, as on a disk that is slower than `speed`; `out` then does not appear.
     """
     first = next(session.items(), None)
     if first is None:
@@ -105,16 +119,19 @@ async def replay_and_record(
     hub = Hub()
     watch(hub)
     settings = _settings(session, VIRTUAL_COMMIT_S if speed is None else speed)
+    info = SessionInfo.of(session.metadata)
+    if session.holes:
+        info = replace(info, format=str(FORMAT), holes=holes_text(session.holes))
     with new_folder(out) as folder:
-        recorder = Recorder(
-            folder, _info(session.metadata), session.attachments, recorded_devices(session), hub, clock, settings
-        )
+        devices = recorded_devices(session)
+        recorder = Recorder(folder, info, session.attachments, devices, hub, clock, settings)
         recorder.start()
         background = [recorder.run()] + ([clock.run()] if isinstance(clock, VirtualClock) else [])
         try:
-            await _beside(replay(session, hub, clock), background)
+            await _beside(replay(session, hub, clock, recorder.keep_description), background)
         finally:
             await recorder.finish()
+        _copy_journal(session, folder)
         if recorder.frames_lost:
             raise SessionError(
                 f"{out}: {recorder.frames_lost} frames could not be written; is the disk full or too slow?"
@@ -135,10 +152,11 @@ async def _beside(work: Coroutine[Any, Any, None], background: Sequence[Coroutin
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _info(metadata: Mapping[str, str]) -> SessionInfo:
-    """The inverse of SessionInfo.metadata; a field the session does not tell is ""."""
-    known: dict[str, Any] = {field.name: metadata.get(field.name, "") for field in fields(SessionInfo)}
-    return SessionInfo(**{**known, "simulated": known["simulated"] == "true"})
+def _copy_journal(session: Session, folder: Path) -> None:
+    """The run's journal, where there is one; it is as good as it was."""
+    journal = session.path / JOURNAL_NAME
+    if journal.is_file():
+        shutil.copyfile(journal, folder / JOURNAL_NAME)
 
 
 def _settings(session: Session, commit_s: float) -> RecordingSettings:

@@ -29,6 +29,7 @@ from stand.recording.layout import (
     DAMAGED,
     FINISHED,
     FRAMES,
+    SALVAGE_METADATA,
     SEGMENT_METADATA,
     SESSION_METADATA,
     TELEMETRY,
@@ -44,7 +45,6 @@ from stand.recording.sink import sync_folder
 from stand.recording.walk import StoredMessage, Survey, stored_messages, survey
 from stand.recording.wire import Source
 
-SALVAGE_METADATA = "salvage"
 BEING_RECORDED = "is being recorded"
 COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}
 

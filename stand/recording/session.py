@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from itertools import accumulate, chain, pairwise
 from operator import attrgetter
@@ -22,9 +23,17 @@ from numpy.typing import NDArray
 from drivers.interface import Frame, SessionError
 from stand.hub import Event, Item, StepMark
 from stand.recording import messages
+from stand.recording.chain import Link, misplaced
 from stand.recording.columns import Column, TopicColumns
+from stand.recording.contents import Contents
+from stand.recording.coverage import coverage_of
 from stand.recording.damage import naming
+from stand.recording.extent import extent_of
+from stand.recording.hole_finder import find_holes
+from stand.recording.holes import Hole, holes_in
+from stand.recording.inventory import State, inventory
 from stand.recording.items import (
+    Description,
     ImagesToCome,
     RecordedImage,
     describes_frame,
@@ -35,7 +44,8 @@ from stand.recording.items import (
     stands_for_item,
     step_of,
 )
-from stand.recording.layout import DAMAGED, DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from stand.recording.journal_lines import journal_facts
+from stand.recording.layout import DAMAGED, DEVICES, FINISHED, FORMAT, FRAMES, TELEMETRY, UNFINISHED
 from stand.recording.records import (
     FramePlace,
     Message,
@@ -46,9 +56,12 @@ from stand.recording.records import (
     read_head,
     telemetry_messages,
 )
+from stand.recording.run_word import Run, run_word
 from stand.recording.utc_offsets import UtcOffsets, offsets_of
 
 T = TypeVar("T")
+_HOLES_TOLD_BY = (messages.CAMERA_META, messages.EVENT, messages.STEP)
+_FORMAT_DIGITS, _NUMBER_DIGITS = 4, 18
 
 
 class Session:
@@ -64,9 +77,11 @@ class Session:
         head = read_head(telemetry[0])
         self.metadata = head.session
         self._attachments = head.attachments
-        self._checked = {telemetry[0]}  # the segments known to belong to this session
-        for segment in frames[:1]:
-            self._check(segment)  # metadata has no CRC, but a second copy there
+        _check_format(path, self.metadata)
+        self._salvaged: dict[Path, bool] = {}  # of the segments known to belong here: whether a salvage has made them
+        for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others
+            with suppress(_Unreadable):  # it is told when it is read
+                self._check(segment)
         self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
         self._all_columns_read = False
         self._places_of: dict[Path, list[FramePlace]] = {}
@@ -198,14 +213,19 @@ class Session:
     def items(self) -> Iterator[Item]:
         """Every batch, frame, step mark and event in the order of their publication, each read when asked for.
 
-        A frame's place in that order is that of its description; a frame whose description is lost comes in order of
-        time. Publishing the items to a recorder gives the same messages again.
+        A frame's place in that order is that of its description; a frame whose description is missing (an
+        UndescribedFrame) comes in order of time, and a description whose image is missing is none of these items.
+        Publishing the items to a recorder gives the same messages again.
         """
+        return (item for item in self.items_and_descriptions() if not isinstance(item, Description))
+
+    def items_and_descriptions(self) -> Iterator[Item | Description]:
+        """As `items`, with the descriptions whose images are missing at their places."""
         images = ImagesToCome(self._places(), (time_ns for time_ns, _ in self.frame_metas), self._image)
         for message, item in self._decoded(stands_for_item, lambda message: (message, item_of(message))):
             yield from map(frame_of, images.undescribed_before(message.time_ns))
             if item is None:
-                yield from map(frame_of, images.described_by(message))
+                yield from images.described_by(message)
             else:
                 yield item
         yield from map(frame_of, images.undescribed_before(None))
@@ -280,12 +300,75 @@ class Session:
                     raise SessionError(f"{path}: {error}") from error
                 yield item
 
+    @cached_property
+    def holes(self) -> tuple[Hole, ...]:
+        """What of the session is not there, of the telemetry first; those that are excused make it no less whole. Reads
+        the telemetry once."""
+        contents = Contents()
+        for message in self._decoded(lambda channel: channel.topic in _HOLES_TOLD_BY, lambda message: message):
+            contents.receive(message)
+        files, recorded = inventory(self.path), holes_in(self.metadata.get("holes", ""))
+        links = {f"{path.parent.name}/{path.name}": self._link(path) for path in self.segments}
+        journal = journal_facts(self.path)
+        coverage = coverage_of(files, links, contents.events, recorded, journal)
+        is_part = extent_of(self.metadata) is not None
+        return find_holes(coverage, contents, self.frame_times_ns.tolist(), journal, is_part=is_part)
+
+    def _link(self, segment: Path) -> Link:
+        span = message_span(segment)
+        return Link(
+            segment.parent.name,
+            _number(segment),
+            span.count,
+            span.first_ns,
+            span.last_ns,
+            self.is_salvaged(segment),
+        )
+
+    @cached_property
+    def run(self) -> Run:
+        """How its run ended, as far as the session tells."""
+        extent = extent_of(self.metadata)
+        if extent is not None:
+            return extent.run
+        is_recording = any(file.state is State.RECORDING for file in inventory(self.path))
+        return run_word(self.events(), journal_facts(self.path), is_recording=is_recording)
+
+    def is_salvaged(self, segment: Path) -> bool:
+        """Whether a salvage has made this segment of what a killed recorder left."""
+        self._check(segment)
+        return self._salvaged[segment]
+
     def _check(self, segment: Path) -> None:
-        """SessionError when the segment is not of this session."""
-        if segment not in self._checked:
-            if read_head(segment).session != self.metadata:
-                raise SessionError(f"{segment}: belongs to another session than {self._telemetry[0]}")
-            self._checked.add(segment)
+        """SessionError when the segment is not of this session, or not of this place in it."""
+        if segment in self._salvaged:
+            return
+        try:
+            head = read_head(segment)
+        except SessionError as error:
+            raise _Unreadable(str(error)) from error
+        if head.session != self.metadata:
+            raise SessionError(f"{segment}: belongs to another session than {self._telemetry[0]}; move it away")
+        if head.place and misplaced(segment.parent.name, _number(segment), head.place, head.session):
+            where = f"{head.place.get('series')}/{head.place.get('number')}{FINISHED}"
+            raise SessionError(f"{segment}: was recorded as {where}; give it that name again, or move it away")
+        self._salvaged[segment] = bool(head.salvaged)
+
+
+class _Unreadable(SessionError):
+    """The head of a segment cannot be read."""
+
+
+def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
+    """SessionError for a session of a later version of thermostand."""
+    text = metadata.get("format", "1")
+    if not text.isdecimal() or len(text) > _FORMAT_DIGITS or int(text) > FORMAT:
+        raise SessionError(f"{path}: is of format {text[:20]!r}; this version of thermostand reads up to {FORMAT}")
+
+
+def _number(segment: Path) -> int:
+    digits = segment.name.partition(".")[0]
+    return int(digits) if digits.isdecimal() and len(digits) <= _NUMBER_DIGITS else -1
 
 
 def _files_of(path: Path, suffix: str) -> tuple[Path, ...]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, Self
 
 from stand.recording.images import ImageEncoding
+from stand.recording.layout import FORMAT
+
+_NOT_EMPTY = ("format", "extent", "holes")  # left out of the record when they are
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,6 +18,9 @@ class SessionInfo:
 
     simulated: the devices were fakes, in whatever time. On a virtual clock `host` is not recorded: the same run on
     another machine is the same session.
+
+    format: of the files, "" for format 1. extent: of a part that was cut out of a session, the range and how the run
+    ended, as JSON; holes: of a copy of a session that is not whole, what the original lacked (holes.py).
     """
 
     session_id: str
@@ -24,13 +31,22 @@ class SessionInfo:
     clock_source: Literal["wall", "virtual"]
     simulated: bool = False
     host: str = ""
+    format: str = str(FORMAT)
+    extent: str = ""
+    holes: str = ""
 
     def metadata(self) -> dict[str, str]:
         """The fields as MCAP metadata."""
-        fields: dict[str, str] = {**asdict(self), "simulated": str(self.simulated).lower()}
+        texts: dict[str, str] = {**asdict(self), "simulated": str(self.simulated).lower()}
         if self.clock_source == "virtual":
-            del fields["host"]
-        return fields
+            del texts["host"]
+        return {name: text for name, text in texts.items() if text or name not in _NOT_EMPTY}
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str]) -> Self:
+        """The inverse: segments that are added to a session have its own record; a field it does not tell is ""."""
+        known: dict[str, Any] = {field.name: metadata.get(field.name, "") for field in fields(cls)}
+        return cls(**{**known, "simulated": known["simulated"] == "true"})
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from drivers.interface import Frame, Quality
 from stand.hub import Batch, Event, Item, StepMark
 from stand.recording import messages
+from stand.recording.items import Description, UndescribedFrame
 from stand.recording.segment import Record, Topic
 
 SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; FrameMeta has all 64
@@ -41,7 +42,7 @@ class TelemetryEncoder:
         if isinstance(item, Batch) and item.device not in self._encoders:
             raise ValueError(f"{item.device} is not among the recorded devices {', '.join(self._encoders)}")
 
-    def encode(self, item: Item) -> Iterator[Record]:
+    def encode(self, item: Item | Description) -> Iterator[Record]:
         """The item's records, most often one."""
         match item:
             case Batch():
@@ -49,6 +50,10 @@ class TelemetryEncoder:
                 yield Record(encoder.topic, item.time_ns, encoder.encode(item))
                 if self._devices[item.device] == "axis":
                     yield from self._pose(item)
+            case Description():
+                yield Record(messages.CAMERA_META, item.time_ns, item.data, item.sequence)
+            case UndescribedFrame():
+                pass  # a description is never invented
             case Frame():
                 yield Record(
                     messages.CAMERA_META, item.time_ns, messages.encode_frame_meta(item), item.block_id & SEQUENCE_MASK

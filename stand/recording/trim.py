@@ -7,7 +7,7 @@ of the stand's clock to UTC when there was one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import chain, groupby
 from operator import attrgetter
 from pathlib import Path
@@ -18,9 +18,11 @@ from drivers.clock import NS_PER_S, seconds_ns
 from drivers.interface import SessionError
 from stand.hub import Event, StepMark, StepState
 from stand.recording import messages
+from stand.recording.extent import Extent, extent_of
 from stand.recording.folder import new_folder
+from stand.recording.holes import holes_text
 from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
-from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.layout import FORMAT, FRAMES, TELEMETRY
 from stand.recording.recorder import RecordingSettings
 from stand.recording.records import FramePlace, frame_places, read_frame, telemetry_messages
 from stand.recording.segment import Record, SeriesForm, Topic
@@ -38,7 +40,8 @@ BLOCK_BYTES = 1 << 20
 def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     """What was recorded in [begin_ns, end_ns) as the new session `out`, which must not exist; returns `out`.
 
-    Metadata, attachments, channels, sequence numbers, instants and order stay. The first messages are an event of kind
+    Attachments, channels, sequence numbers, instants and order stay, and so do the metadata, which tell the extent of
+    the part and what is missing in it as it was in the session. The first messages are an event of kind
     TRIMMED, when a step had started and not ended before `begin_ns` its mark again, and when UTC was not the stand's
     time an event that says so, all at the instant of the first message kept: a frame's step can be looked up, and
     nothing lies before the part. SessionError when nothing
@@ -54,10 +57,22 @@ def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
         )
     first_ns = first.time_ns if first is not None else places[0].time_ns
     telemetry = chain(_opening(session, first_ns, begin_ns, end_ns), [] if first is None else [first], kept)
+    metadata = _metadata(session, begin_ns, end_ns)
     with new_folder(out) as folder:
-        _write_telemetry(session, folder / TELEMETRY, telemetry, first_ns)
-        _write_frames(session, folder / FRAMES, places)
+        _write_telemetry(session, metadata, folder / TELEMETRY, telemetry, first_ns)
+        _write_frames(session, metadata, folder / FRAMES, places)
     return out
+
+
+def _metadata(session: Session, begin_ns: int, end_ns: int) -> dict[str, str]:
+    """The session's record, with the extent and the holes of the part."""
+    before = extent_of(session.metadata)
+    if before is not None:  # a part of a part is one of the whole
+        begin_ns, end_ns = max(begin_ns, before.begin_ns), min(end_ns, before.end_ns)
+    extent = Extent(session.metadata.get("session_id", session.path.name), begin_ns, end_ns, session.run)
+    holes = [part for hole in session.holes if (part := hole.within(begin_ns, end_ns)) is not None]
+    told = {"format": str(FORMAT), "extent": extent.record(), "holes": holes_text(holes)}
+    return {**session.metadata, **{name: text for name, text in told.items() if text}}
 
 
 def _places(session: Session) -> Iterator[FramePlace]:
@@ -112,11 +127,13 @@ def _step_under_way(session: Session, begin_ns: int) -> StepMark | None:
     return under_way
 
 
-def _write_telemetry(session: Session, folder: Path, records: Iterator[Record], first_ns: int) -> None:
+def _write_telemetry(
+    session: Session, metadata: Mapping[str, str], folder: Path, records: Iterator[Record], first_ns: int
+) -> None:
     topics = {topic.name: topic for topic in recorded_topics(session)}
     for name in (messages.EVENT, messages.LOG, messages.STEP):
         topics.setdefault(name, Topic(name, messages.CLASSES[name]))
-    series = _series(session, folder, tuple(topics.values()), CompressionType.ZSTD)
+    series = _series(session, metadata, folder, tuple(topics.values()), CompressionType.ZSTD)
     now_ns = first_ns
     for block in _blocks(records):
         now_ns = max(now_ns, block[-1].time_ns)
@@ -137,12 +154,12 @@ def _blocks(records: Iterator[Record]) -> Iterator[list[Record]]:
         yield block
 
 
-def _write_frames(session: Session, folder: Path, places: list[FramePlace]) -> None:
+def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, places: list[FramePlace]) -> None:
     """One frame per commit, as a chunk holds one; a segment has one kind of image."""
     folder.mkdir()
     classes = {message.DESCRIPTOR.full_name: message for message in IMAGE_CLASS.values()}
     for schema, alike in groupby(places, key=attrgetter("schema")):
-        series = _series(session, folder, (Topic(CAMERA_IMAGE, classes[schema]),), CompressionType.NONE)
+        series = _series(session, metadata, folder, (Topic(CAMERA_IMAGE, classes[schema]),), CompressionType.NONE)
         for place in alike:
             message = read_frame(place)
             record = Record(CAMERA_IMAGE, message.time_ns, message.data, message.sequence)
@@ -150,13 +167,13 @@ def _write_frames(session: Session, folder: Path, places: list[FramePlace]) -> N
         _finish(series)
 
 
-def _series(session: Session, folder: Path, topics: tuple[Topic, ...], compression: CompressionType) -> Series:
+def _series(
+    session: Session, metadata: Mapping[str, str], folder: Path, topics: tuple[Topic, ...], compression: CompressionType
+) -> Series:
     folder.mkdir(exist_ok=True)
     usual = RecordingSettings()
     segment_ns = seconds_ns(usual.segment_s)
-    form = SeriesForm(
-        folder.name, topics, compression, session.metadata, session.attachments, usual.segment_bytes, segment_ns
-    )
+    form = SeriesForm(folder.name, topics, compression, metadata, session.attachments, usual.segment_bytes, segment_ns)
     return Series(folder, form)
 
 

@@ -2,6 +2,7 @@
 
 An error is something that was recorded and cannot be trusted or is not there; a note is a hole in what was measured
 that the recording itself tells of: silence of a device, frames the camera or a slow disk lost, a salvaged segment.
+How the run ended is another matter: a stopped run has sound files.
 """
 
 from __future__ import annotations
@@ -10,36 +11,33 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from math import inf
 from pathlib import Path
 
-from mcap.records import DataEnd
-from mcap.records import Message as StoredMessage
-from mcap.stream_reader import StreamReader
-
-from drivers.clock import NS_PER_S
 from drivers.interface import SessionError
-from stand.recording.contents import RUN_END, Contents, FrameKey
-from stand.recording.damage import DAMAGE
+from stand.recording.chain import Link, misplaced, missing_segments
+from stand.recording.contents import Contents, FrameKey
+from stand.recording.coverage import Coverage, coverage_of
+from stand.recording.ends import is_of_a_run, lost_end
+from stand.recording.extent import Extent, extent_of
+from stand.recording.frame_account import frame_account
 from stand.recording.gaps import FRAMES_DROPPED, silences, told_blocks
+from stand.recording.holes import Hole, holes_in, segments_text
 from stand.recording.images import CAMERA_IMAGE
 from stand.recording.inventory import SegmentFile, State, inventory
+from stand.recording.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
+from stand.recording.kept import is_recovered
 from stand.recording.layout import (
     FINISHED,
     FRAMES,
+    SALVAGE_METADATA,
     SEGMENT_METADATA,
-    SESSION_CRC,
     SESSION_METADATA,
     TELEMETRY,
-    segment_metadata,
 )
 from stand.recording.records import Message
-from stand.recording.salvage import SALVAGE_METADATA
+from stand.recording.run_word import Files, Run, run_word
 from stand.recording.segment_check import Damage, SegmentCheck, check_segment
 from stand.recording.utc_offsets import UtcOffsets, offsets_of
-
-# Between the middle of a frame's exposure and its description being on the disk, or the frame itself.
-TORN_NS = 5 * NS_PER_S
 
 
 class Severity(StrEnum):
@@ -51,11 +49,13 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One sentence; `where` is the file it is about, as in `telemetry/0003.mcap`, or "" for the whole session."""
+    """One sentence; `where` is the file it is about, as in `telemetry/0003.mcap`, or "" for the whole session. `files`:
+    what an error makes of the session's files, sound for a note."""
 
     severity: Severity
     where: str
     text: str
+    files: Files = Files.SOUND
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.where}{': ' if self.where else ''}{self.text}"
@@ -63,13 +63,20 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What was read (finished segments) and what was found."""
+    """What was read (finished segments), what was found, and how the run ended."""
 
     findings: tuple[Finding, ...]
     segments: int
     messages: int
     frames: int
     bytes: int
+    run: Run
+
+    @property
+    def files(self) -> Files:
+        """The gravest of what was found."""
+        words = {finding.files for finding in self.findings}
+        return next((word for word in (Files.DAMAGED, Files.INCOMPLETE) if word in words), Files.SOUND)
 
     @property
     def is_sound(self) -> bool:
@@ -102,48 +109,26 @@ class _Read:
             for damage in check.damages
         )
 
-    def is_torn_at(self, series: str, time_ns: int) -> bool:
-        """The series lost what it held of that instant because the recorder was killed: it lies behind the end of a
-        salvaged segment and before the next one, or right behind the last segment of a run without an end."""
-        checks = [check for name, check in self.checks.items() if name.startswith(f"{series}/")]
-        is_ended = any(event.kind == RUN_END for event in self.contents.events)
-        late_ns = _late_ns(series)
-        next_ns = [*(check.first_ns for check in checks[1:]), inf]
-        for check, end_ns in zip(checks, next_ns, strict=False):  # without any check there is no next either
-            if SALVAGE_METADATA in check.metadata:
-                torn_ns = end_ns
-            elif end_ns == inf and not is_ended:
-                torn_ns = check.last_ns + TORN_NS
-            else:
-                continue
-            if check.last_ns - late_ns < time_ns < torn_ns:
-                return True
-        return False
+    def coverage(self, journal: JournalFacts | None) -> Coverage:
+        """Which instants the segments that were read cover."""
+        session = self.session()
+        links = {file.name: _link(file, self.checks[file.name]) for file in self.files if file.name in self.checks}
+        return coverage_of(self.files, links, self.contents.events, holes_in(session.get("holes", "")), journal)
 
-    def unread(self, series: str) -> list[tuple[float, float]]:
-        """Between which instants the series goes on in segments that were not read: from the end of one that was to
-        the begin of the next. A recorder at work may be about to write what comes behind the last one."""
-        stretches: list[tuple[float, float]] = []
-        begin_ns, is_open, number = -inf, False, -1
-        for file in self.files:
-            check = self.checks.get(file.name)
-            if file.series != series or (check is None and file.number == number):
-                continue  # what was left beside a finished segment of the same number counts for nothing
-            if check is None:
-                is_open |= file.state is not State.DAMAGED
-                continue
-            number = file.number
-            if check.messages:
-                stretches += [(begin_ns, check.first_ns)] if is_open else []
-                begin_ns, is_open = check.last_ns - _late_ns(series), False
-        if is_open or any(file.state is State.RECORDING for file in self.files):
-            stretches.append((begin_ns, inf))
-        return stretches
+    def session(self) -> dict[str, str]:
+        """The record `session` that most segments have."""
+        told = Counter(_entries(check.metadata.get(SESSION_METADATA)) for check in self.checks.values())
+        return dict(told.most_common(1)[0][0]) if told else {}
 
 
-def _late_ns(series: str) -> int:
-    """How long before the end of a segment something may have been that is in the next one."""
-    return TORN_NS if series == TELEMETRY else 0  # a description is written after what happened meanwhile
+def _link(file: SegmentFile, check: SegmentCheck) -> Link:
+    is_salvaged = SALVAGE_METADATA in check.metadata
+    return Link(file.series, file.number, check.messages, check.first_ns, check.last_ns, is_salvaged)
+
+
+def _extent(extent: Extent | None, utc: UtcOffsets) -> Iterator[Finding]:
+    if extent is not None:
+        yield _note(extent.text(utc))
 
 
 def _no_report(done_bytes: float, text: str) -> None:
@@ -164,17 +149,24 @@ def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Ver
     for file in finished:
         read.checks[file.name] = _checked(file, read, report, done_bytes)
         done_bytes += file.size_bytes
+    journal, utc = journal_facts(path), offsets_of(read.contents.events)
+    coverage = read.coverage(journal)
+    extent = extent_of(read.session())
     findings = (
+        *_extent(extent, utc),
         *_not_finished(files, read.checks),
-        *_missing(files),
+        *_missing(coverage, utc),
         *_damaged(read),
         *_metadata(finished, read),
-        *_frames_against_descriptions(read),
+        *(() if extent else _journal_and_end(read.contents, coverage, journal, utc)),
+        *_frames_against_descriptions(read, coverage),
         *_frames_lost(read.contents),
         *_silences(read.contents),
     )
     total = sum(check.messages for check in read.checks.values())
-    return Verification(findings, len(finished), total, read.images.total(), done_bytes)
+    is_recording = any(file.state is State.RECORDING for file in files)
+    run = extent.run if extent else run_word(read.contents.events, journal, is_recording=is_recording)
+    return Verification(findings, len(finished), total, read.images.total(), done_bytes, run)
 
 
 def _checked(file: SegmentFile, read: _Read, report: Callable[[float, str], None], before_bytes: int) -> SegmentCheck:
@@ -195,7 +187,7 @@ def _not_finished(files: Iterable[SegmentFile], checks: Mapping[str, SegmentChec
     for file in files:
         match file.state:
             case State.UNFINISHED:
-                yield _error("is not finished; `stand session salvage` recovers what is in it", file.name)
+                yield _missing_part("is not finished; `stand session salvage` recovers what is in it", file.name)
             case State.DAMAGED if _is_recovered(file, checks.get(f"{file.series}/{file.number:04d}{FINISHED}")):
                 yield _note(
                     "a salvage recovered every message and kept the original because it was finished and damaged; "
@@ -211,40 +203,56 @@ def _not_finished(files: Iterable[SegmentFile], checks: Mapping[str, SegmentChec
 
 
 def _is_recovered(kept: SegmentFile, salvaged: SegmentCheck | None) -> bool:
-    """Whether the salvaged segment has every message of the original: its salvage lost no byte, and both have as many.
-    The original must go on to the end of its data; of one that was cut short nobody knows how many it had."""
-    if salvaged is None or salvaged.metadata.get(SALVAGE_METADATA, {}).get("lost_bytes") != "0":
-        return False
-    messages = 0
-    try:
-        with kept.path.open("rb") as file:
-            for record in StreamReader(file, validate_crcs=True, record_size_limit=kept.size_bytes).records:
-                if isinstance(record, DataEnd):
-                    return messages == salvaged.messages
-                messages += isinstance(record, StoredMessage)
-    except DAMAGE:
-        pass
-    return False
+    return salvaged is not None and is_recovered(kept, salvaged.metadata.get(SALVAGE_METADATA, {}), salvaged.messages)
 
 
 def _error(text: str, where: str = "") -> Finding:
-    return Finding(Severity.ERROR, where, text)
+    return Finding(Severity.ERROR, where, text, Files.DAMAGED)
+
+
+def _missing_part(text: str, where: str = "") -> Finding:
+    return Finding(Severity.ERROR, where, text, Files.INCOMPLETE)
 
 
 def _note(text: str, where: str = "") -> Finding:
     return Finding(Severity.NOTE, where, text)
 
 
-def _missing(files: Iterable[SegmentFile]) -> Iterator[Finding]:
-    """Segments are numbered from 0 without a hole."""
-    numbers: dict[str, set[int]] = {}
-    for file in files:
-        numbers.setdefault(file.series, set()).add(file.number)
-    for series, present in numbers.items():
-        for number in sorted(set(range(max(present))) - present):
-            yield _error("is missing", f"{series}/{number:04d}.mcap")
-    if TELEMETRY not in numbers:
-        yield _error("is missing", TELEMETRY)
+def _missing(coverage: Coverage, utc: UtcOffsets) -> Iterator[Finding]:
+    """Segments are numbered from 0 without a gap; a copy of a session with gaps has them in its record."""
+    for series in (TELEMETRY, FRAMES):
+        numbers = {file.number for file in coverage.files if file.series == series}
+        for hole in missing_segments(series, numbers, coverage.links.values()):
+            yield _missing_part(_are_missing(hole, utc), f"{series}/{hole.first:04d}.mcap")
+        if not numbers and series == TELEMETRY:
+            yield _missing_part("is missing", TELEMETRY)
+    for hole in coverage.holes:
+        found = _note if hole.excused else _missing_part
+        yield found(f"missing in the session this was copied from: {hole.text(utc)}")
+
+
+def _are_missing(hole: Hole, utc: UtcOffsets) -> str:
+    if hole.first == hole.last:
+        return "is missing"
+    when = hole.when(utc)
+    return f"is missing, and so are all up to {hole.last:04d}.mcap{f', {when}' if when else ''}"
+
+
+def _journal_and_end(
+    contents: Contents, coverage: Coverage, journal: JournalFacts | None, utc: UtcOffsets
+) -> Iterator[Finding]:
+    """The journal by itself, and what it says that is not in the recording."""
+    if journal is None and is_of_a_run(contents.events, contents.marks):
+        yield _missing_part("is missing; what the recording itself says of the run counts", JOURNAL_NAME)
+    if journal is not None and journal.damage:
+        yield _error(journal.damage, JOURNAL_NAME)
+    has_gap = any(hole.series == TELEMETRY for hole in coverage.holes) or any(
+        missing_segments(TELEMETRY, (file.number for file in coverage.files if file.series == TELEMETRY), ())
+    )
+    lost = lost_end(coverage, contents.events, () if has_gap else contents.marks, journal, utc)
+    if lost is not None and lost.hole.first is not None:
+        where = segments_text(TELEMETRY, lost.hole.first, None).partition(" ")[0]
+        yield _missing_part(f"is missing, with all that followed: {lost.why}", where)
 
 
 def _damaged(read: _Read) -> Iterator[Finding]:
@@ -265,8 +273,7 @@ def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
         if _entries(metadata.get(SESSION_METADATA)) != sessions.most_common(1)[0][0]:
             yield _error("tells of another session than the other segments", file.name)
         segment, session = metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})
-        place = segment_metadata(file.series, file.number, session)
-        if segment.keys() - place.keys() or any(segment.get(key) != place[key] for key in place.keys() - {SESSION_CRC}):
+        if misplaced(file.series, file.number, segment, session):
             yield _error("tells of another place in the session than its name does", file.name)
         if (salvage := metadata.get(SALVAGE_METADATA)) is not None:
             yield _note(f"was salvaged ({', '.join(f'{key}: {text}' for key, text in salvage.items())})", file.name)
@@ -276,31 +283,19 @@ def _entries(metadata: dict[str, str] | None) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((metadata or {}).items()))
 
 
-def _frames_against_descriptions(read: _Read) -> Iterator[Finding]:
+def _frames_against_descriptions(read: _Read, coverage: Coverage) -> Iterator[Finding]:
     """Every image has its description in the telemetry and the other way round; what was not read may have it."""
     described = Counter(key for key, _ in read.contents.metas)
     block_ids = {key: meta.block_id for key, meta in read.contents.metas}
     told, utc = told_blocks(read.contents.events), offsets_of(read.contents.events)
-    bare = _without_a_reason(read.images - described, TELEMETRY, read)
-    gone = _without_a_reason(described - read.images, FRAMES, read)
-    bare_torn = [key for key in bare if read.is_torn_at(TELEMETRY, key[0])]
-    gone_told = [key for key in gone if any(block_ids[key] in blocks for blocks in told)]
-    gone_torn = [key for key in gone if key not in gone_told and read.is_torn_at(FRAMES, key[0])]
-    yield from _frames(_error, set(bare) - {*bare_torn}, "without a description in the telemetry", utc)
-    yield from _frames(_error, set(gone) - {*gone_told, *gone_torn}, "missing, though described in the telemetry", utc)
-    yield from _frames(_note, gone_told, "described but lost by the recorder, as its events say", utc)
-    yield from _frames(_note, bare_torn, "without a description, which was lost when the recorder was killed", utc)
-    yield from _frames(_note, gone_torn, "described but lost when the recorder was killed", utc)
-
-
-def _without_a_reason(keys: Iterable[FrameKey], series: str, read: _Read) -> list[FrameKey]:
-    """Those that no finding about a segment of `series` explains."""
-    unread = read.unread(series)
-    return [
-        key
-        for key in keys
-        if not read.is_damaged_at(series, key[0]) and not any(begin < key[0] < end for begin, end in unread)
-    ]
+    found = frame_account(read.images, block_ids, described, told, coverage, read.is_damaged_at)
+    yield from _frames(_missing_part, found.bare, "without a description in the telemetry", utc)
+    yield from _frames(_missing_part, found.gone, "missing, though described in the telemetry", utc)
+    yield from _frames(_note, found.gone_told, "described but lost by the recorder, as its events say", utc)
+    yield from _frames(
+        _note, found.bare_torn, "without a description, which was lost when the recorder was killed", utc
+    )
+    yield from _frames(_note, found.gone_torn, "described but lost when the recorder was killed", utc)
 
 
 def _frames(

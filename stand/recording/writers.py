@@ -10,6 +10,7 @@ from drivers.interface import Frame
 from stand.hub import Item
 from stand.recording.home import FolderLost
 from stand.recording.images import CAMERA_IMAGE
+from stand.recording.items import Description
 from stand.recording.losses import Losses
 from stand.recording.segment import Record
 from stand.recording.store import SeriesFace, SpaceFace
@@ -113,7 +114,7 @@ class TelemetryWriter:
         """Messages that are not on the disk yet."""
         return len(self._backlog)
 
-    def save(self, items: Sequence[Item], now_ns: int) -> OSError | None:
+    def save(self, items: Sequence[Item | Description], now_ns: int) -> OSError | None:
         """All items so far on the disk, or why they are not; FolderLost also when there was nothing to write."""
         for item in items:
             self._backlog.extend(self._encoder.encode(item))

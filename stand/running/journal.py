@@ -12,7 +12,7 @@ it was never acknowledged, and is cut off before anything is appended.
     Again     steps that were done are to be done again
     Tripped   the guard has made the stand safe, and why
     Cleared   an operator has seen to what had tripped
-    Ended     complete, tripped, interrupted by the operator, or failed
+    Ended     complete, stopped by the operator, tripped, or failed
 
 Instants are ns on the stand's clock, so a run in virtual time has the same journal each time.
 """
@@ -117,10 +117,10 @@ class Cleared:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How the run ended, and why."""
+    """How the run ended, and why. `interrupted` is what journals of format 1 call `stopped`, by the operator."""
 
     time_ns: int
-    status: Literal["complete", "tripped", "interrupted", "failed"]
+    status: Literal["complete", "stopped", "tripped", "failed", "interrupted"]
     text: str
 
 

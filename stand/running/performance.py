@@ -12,6 +12,7 @@ from compensation.target import Target
 from drivers.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
 from drivers.documents import parse_document
 from drivers.interface import SessionError, StandTripped
+from experiments.steps import Capture
 from stand.assembly import Assembly
 from stand.estimating.estimate import price
 from stand.estimating.learned import load_learned
@@ -19,9 +20,11 @@ from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Fault
 from stand.hub import Event, Item
 from stand.poller import Poller
+from stand.recording.contents import RUN_END
 from stand.recording.instants import utc_text
 from stand.recording.recorder import Recorder
 from stand.recording.restarts import restarted
+from stand.recording.run_word import Run
 from stand.remote.control import handlers, serve
 from stand.remote.status import StatusBoard
 from stand.running.camera_gap import doubt
@@ -91,7 +94,8 @@ async def perform(work: Performance) -> None:
         stop.taking_down()
         assembly.stand.gate.let_go()  # what an operator presses now holds nothing
         try:
-            log.tell("info" if ended.status == "complete" else "error", "run.end", ended.text)
+            level = "info" if ended.status == "complete" else "error"
+            log.tell(level, RUN_END, ended.text, {"status": ended.status})
         finally:  # also when somebody who listens fails
             await _taken_down(assembly, guard, watchers, pollers)
             settling.close()
@@ -123,9 +127,9 @@ async def _begun(
     for poller in pollers:
         await poller.first()
     if work.before is None:
-        log.tell("info", "run.start", f"recipe {work.order.recipe.name}", _host_now(work.assembly.clock))
+        log.tell("info", "run.start", f"recipe {work.order.recipe.name}", _begin_data(work))
     else:
-        _tell_interruption(work.before, work.assembly.clock, log)
+        _tell_interruption(work, work.before, log)
         if work.before.again:
             step_id, frames = work.before.again[-1], work.before.superseded
             work.assembly.hub.publish(restarted(work.assembly.clock.now_ns(), step_id, frames, "from a cold camera"))
@@ -172,10 +176,13 @@ def _judge_camera(before: Interruption, assembly: Assembly) -> None:
         stand.lose_equilibrium(reason)
 
 
-def _host_now(clock: Clock) -> dict[str, object]:
-    """For whoever resumes the run: whether the host has run on since."""
-    boot = boot_of(clock)
-    return {} if boot is None else {"boot_id": boot.id}
+def _begin_data(work: Performance) -> dict[str, object]:
+    """For whoever resumes the run: whether the host has run on since. For whoever counts what is done: how many steps
+    and frames the plan has."""
+    plan, boot = tuple(work.order.recipe.plan()), boot_of(work.assembly.clock)
+    frames = sum(planned.step.frames for planned in plan if isinstance(planned.step, Capture))
+    data: dict[str, object] = {"steps": len(plan), "frames": frames}
+    return data if boot is None else {**data, "boot_id": boot.id}
 
 
 async def _board(work: Performance, guard: Guard) -> StatusBoard:
@@ -213,11 +220,12 @@ def _first_entries(work: Performance) -> tuple[Entry, ...]:
     return (*cleared, Gap(work.before.last_ns, now_ns), *again)
 
 
-def _tell_interruption(before: Interruption, clock: Clock, log: Logbook) -> None:
+def _tell_interruption(work: Performance, before: Interruption, log: Logbook) -> None:
     """The end of the run that was interrupted, the gap since, and that it goes on."""
+    clock = work.assembly.clock
     now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
     if not before.ended:
-        log.tell("error", "run.end", f"interrupted: killed after {utc_text(last_utc_ns)}")
+        log.tell("error", RUN_END, f"interrupted: killed after {utc_text(last_utc_ns)}", {"status": Run.INTERRUPTED})
     gap_s = (now_ns - before.last_ns) / NS_PER_S
     span = f"from {utc_text(last_utc_ns)} to {utc_text(now_ns + utc_offset_ns(clock))}"
     log.tell("warning", "gap", f"nothing was recorded and nobody watched the stand {span} ({gap_s:.3f} s)")
@@ -229,7 +237,7 @@ def _tell_interruption(before: Interruption, clock: Clock, log: Logbook) -> None
         "info",
         "run.resume",
         f"recipe {before.order.recipe.name} goes on, {done}; thermostand {version}",
-        _host_now(clock),
+        _begin_data(work),
     )
 
 
@@ -267,7 +275,7 @@ def _ending(fault: Fault | None, error: BaseException) -> Ended:
         cause = cause_of(error)
         reason = "cancelled" if isinstance(cause, asyncio.CancelledError) else failure_text(cause)
         return Ended(0, "failed", f"failed: {reason}")
-    return Ended(0, "interrupted" if fault.rule == OPERATOR else "tripped", f"aborted: {fault.text}")
+    return Ended(0, "stopped" if fault.rule == OPERATOR else "tripped", f"aborted: {fault.text}")
 
 
 def _hold_while_not_recorded(gate: Gate) -> Callable[[Item], None]:

@@ -11,7 +11,6 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, cast
 
 from drivers.interface import SessionError
 from experiments.steps import Capture, PlannedStep
@@ -20,7 +19,7 @@ from stand.hub import StepState
 from stand.order_files import parse_order
 from stand.progress import late_progress
 from stand.recipe import Recipe
-from stand.recording.overview import glance
+from stand.recording.glance import glance
 from stand.recording.salvage import Salvaged, salvage_unfinished
 from stand.recording.session import Session
 from stand.recording.settings import SessionInfo
@@ -111,7 +110,7 @@ def _interruption(
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
     order = _order(session, first)
-    info = _info(session.metadata)
+    info = SessionInfo.of(session.metadata)
     config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
     order = replace(order, config=config)
     found = _found(session, entries, order.recipe)
@@ -162,21 +161,6 @@ def _order(session: Session, first: Begun) -> Order:
             f"{session.path}: this version of thermostand makes another plan of its recipe; begin a new run"
         )
     return order
-
-
-def _info(metadata: Mapping[str, str]) -> SessionInfo:
-    """The session's own metadata again: its segments must all have the same."""
-    clock_source = cast('Literal["wall", "virtual"]', metadata["clock_source"])
-    return SessionInfo(
-        session_id=metadata["session_id"],
-        recipe=metadata["recipe"],
-        camera_serial=metadata["camera_serial"],
-        operator=metadata["operator"],
-        software_version=metadata["software_version"],
-        clock_source=clock_source,
-        simulated=metadata["simulated"] == "true",
-        host=metadata.get("host", ""),
-    )
 
 
 def journaled(entries: Iterable[Entry]) -> tuple[frozenset[str], dict[str, float]]:

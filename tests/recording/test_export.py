@@ -17,7 +17,7 @@ from stand.hub import Batch, Event
 from stand.recording.export import export
 from stand.recording.images import CAMERA_IMAGE
 from stand.recording.instants import utc_text
-from stand.recording.layout import FRAMES
+from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.segment import Record, SeriesForm, Topic
 from stand.recording.series import Series
 from stand.recording.session import Session
@@ -198,9 +198,8 @@ async def test_the_index_says_what_the_sidecars_say(tmp_path):
 
 
 async def test_a_frame_without_its_description_is_exported_with_what_is_known(tmp_path):
-    await record(tmp_path / "s", 1)
-    await record(tmp_path / "other", 1, items=lambda time_ns, index: half_second(time_ns + NS_PER_S, index + 1))
-    (tmp_path / "other" / FRAMES / "0000.mcap").rename(tmp_path / "s" / FRAMES / "0001.mcap")
+    await record(tmp_path / "s", 4, segment_s=1.0)
+    (tmp_path / "s" / TELEMETRY / "0001.mcap").unlink()
     export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
     told = sidecar(tmp_path / "out" / "frames" / "000002.txt")
     assert told["camera_temperature_degC"] == told["exposure_s"] == " nan"

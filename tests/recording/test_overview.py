@@ -10,9 +10,10 @@ import pytest
 from drivers.clock import NS_PER_S
 from drivers.interface import ConfigError, Frame, Reading, SessionError, bad_reading
 from stand.hub import Batch, Event, StepMark, StepState
+from stand.recording.glance import glance
 from stand.recording.instants import date_time, duration, parse_instant, utc_text
 from stand.recording.inventory import State, inventory
-from stand.recording.overview import glance, overview
+from stand.recording.overview import overview
 
 from .recorded import ATTACHMENTS, START_NS, record
 
@@ -58,7 +59,7 @@ async def session(tmp_path):
 async def test_a_glance_tells_what_when_and_how_much(session):
     seen = glance(session)
     files = [path for path in session.rglob("*") if path.is_file()]
-    assert (seen.frames, seen.state, seen.simulated) == (5, "complete", False)
+    assert (seen.frames, seen.state, seen.simulated) == (5, "sound", False)
     assert (seen.begin_ns, seen.end_ns) == (START_NS, START_NS + 9 * NS_PER_S)
     assert seen.size_bytes == sum(path.stat().st_size for path in files)
     assert seen.metadata["recipe"] == "thermal_cycle"
@@ -98,7 +99,7 @@ async def test_the_overview_has_frames_temperatures_and_events(session):
 async def test_a_damaged_segment_is_told_and_the_others_are_read(session):
     path = session / "telemetry" / "0001.mcap"
     path.write_bytes(path.read_bytes()[:-20])
-    assert glance(session).state.startswith("damaged: telemetry/0001.mcap: ")
+    assert glance(session).state_text.startswith("damaged: telemetry/0001.mcap: ")
     found = overview(session)
     assert [trouble.startswith("telemetry/0001.mcap: ") for trouble in found.troubles] == [True] * len(found.troubles)
     assert found.troubles
@@ -121,7 +122,7 @@ async def test_a_recording_without_a_finished_segment_still_tells_what_it_is(ses
         path.rename(path.with_name(f"{path.name}.part"))
     seen = glance(session)
     assert seen.metadata["recipe"] == "thermal_cycle"
-    assert seen.state == f"{len(seen.files)} unfinished"
+    assert seen.state_text.startswith(f"incomplete: {len(seen.files)} segments not finished")
     assert (seen.frames, seen.begin_ns, seen.end_ns) == (0, None, None)
     assert overview(session).steps == ()
 
@@ -130,9 +131,11 @@ async def test_a_session_without_telemetry_is_not_complete(session):
     for path in (session / "telemetry").iterdir():
         path.rename(path.with_name(f"{path.name}.damaged"))
     kept = len(list((session / "telemetry").iterdir()))
-    assert glance(session).state == f"telemetry missing, {kept} kept damaged"
+    assert glance(session).state_text == (
+        f"damaged: telemetry/0000.mcap.damaged: is what a salvage could not recover all of and {kept - 1} more"
+    )
     shutil.rmtree(session / "telemetry")
-    assert glance(session).state == "telemetry missing"
+    assert glance(session).state_text == "incomplete: telemetry is missing"
     assert overview(session).frames.count == 5
 
 
@@ -153,7 +156,9 @@ async def test_frames_that_the_recorder_lost_are_counted_apart_from_those_that_n
 async def test_what_a_salvage_kept_and_what_is_no_segment(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
     (session / "frames" / "notes.txt").write_text("a cloudy night")
-    assert glance(session).state == "1 kept damaged"
+    assert glance(session).state_text == (
+        "damaged: frames/0000.2.mcap.damaged: is what a salvage could not recover all of"
+    )
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
@@ -162,7 +167,7 @@ async def test_a_segment_that_may_not_be_opened_hides_no_other(session):
     part = session / "telemetry" / "0009.mcap.part"
     part.write_bytes(b"")
     part.chmod(0)
-    assert glance(session).state == "1 unfinished"
+    assert glance(session).state_text == "incomplete: 1 segment not finished"
     assert [file for file in inventory(session) if file.path != part] == list(before.files)
 
 

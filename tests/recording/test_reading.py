@@ -136,7 +136,14 @@ def test_a_frame_without_description_comes_in_order_of_time_and_a_description_wi
     write_images(tmp_path, [small_frame(second) for second in (1, 1.5, 5)])
     session = Session.open(tmp_path)
     told = [(type(item).__name__, (item.time_ns - START_NS) / NS_PER_S) for item in session.items()]
-    assert told == [("Batch", 0), ("Frame", 1), ("Frame", 1.5), ("Batch", 2), ("Batch", 4), ("Frame", 5)]
+    assert told == [
+        ("Batch", 0),
+        ("Frame", 1),
+        ("UndescribedFrame", 1.5),
+        ("Batch", 2),
+        ("Batch", 4),
+        ("UndescribedFrame", 5),
+    ]
     assert [time_ns for time_ns, _ in session.frame_metas] == [at(1), at(3)]
     assert [meta.block_id for _, meta in session.frame_metas] == [1, 3]
 

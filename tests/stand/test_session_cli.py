@@ -60,13 +60,24 @@ def test_the_list_has_a_line_for_each_session_and_for_a_damaged_one(session: Pat
     (session.parent / "no-session").mkdir()
     (session.parent / "notes.txt").write_text("a cloudy night")
     header, *lines = ask("list", session.parent).stdout.splitlines()
-    assert header.split() == ["session", "recipe", "start", "(UTC)", "duration", "frames", "size", "devices", "state"]
+    assert header.split() == [
+        "session",
+        "recipe",
+        "start",
+        "(UTC)",
+        "duration",
+        "frames",
+        "size",
+        "devices",
+        "run",
+        "files",
+    ]
     running, first, last = (line.split(maxsplit=8) for line in lines)  # the one without a known start is first
     assert (running[0], running[1]) == ("y-running", "thermal_cycle")
-    assert lines[0].endswith("3 unfinished")
+    assert "interrupted  incomplete: 3 segments not finished and 1 more" in lines[0]
     assert first[:6] == [session.name, "thermal_cycle", "2026-01-01", "18:00:00", "5.5", "s"]
     assert first[6] == "12"
-    assert lines[1].endswith("real     complete")
+    assert lines[1].endswith("real     interrupted  sound")
     assert last[0] == "z-damaged"
     assert "damaged: telemetry/0001.mcap: " in lines[2]
 
@@ -78,7 +89,8 @@ def _as_part(source: str, target: str) -> str:
 def test_the_list_as_json(session: Path):
     (listed,) = json.loads(ask("list", session.parent, "--json").stdout)
     assert listed["name"] == session.name
-    assert (listed["frames"], listed["state"], listed["simulated"]) == (COUNT, "complete", False)
+    assert (listed["frames"], listed["run"], listed["files"]) == (COUNT, "interrupted", "sound")
+    assert listed["simulated"] is False
     assert listed["start"] == "2026-01-01T18:00:00.073456789Z"  # the first frame's middle, half of its exposure ago
     assert listed["bytes"] == sum(path.stat().st_size for path in session.rglob("*.mcap"))
     assert {entry["file"].partition("/")[0] for entry in listed["segments"]} == {"telemetry", "frames"}
@@ -106,7 +118,9 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
     assert max(map(len, output.splitlines())) <= 100
     said = " ".join(output.split())
     for fact in (
-        f"session {session.name} (complete), recorded as night-1",
+        f"session {session.name}, recorded as night-1",
+        "run interrupted",
+        "files sound",
         "recipe thermal_cycle",
         "recorded 2026-01-01 18:00:00 to 2026-01-01 18:00:05 UTC, 5.5 s, wall clock",
         "ended the recording does not tell",
@@ -114,7 +128,7 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
         "camera DA1234567",
         "software thermostand 0.1.0, host laboratory",
         "attached config.yaml, target.yaml",
-        "steps 12 of 12 done: 12 Capture",
+        "steps 12 done: 12 Capture",
         "frames 12, 40 x 30 px, 8 bit, PNG",
         "6 lost by the camera or its wire",
         "step 3 1 of 1 frames from 2026-01-01 18:00:01",
@@ -155,7 +169,7 @@ def test_info_says_what_is_unfinished_and_what_to_do(session: Path):
     path = session / "frames" / "0001.mcap"
     path.rename(path.with_name("0001.mcap.part"))
     said = " ".join(ask("info", session).stdout.split())
-    assert "(1 unfinished)" in said
+    assert "files incomplete" in said
     assert "frames/0001.mcap.part is unfinished (" in said
     assert f"to do stand session salvage {session}" in said
 
@@ -165,7 +179,7 @@ def test_verify_tells_what_was_lost_before_the_recording_and_that_the_session_is
     assert lines[:-1] == [
         f"note: 1 frame of step {k} (Capture) lost by the camera or its wire" for k in range(1, 12, 2)
     ]
-    assert lines[-1].startswith("sound; 7 segments, 143 messages, 12 frames, ")
+    assert lines[-1].startswith("files sound; run interrupted; 7 segments, 143 messages, 12 frames, ")
 
 
 def test_verify_fails_with_a_sentence_for_each_damage(session: Path):
@@ -174,10 +188,15 @@ def test_verify_fails_with_a_sentence_for_each_damage(session: Path):
     lines = ask("verify", session, status=1).stdout.splitlines()
     assert "error: telemetry/0001.mcap: is missing" in lines
     assert any(line.startswith("error: frames/0000.mcap: is damaged: the CRC of a chunk is wrong") for line in lines)
-    assert lines[-1].startswith("NOT sound (")
+    assert lines[-1].startswith("files damaged (")
     found = json.loads(ask("verify", session, "--json", status=1).stdout)
     assert found["sound"] is False
-    assert {"severity": "error", "where": "telemetry/0001.mcap", "text": "is missing"} in found["findings"]
+    assert {
+        "severity": "error",
+        "where": "telemetry/0001.mcap",
+        "text": "is missing",
+        "files": "incomplete",
+    } in found["findings"]
 
 
 def test_salvage_finishes_what_is_unfinished_in_every_session(session: Path):

@@ -1,0 +1,91 @@
+"""The end of a recording held against what its run's journal says, and against the end that a run leaves.
+
+A journal's entries are on the disk after what they speak of. So when it tells of an end, of steps or of a resumption
+that the telemetry does not have, the last segments are missing. Without a journal a run leaves either the event of its
+end or a segment that a salvage has made; a recording with neither has lost its last segments, or was killed in the
+moment between two of them, and counts as incomplete.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from drivers.clock import NS_PER_S
+from stand.hub import Event, StepMark, StepState
+from stand.recording.contents import RUN_BEGINS, RUN_END
+from stand.recording.coverage import Coverage
+from stand.recording.holes import Hole
+from stand.recording.inventory import State
+from stand.recording.journal_lines import JOURNAL_NAME, JournalFacts
+from stand.recording.layout import TELEMETRY
+from stand.recording.run_word import last_run_event
+from stand.recording.utc_offsets import UtcOffsets
+
+# The journal may be ahead of telemetry that waits for its next commit, on a virtual clock for 20 s.
+AHEAD_NS = 60 * NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class LostEnd:
+    """The telemetry behind its last segment is missing; `why` says what tells of it."""
+
+    hole: Hole
+    why: str
+
+
+def lost_end(
+    coverage: Coverage,
+    events: Iterable[Event],
+    marks: Iterable[StepMark],
+    journal: JournalFacts | None,
+    utc: UtcOffsets,
+) -> LostEnd | None:
+    """Whether the end of the telemetry is missing; None while something of it is unread. `marks`: those that the reader
+    has, all of them when it knows of any."""
+    links = [link for link in coverage.links.values() if link.series == TELEMETRY and link.count]
+    series = [file for file in coverage.files if file.series == TELEMETRY]
+    is_open = any(file.state is State.RECORDING for file in coverage.files)
+    if not links or is_open or series[-1].state is State.UNFINISHED:
+        return None
+    last, end_ns = links[-1], int(max(link.last_ns for link in links))
+    why = _why(end_ns, last.salvaged, last_run_event(events), frozenset(_done(marks)), journal, utc)
+    if not why:
+        return None
+    to_ns = None if journal is None or journal.last_ns <= end_ns else journal.last_ns
+    return LostEnd(Hole(TELEMETRY, series[-1].number + 1, None, end_ns, to_ns), why)
+
+
+def is_of_a_run(events: Iterable[Event], marks: Iterable[StepMark]) -> bool:
+    """Whether a run was recorded whose journal was begun: its first step comes after that."""
+    return any(event.kind in RUN_BEGINS for event in events) and any(True for _ in marks)
+
+
+def _done(marks: Iterable[StepMark]) -> Iterable[str]:
+    return (mark.step_id for mark in marks if mark.state is StepState.DONE)
+
+
+def _why(
+    end_ns: int,
+    is_salvaged: bool,
+    last: Event | None,
+    done: frozenset[str],
+    journal: JournalFacts | None,
+    utc: UtcOffsets,
+) -> str:
+    """What tells that more was recorded; "" when nothing does."""
+    is_ended = last is not None and last.kind == RUN_END
+    if journal is None:
+        if last is None or is_ended or is_salvaged:
+            return ""
+        return f"the recording stops at {utc.date_time(end_ns)} UTC without an end of its run"
+    stops = f"the telemetry stops at {utc.date_time(end_ns)} UTC"
+    if journal.status and not is_ended:
+        return f"{JOURNAL_NAME} says that the run ended at {utc.date_time(journal.ended_ns)} UTC, {stops}"
+    if journal.resumed_ns > (last.time_ns if is_ended and last is not None else end_ns + AHEAD_NS):
+        return f"{JOURNAL_NAME} says that the run went on at {utc.date_time(journal.resumed_ns)} UTC, {stops}"
+    if done and (more := len(journal.done - done)):
+        return f"{JOURNAL_NAME} says that {len(journal.done)} steps are done, {more} more than the telemetry; {stops}"
+    if journal.last_ns > end_ns + AHEAD_NS and not is_salvaged and not is_ended:
+        return f"{JOURNAL_NAME} goes on to {utc.date_time(journal.last_ns)} UTC, {stops}"
+    return ""

@@ -1,0 +1,60 @@
+"""A session of which segments are missing is fitted, reported and applied only when that is asked for."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from compensation.cli import app
+
+from .conftest import SEQUENCE, Recorded
+
+runner = CliRunner()
+
+
+@pytest.fixture
+def holed(recorded: Recorded, tmp_path: Path) -> Path:
+    """The second segment of the frames, ten minutes of the night, is missing."""
+    path = Path(shutil.copytree(recorded.path, tmp_path / "night"))
+    assert len(list((path / "frames").glob("*.mcap"))) == 2
+    (path / "frames" / "0000.mcap").unlink()
+    return path
+
+
+def ask(*arguments: object) -> tuple[int, str]:
+    result = runner.invoke(app, [str(argument) for argument in arguments])
+    return result.exit_code, " ".join(result.stderr.split())
+
+
+def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path, tmp_path: Path):
+    out = tmp_path / "markers.csv"
+    status, said = ask("detect", holed, "-o", out)
+    assert status == 2
+    assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in said
+    assert "frames that are described); with --incomplete what is there is used" in said
+    assert not out.exists()
+    status, said = ask("detect", holed, "-o", out, "--incomplete")
+    assert status == 0
+    assert f"warning: {holed}: is incomplete; missing: frames/0000.mcap" in said
+    assert 0 < len({line.split(",")[0] for line in out.read_text().splitlines()[1:]}) < len(SEQUENCE)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("fit", "{session}", "-o", "{out}"),
+        ("report", "{session}", "-o", "{out}"),
+        ("budget", "{session}"),
+        ("calibrate", "{session}", "-o", "{out}"),
+    ],
+)
+def test_each_command_refuses_it_with_the_same_sentence(holed: Path, tmp_path: Path, command: tuple[str, ...]):
+    out = tmp_path / "out.html"
+    status, said = ask(*(text.format(session=holed, out=out) for text in command))
+    assert status == 2
+    assert said.startswith(f"error: {holed}: is incomplete; missing: frames/0000.mcap (to ")
+    assert said.endswith("with --incomplete what is there is used")
+    assert not out.exists()
+    _, said = ask(*(text.format(session=holed, out=out) for text in command), "--incomplete")
+    assert said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap (to ")

@@ -1,0 +1,314 @@
+"""What is missing of a session is said, by everything that reads it; a copy of it lacks the same."""
+
+import asyncio
+import shutil
+import time
+
+import pytest
+
+from drivers.clock import NS_PER_S
+from drivers.interface import SessionError
+from stand.recording.export import export
+from stand.recording.glance import glance
+from stand.recording.holes import Hole, holes_in, holes_text
+from stand.recording.layout import FRAMES, TELEMETRY
+from stand.recording.messages import TABLE_POSE
+from stand.recording.overview import overview
+from stand.recording.replay import replay_and_record
+from stand.recording.run_word import Files, Run
+from stand.recording.salvage import salvage_session
+from stand.recording.session import Session
+from stand.recording.summary import read_summary
+from stand.recording.trim import trim
+from stand.recording.using import open_whole
+from stand.recording.verify import verify
+
+from .damage import METADATA, write_segment
+from .recorded import START_NS, images, record, telemetry
+from .runs import SECONDS, ended, entries, half_done, killed, record_run, remove, write_journal
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A complete run in five or six segments of each series; not to be changed."""
+    directory = tmp_path_factory.mktemp("sessions") / "night-1"
+    asyncio.run(record_run(directory))
+    return directory
+
+
+@pytest.fixture
+def session(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "night-1")
+
+
+def last_numbers(directory, series, count):
+    numbers = sorted(int(path.name[:4]) for path in (directory / series).iterdir())
+    return numbers[-count:]
+
+
+def words(directory):
+    """Run and files, on which list, info and verify agree."""
+    found = verify(directory)
+    assert (glance(directory).run, glance(directory).state) == (found.run, found.files)
+    assert (overview(directory).glance.run, overview(directory).state) == (found.run, found.files)
+    assert found.is_sound == (found.files is Files.SOUND)
+    return found.run, found.files
+
+
+def errors(directory):
+    return [str(finding) for finding in verify(directory).findings if finding.severity == "error"]
+
+
+def refused(directory):
+    """The sentence with which a session is refused that is not whole."""
+    said = []
+    open_whole(directory, said.append)
+    (text,) = said
+    sentence = text.removesuffix("; only what is there is used")
+    with pytest.raises(SessionError) as raised:
+        open_whole(directory)
+    assert str(raised.value) == f"{sentence}; with --incomplete what is there is used"
+    return sentence
+
+
+def test_a_whole_run_is_complete_and_sound(whole):
+    assert words(whole) == (Run.COMPLETE, Files.SOUND)
+    assert open_whole(whole).holes == ()
+
+
+def test_a_lost_tail_of_both_series_is_incomplete(session):
+    remove(session, TELEMETRY, *last_numbers(session, TELEMETRY, 2))
+    remove(session, FRAMES, *last_numbers(session, FRAMES, 2))
+    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert errors(session) == [
+        "error: telemetry/0004.mcap: is missing, with all that followed: journal.jsonl says that the run ended at "
+        "2026-01-01 18:00:20 UTC, the telemetry stops at 2026-01-01 18:00:14 UTC",
+        "error: 3 frames are missing, though described in the telemetry: blocks 12 to 14, "
+        "2026-01-01 18:00:12 to 2026-01-01 18:00:14 UTC",
+    ]
+    assert refused(session) == (
+        f"{session}: is incomplete; missing: telemetry/0004.mcap and what follows it (from 2026-01-01 18:00:14 UTC); "
+        "frames/0003.mcap and what follows it (from 2026-01-01 18:00:11 UTC, 3 frames that are described)"
+    )
+
+
+def test_frames_deleted_from_the_end_alone_are_missed_by_their_descriptions(session):
+    remove(session, FRAMES, *last_numbers(session, FRAMES, 1))
+    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert "missing: frames/0004.mcap and what follows it (from 2026-01-01 18:00:15 UTC, 4 frames" in refused(session)
+    shutil.rmtree(session / FRAMES)
+    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert "missing: frames/0000.mcap and what follows it (20 frames that are described)" in refused(session)
+
+
+def test_without_its_journal_a_lost_tail_leaves_no_end_and_is_incomplete(session):
+    (session / "journal.jsonl").unlink()
+    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    (text,) = errors(session)
+    assert text == "error: journal.jsonl: is missing; what the recording itself says of the run counts"
+    assert open_whole(session).holes == ()  # everything that was recorded is there
+    for series in (TELEMETRY, FRAMES):
+        remove(session, series, *last_numbers(session, series, 2))
+    assert words(session) == (Run.INTERRUPTED, Files.INCOMPLETE)
+    assert "the recording stops at 2026-01-01 18:00:14 UTC without an end of its run" in errors(session)[1]
+    assert "telemetry/0004.mcap and what follows it" in refused(session)
+
+
+async def test_steps_that_the_journal_has_and_the_telemetry_has_not_are_missed(tmp_path):
+    directory = await record_run(tmp_path / "s", items=killed, status="")
+    assert words(directory) == (Run.INTERRUPTED, Files.SOUND)  # killed between two segments
+    remove(directory, TELEMETRY, *last_numbers(directory, TELEMETRY, 2))
+    remove(directory, FRAMES, *last_numbers(directory, FRAMES, 2))
+    assert any("says that 20 steps are done, 5 more than the telemetry" in text for text in errors(directory))
+    assert verify(directory).files is Files.INCOMPLETE
+
+
+async def test_what_was_recorded_after_a_resumption_and_is_gone_is_missed(tmp_path):
+    directory = await record_run(tmp_path / "s", items=ended("error", "aborted", status="stopped"), status="stopped")
+    assert words(directory) == (Run.STOPPED, Files.SOUND)
+    after_ns = START_NS + 3600 * NS_PER_S
+    write_journal(
+        directory,
+        *entries(status="stopped"),
+        {"entry": "Gap", "from_ns": START_NS, "time_ns": after_ns},
+        {"entry": "Ended", "time_ns": after_ns + NS_PER_S, "status": "complete", "text": "complete"},
+    )
+    assert words(directory) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert any("says that the run went on at 2026-01-01 19:00:00 UTC" in text for text in errors(directory))
+
+
+@pytest.mark.parametrize(
+    ("level", "text", "data", "status", "word"),
+    [
+        ("info", "complete", {"status": "complete"}, "complete", Run.COMPLETE),
+        ("error", "aborted: stopped", {"status": "stopped"}, "stopped", Run.STOPPED),
+        ("error", "aborted: too hot", {"status": "tripped"}, "tripped", Run.TRIPPED),
+        ("error", "failed: a device", {"status": "failed"}, "failed", Run.FAILED),
+        ("error", "aborted: stopped", {}, "interrupted", Run.STOPPED),  # as format 1 has it
+        ("error", "aborted: too hot", {}, "tripped", Run.TRIPPED),
+        ("info", "complete", {}, "complete", Run.COMPLETE),
+    ],
+)
+async def test_a_run_has_its_own_word_and_its_files_are_sound(tmp_path, level, text, data, status, word):
+    directory = await record_run(tmp_path / "s", items=ended(level, text, **data), status=status)
+    assert words(directory) == (word, Files.SOUND)
+
+
+async def test_steps_are_counted_against_the_plan(tmp_path):
+    directory = await record_run(tmp_path / "s", items=half_done, status="")
+    write_journal(directory, *entries(SECONDS // 2, "stopped"))
+    found = overview(directory)
+    assert (found.glance.run, found.planned_steps) == (Run.STOPPED, SECONDS)
+    assert [step.state for step in found.steps].count("done") == SECONDS // 2
+
+
+def test_a_gap_is_told_with_its_times_and_its_frames(session):
+    remove(session, TELEMETRY, 1, 2)
+    remove(session, FRAMES, 1)
+    assert verify(session).files is glance(session).state is Files.INCOMPLETE
+    assert refused(session) == (
+        f"{session}: is incomplete; missing: telemetry/0001.mcap to 0002.mcap (from 2026-01-01 18:00:02 to "
+        "2026-01-01 18:00:11 UTC, 4 frames without their descriptions); "
+        "frames/0001.mcap (from 2026-01-01 18:00:03 to 2026-01-01 18:00:08 UTC)"
+    )
+
+
+def test_a_segment_of_a_huge_number_costs_nothing(session):
+    shutil.copy(session / TELEMETRY / "0001.mcap", session / TELEMETRY / "99999999999.mcap")
+    begun_s = time.perf_counter()
+    found = errors(session)
+    assert time.perf_counter() - begun_s < 10
+    assert any("telemetry/0006.mcap: is missing, and so are all up to 99999999998.mcap" in text for text in found)
+    assert glance(session).state is Files.DAMAGED
+
+
+@pytest.mark.parametrize("series", [TELEMETRY, FRAMES])
+def test_doubled_and_swapped_segments_are_refused_and_damaged(session, series):
+    first, second, doubled = (session / series / f"{number:04d}.mcap" for number in (1, 2, 7))
+    shutil.copy(first, doubled)
+    with pytest.raises(SessionError, match=rf"{series}/0007.mcap: was recorded as {series}/0001.mcap"):
+        Session.open(session)
+    assert (verify(session).files, glance(session).state) == (Files.DAMAGED, Files.DAMAGED)
+    doubled.unlink()
+    first.rename(doubled)
+    second.rename(first)
+    doubled.rename(second)
+    with pytest.raises(SessionError, match=rf"{series}/0001.mcap: was recorded as {series}/0002.mcap"):
+        Session.open(session)
+    assert (verify(session).files, glance(session).state) == (Files.DAMAGED, Files.DAMAGED)
+
+
+async def test_frames_of_another_session_are_refused_by_everything_that_uses_them(session, tmp_path):
+    other = (await record_run(tmp_path / "night-2")) / FRAMES / "0001.mcap"
+    (session / FRAMES / "0001.mcap").write_bytes(other.read_bytes().replace(b"DA1234567", b"DA7654321"))
+    with pytest.raises(SessionError, match=r"frames/0001\.mcap: "):
+        export(Session.open(session), tmp_path / "out", report=lambda done, text: None)
+    with pytest.raises(SessionError, match=r"frames/0001\.mcap: "):
+        trim(Session.open(session), tmp_path / "part", START_NS, START_NS + NS_PER_S)
+    assert (verify(session).files, glance(session).state) == (Files.DAMAGED, Files.DAMAGED)
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "part").exists()
+
+
+def missing_middle(session):
+    remove(session, TELEMETRY, 1, 2)
+    remove(session, FRAMES, 2)
+    return Session.open(session)
+
+
+def recorded_items(session):
+    """Every message but the poses for viewers, which a recorder derives from what the axes said before."""
+    return [message for message in telemetry(session) if message.topic != TABLE_POSE]
+
+
+def holes_of(session):
+    return sorted(map(repr, session.holes))
+
+
+async def test_the_copy_of_an_incomplete_session_lacks_the_same_and_invents_nothing(session, tmp_path):
+    original = missing_middle(session)
+    copy = Session.open(await replay_and_record(original, tmp_path / "copy", None))
+    assert recorded_items(copy) == recorded_items(original)
+    assert images(copy) == images(original)
+    assert holes_of(copy) == holes_of(original)
+    assert words(tmp_path / "copy") == (Run.COMPLETE, Files.INCOMPLETE)
+    assert refused(tmp_path / "copy").partition(": is")[2] == refused(session).partition(": is")[2]
+    twice = Session.open(await replay_and_record(copy, tmp_path / "twice", None))
+    assert holes_of(twice) == holes_of(original)
+
+
+def test_a_part_lacks_what_the_session_lacked_in_its_range_and_no_more(session, tmp_path):
+    original = missing_middle(session)
+    trim(original, tmp_path / "all", START_NS - NS_PER_S, START_NS + 100 * NS_PER_S)
+    assert words(tmp_path / "all") == (Run.COMPLETE, Files.INCOMPLETE)
+    assert len(open_whole(tmp_path / "all", lambda text: None).holes) == len(original.holes)
+    trim(original, tmp_path / "sound", START_NS + 14 * NS_PER_S, START_NS + 17 * NS_PER_S)
+    assert words(tmp_path / "sound") == (Run.COMPLETE, Files.SOUND)
+    (note,) = map(str, verify(tmp_path / "sound").findings[:1])
+    assert note.startswith("note: a part of the session night-1: 2026-01-01 18:00:14 to 2026-01-01 18:00:17 UTC")
+
+
+async def test_a_part_is_sound_however_its_run_ended_and_so_is_a_part_of_it(tmp_path):
+    directory = await record_run(tmp_path / "s", items=half_done, status="")
+    write_journal(directory, *entries(SECONDS // 2, "stopped"))
+    trim(Session.open(directory), tmp_path / "part", START_NS, START_NS + 5 * NS_PER_S)
+    assert words(tmp_path / "part") == (Run.STOPPED, Files.SOUND)
+    trim(Session.open(tmp_path / "part"), tmp_path / "less", START_NS + NS_PER_S, START_NS + 9 * NS_PER_S)
+    assert words(tmp_path / "less") == (Run.STOPPED, Files.SOUND)
+    assert "18:00:01 to 2026-01-01 18:00:05 UTC" in str(verify(tmp_path / "less").findings[0])
+
+
+async def test_what_a_kill_cost_is_no_hole_and_its_copies_are_sound(tmp_path):
+    directory = await record_run(tmp_path / "s", items=killed, status="")
+    last = max((directory / TELEMETRY).iterdir())
+    with last.open("rb") as file:
+        *_, chunk = read_summary(file, last.stat().st_size).chunks()
+    last.with_name(f"{last.name}.part").write_bytes(last.read_bytes()[: chunk.offset + 30])
+    last.unlink()
+    assert words(directory) == (Run.INTERRUPTED, Files.INCOMPLETE)
+    salvage_session(directory)
+    write_journal(directory, *entries(16, ""))
+    assert words(directory) == (Run.INTERRUPTED, Files.SOUND)
+    holes = open_whole(directory).holes
+    assert [(hole.series, hole.first, hole.excused) for hole in holes] == [(TELEMETRY, None, True)]
+    copy = await replay_and_record(Session.open(directory), tmp_path / "copy", None)
+    assert words(copy) == (Run.INTERRUPTED, Files.SOUND)
+    assert telemetry(Session.open(copy)) == telemetry(Session.open(directory))  # no description is invented
+    part = trim(Session.open(directory), tmp_path / "part", START_NS, START_NS + 100 * NS_PER_S)
+    assert words(part) == (Run.INTERRUPTED, Files.SOUND)
+
+
+async def test_frames_the_recorder_said_it_lost_are_no_hole(tmp_path):
+    directory = tmp_path / "s"
+    await record(directory, 4)
+    assert open_whole(directory).holes == ()
+
+
+async def test_a_replay_hands_on_frames_without_their_descriptions_and_no_descriptions_without_their_frames(session):
+    original = missing_middle(session)
+    frames = [item for item in original.items() if hasattr(item, "image")]
+    assert len(frames) == original.frame_count
+    assert len(list(original.items_and_descriptions())) == len(list(original.items())) + sum(
+        hole.frames for hole in original.holes if hole.series == FRAMES
+    )
+
+
+def test_a_session_of_a_later_format_is_refused_with_a_sentence(tmp_path):
+    write_segment(tmp_path / TELEMETRY, TELEMETRY, range(2), finish=True, metadata={**METADATA, "format": "3"})
+    with pytest.raises(SessionError, match="is of format '3'; this version of thermostand reads up to 2"):
+        Session.open(tmp_path)
+
+
+def test_holes_in_a_record_are_read_again_and_nonsense_is_none():
+    holes = (Hole(TELEMETRY, 3, 12, 5, 9, 6), Hole(FRAMES, None, None, None, 9, 1, True))
+    assert holes_in(holes_text(holes)) == holes
+    for text in (
+        "",
+        "null",
+        "7",
+        "[7, {}]",
+        '[{"series": "moon"}]',
+        "[" * 5000,
+        '[{"series":"frames","excused":true}]',
+    ):
+        assert [hole for hole in holes_in(text) if hole.first] == []
