@@ -48,7 +48,7 @@ def list_row(seen: Glance) -> tuple[str, ...]:
         size(seen.size_bytes),
         "simulated" if seen.simulated else "real",
         str(seen.run),
-        one_line(seen.state_text),
+        one_line(f"{seen.state_text}{'; ' if seen.lacks else ''}{seen.lacks}"),
     )
 
 
@@ -74,6 +74,7 @@ def glance_json(seen: Glance, utc: UtcOffsets | None = None) -> dict[str, object
         "segments": [{"file": file.name, "state": str(file.state), "bytes": file.size_bytes} for file in seen.files],
         "troubles": list(seen.troubles),
         "missing": list(seen.missing),
+        "has_camera_temperature": seen.has_camera_degC,
     }
 
 
@@ -122,7 +123,7 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     ending = "the recording does not tell" if found.ending is None else found.ending.text
     yield from _row("ended", ending)
     yield from _row("operator", told("operator", "") or "not told")
-    yield from _row("camera", told("camera_serial", "?"))
+    yield from _row("camera", told("camera_serial", "?") + (f"; {seen.lacks}" if seen.lacks else ""))
     host = f", host {told('host')}" if told("host") else ""
     yield from _row("software", f"thermostand {told('software_version', '?')}{host}")
     yield from _row("segments", _segments(seen))

@@ -15,6 +15,7 @@ from drivers.clock import NS_PER_S
 from drivers.interface import SessionError
 from stand.hub import Event, StepMark
 from stand.recording import messages
+from stand.recording.camera_temperature import NO_TEMPERATURE, has_recorded_temperature
 from stand.recording.chain import Link, misplaced, missing_segments
 from stand.recording.coverage import Coverage, coverage_of
 from stand.recording.damage import DAMAGE, reading
@@ -43,7 +44,8 @@ class Glance:
     """What names, sizes, heads and indexes tell. begin_ns and end_ns: log times of the first and the last message of
     the finished segments, None when they hold none; `frames` are theirs, too. `troubles`: a sentence for each that is
     damaged, `missing`: for each that is not there. utc: to UTC near both ends; the steps of the system clock between
-    them are not looked for. run: how the run ended."""
+    them are not looked for. run: how the run ended. has_camera_degC: whether any frame has a good camera temperature,
+    None when no description of a frame can be read."""
 
     path: Path
     files: tuple[SegmentFile, ...]
@@ -56,6 +58,7 @@ class Glance:
     missing: tuple[str, ...]
     utc: UtcOffsets
     run: Run
+    has_camera_degC: bool | None
 
     @property
     def size_bytes(self) -> int:
@@ -77,6 +80,11 @@ class Glance:
         if self.troubles:
             return Files.DAMAGED
         return Files.INCOMPLETE if self.missing else Files.SOUND
+
+    @property
+    def lacks(self) -> str:
+        """What a fit would miss in these frames, in words; "" when there is nothing."""
+        return NO_TEMPERATURE if self.has_camera_degC is False else ""
 
     @property
     def state_text(self) -> str:
@@ -146,6 +154,7 @@ def glance(path: Path) -> Glance:
         tuple(missing),
         utc,
         extent.run if extent else run_word(near.events, journal, is_recording=is_recording),
+        has_recorded_temperature(each.file.path for each in seen if each.file.series == TELEMETRY),
     )
 
 

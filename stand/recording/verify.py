@@ -14,6 +14,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from drivers.interface import SessionError
+from stand.recording.camera_temperature import NO_TEMPERATURE, has_temperature
 from stand.recording.chain import Link, misplaced, missing_segments
 from stand.recording.contents import Contents, FrameKey
 from stand.recording.coverage import Coverage, coverage_of
@@ -162,6 +163,7 @@ def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Ver
         *_frames_against_descriptions(read, coverage),
         *_frames_lost(read.contents),
         *_silences(read.contents),
+        *_camera_temperature(read.contents),
     )
     total = sum(check.messages for check in read.checks.values())
     is_recording = any(file.state is State.RECORDING for file in files)
@@ -327,6 +329,11 @@ def _frames_lost(contents: Contents) -> Iterator[Finding]:
         if count:
             lost = "1 frame" if count == 1 else f"{count} frames"
             yield _note(f"{lost} of {steps.get(step_id, 'no step')} lost by the camera or its wire")
+
+
+def _camera_temperature(contents: Contents) -> Iterator[Finding]:
+    if has_temperature(meta for _, meta in contents.metas) is False:
+        yield _note(f"{NO_TEMPERATURE}: no drift over temperature can be fitted to them")
 
 
 def _silences(contents: Contents) -> Iterator[Finding]:

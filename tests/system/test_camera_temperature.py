@@ -95,6 +95,8 @@ async def test_a_temperature_that_goes_holds_the_run_until_it_is_back(tmp_path: 
     bad_ns = times_ns[camera_degC != camera_degC]
     assert 55 <= (held.time_ns - bad_ns[0]) / NS_PER_S <= 75
     assert [meta.camera_degC > 20 for _, meta in session.frame_metas] == [True] * 4
+    for command, place in (("list", directory.parent), ("verify", directory), ("info", directory)):
+        assert "no frame has" not in CliRunner().invoke(app, ["session", command, str(place)]).stdout
 
 
 @pytest.mark.usefixtures("_aravis")
@@ -110,6 +112,12 @@ async def test_a_camera_that_is_configured_to_have_no_temperature_is_not_asked_f
     assert "guard.camera_temperature_bad" not in kinds
     assert session.frame_count == 4
     assert not (session.readings("camera.temperature")[1] > -300).any()
+    verified = CliRunner().invoke(app, ["session", "verify", str(directory)])
+    assert verified.exit_code == 0
+    assert "note: no frame has a good camera temperature: no drift over temperature can be fitted" in verified.stdout
+    for command, place in (("list", directory.parent), ("info", directory)):
+        shown = CliRunner().invoke(app, ["session", command, str(place)])
+        assert "no frame has a good camera temperature" in shown.stdout
 
 
 def test_no_temperature_is_asked_of_a_camera_that_is_off_lost_or_has_taken_its_last_frame():
