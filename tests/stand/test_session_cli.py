@@ -249,6 +249,7 @@ def test_export_writes_images_and_tables(session: Path, tmp_path: Path):
     assert list((tmp_path / "files" / "telemetry").glob("*.csv"))
     ask("export", session, "--out", tmp_path / "bare", "--no-frames", "--no-telemetry")
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == [
+        "README.txt",
         "attachments",
         "events.csv",
         "session.json",
