@@ -71,7 +71,7 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
     assert (first.state, second.state) == ("interrupted", "waiting")
     assert first.session.endswith("-queued")
 
-    ended = subprocess.run([*COMMAND, str(out), "--report"], capture_output=True, text=True, check=False, timeout=60)
+    ended = subprocess.run([*COMMAND, str(out), "--report"], capture_output=True, text=True, check=False, timeout=300)
     assert ended.returncode == 0, ended.stderr
     assert f"run 1 (queued) goes on in {first.session}" in ended.stderr
     entries = queue.queued(out).entries
@@ -99,12 +99,12 @@ def test_a_run_that_dies_whenever_it_goes_on_makes_way_for_the_next(tmp_path: Pa
     kill_under_way(out)
     for _ in range(MOST_FRUITLESS_STARTS):
         kill_at_once(out)
-    ended = subprocess.run([*COMMAND, str(out)], capture_output=True, text=True, check=False, timeout=60)
+    ended = subprocess.run([*COMMAND, str(out)], capture_output=True, text=True, check=False, timeout=300)
     assert ended.returncode == 0, ended.stderr
     first, second = queue.queued(out).entries
     assert (first.state, second.state) == ("failed", "done")
     assert first.reason.startswith("its daemon was killed 3 times in a row before one more step was done")
     assert Session.open(out / second.session).frame_count == 4
     resumed = [sys.executable, "-m", "stand.cli", "resume", str(out / first.session)]
-    assert subprocess.run(resumed, capture_output=True, check=False, timeout=60).returncode == 0
+    assert subprocess.run(resumed, capture_output=True, check=False, timeout=300).returncode == 0
     assert Session.open(out / first.session).frame_count == 4
