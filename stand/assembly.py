@@ -21,11 +21,12 @@ from drivers.stage import Axis, AxisSettings
 from drivers.thermometers import ThermometerChannel, Thermometers
 from stand.config import CameraConfig, StandConfig, packaged
 from stand.guarding.compressor import CompressorLimits
+from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Fault, Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
 from stand.guarding.permits import PermitLimits
-from stand.guarding.rules import VITAL, Announcements, camera_measured, recorded, watches
+from stand.guarding.rules import CAMERA, VITAL, Announcements, camera_measured, camera_stale, recorded, watches
 from stand.hub import Hub
 from stand.poller import Poller
 from stand.running.equilibrium import EquilibriumLimits
@@ -55,7 +56,11 @@ class Assembly:
             (devices.flap, config.flap.poll_s),
             *((devices.axes[name], axis.poll_s) for name, axis in config.axes.items()),
         ]
-        return tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
+        pollers = tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
+        for poller in pollers:
+            if poller.sensor is devices.camera:
+                poller.mark = marking_stale(CAMERA, camera_stale(config), self.hub)
+        return pollers
 
     def guard(
         self,

@@ -5,6 +5,7 @@ Whether the wire failed (it is asked again soon) or the device itself declines i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.clock import Clock, seconds_ns
@@ -19,12 +20,14 @@ class Poller:
     """Polls `sensor` every `period_s` (absolute deadlines) until cancelled; 1 s after a poll that failed on the wire.
 
     `first()` must succeed before `run()`: what it returns tells which channels to declare BAD when a later read fails.
+    mark: what is published of the readings of a poll at an instant (ns); it may mark some as STALE.
     """
 
     sensor: Sensor
     period_s: float
     hub: Hub
     clock: Clock
+    mark: Callable[[tuple[Reading, ...], int], tuple[Reading, ...]] = lambda readings, now_ns: readings
 
     def __post_init__(self) -> None:
         self._known: tuple[Reading, ...] = ()
@@ -58,7 +61,7 @@ class Poller:
         self._publish(readings)
 
     def _publish(self, readings: tuple[Reading, ...]) -> None:
-        self._known = readings
+        readings = self._known = self.mark(readings, self.clock.now_ns())
         self.hub.publish(Batch(self.sensor.name, self.clock.now_ns(), readings))
 
     def _lost(self, error: DeviceError) -> None:

@@ -184,8 +184,16 @@ def _silent_camera(laboratory: Laboratory, value: object) -> None:
     laboratory.camera.faults.silent_gvcp = laboratory.camera.faults.silent_gvsp = bool(value)
 
 
+def _freeze_temperature(laboratory: Laboratory, value: object) -> None:
+    laboratory.camera.faults.temperature = "stuck" if value else None
+
+
 def _hide_temperature(laboratory: Laboratory, value: object) -> None:
     laboratory.camera.faults.temperature = "zero" if value else None
+
+
+def _restart_camera(laboratory: Laboratory, value: object) -> None:
+    laboratory.camera.restart()
 
 
 def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
@@ -229,7 +237,9 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "relays.no_timer": _stop_timing,  # a timed-on stays on
     "flap.jam": _flap_jam,  # feedback counts at which it stops
     "camera.sensor_degC": _overheat_camera,  # its sensor chip stays at this
+    "camera.restart": _restart_camera,  # by itself, its supply on all the while
     "camera.no_stream_channel": _camera_without_stream,  # it restarts, and does not offer one until this is undone
+    "camera.frozen_temperature": _freeze_temperature,  # it goes on showing the last one
     "camera.no_temperature": _hide_temperature,  # it shows 0 degC
     "camera.loss": _camera_loss,  # share of stream packets lost
     "camera.silent": _silent_camera,  # neither answers nor sends

@@ -12,6 +12,7 @@ from stand.guarding.frozen import frozen, stale_by_air
 from stand.guarding.heat_given import HeatFeltLimits, heat_not_felt, too_much_heat
 from stand.guarding.interlocks import (
     Recording,
+    Rule,
     Watch,
     camera_temperature_bad,
     disagreement,
@@ -150,9 +151,15 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
             Watch(frozen(channel, module, frost.step_K, frost.after_s, "regulator"), action="hold")
             for channel in (AIR, GRANITE)
         ),
-        Watch(stale_by_air(CAMERA, AIR, frost.air_moves_K, frost.camera_after_s), action="warn"),
+        Watch(camera_stale(config), action="warn"),
         Watch(first_heat(FirstHeatLimits(**limits.first_heat.model_dump()), AIR, "regulator", PERMIT), action="hold"),
     )
+
+
+def camera_stale(config: StandConfig) -> Rule:
+    """A frozen temperature of the camera: told, and recorded as STALE."""
+    frost = config.guard.frozen
+    return stale_by_air(CAMERA, AIR, frost.air_moves_K, frost.camera_after_s)
 
 
 def _granite_limits(config: StandConfig) -> GraniteLimits:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.clock import NS_PER_S, Clock, seconds_ns
+from drivers.interface import Quality
 from stand.hub import Batch, Event, Hub, Item
 from stand.running.settling import Float, camera_rate, digit_K, seconds
 
@@ -131,5 +132,6 @@ class CameraEquilibrium:
         """The hub's subscriber."""
         if isinstance(item, Batch):
             for reading in item.readings:
-                if reading.channel == CAMERA and math.isfinite(reading.value) and reading.time_ns >= self._since_ns:
+                is_good = reading.channel == CAMERA and reading.quality is Quality.GOOD
+                if is_good and reading.time_ns >= self._since_ns:
                     self._readings.append((seconds(reading.time_ns), reading.value))

@@ -165,6 +165,16 @@ def test_a_camera_temperature_that_does_not_follow_the_air_is_stale():
     assert feed.run(900, thermometers_air=lambda s: 40 + s / 50) == 150 + 600
 
 
+def test_a_camera_temperature_in_coarse_steps_must_be_left_behind_by_three_of_them():
+    feed = Feed(stale_by_air(CAMERA, AIR, 3.0, 600))
+    assert feed.run(60, camera_temperature=lambda s: 60.0 if s < 30 else 62.0) is None
+    assert feed.run(1500, thermometers_air=lambda s: min(45.5, 40 + s / 50), camera_temperature=constant(62.0)) is None
+    feed = Feed(stale_by_air(CAMERA, AIR, 3.0, 600))
+    assert feed.run(60, camera_temperature=lambda s: 60.0 if s < 30 else 62.0) is None
+    rising = {"thermometers_air": lambda s: 40 + s / 50, "camera_temperature": constant(62.0)}
+    assert feed.run(1500, **rising) == 300 + 600
+
+
 def test_the_first_heat_must_reach_both_probes():
     def heated(pv_K: float, air_K: float) -> int | None:
         feed = Feed(first_heat(FIRST, AIR, "regulator", PERMIT))
