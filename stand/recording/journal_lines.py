@@ -1,7 +1,7 @@
 """The lines of a run's journal, `journal.jsonl`: the CRC-32 of the rest in 8 hex digits, a space, a JSON object.
 
-A line that does not fit its CRC is damaged when a sound line follows it, or when it has its end of line: the lines
-after it count all the same. What follows the last sound line without an end of line was never acknowledged.
+A line that has its end but does not fit its CRC is damaged; the lines after it count all the same. What has no end of
+line was never acknowledged.
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ def run_word(events: Iterable[Event], journal: JournalFacts | None, *, is_record
     if is_recording:
         return Run.RUNNING
     last = last_run_event(events)
-    if journal is not None and journal.last_ns >= (0 if last is None else last.time_ns):
+    told_ns = -1 if last is None else last.time_ns
+    if journal is not None and (journal.last_ns > told_ns or (journal.status and journal.last_ns == told_ns)):
         return _journaled(journal.status)
     if last is None or last.kind != RUN_END:
         return Run.INTERRUPTED

@@ -1,8 +1,8 @@
 """What a run has done, durable: `journal.jsonl` in the session's folder, from which a killed run goes on.
 
-Append-only, one entry a line: the CRC-32 of the rest in 8 hex digits, a space, a JSON object, a newline. A line is
-on the disk (fdatasync) when `write` returns. A reader goes as far as the first line that is not whole; what follows
-it was never acknowledged, and is cut off before anything is appended.
+Append-only, one entry a line (stand/recording/journal_lines.py). A line is on the disk (fdatasync) when `write`
+returns. What follows the last sound line is cut off before anything is appended. A damaged line before it stays where
+it is, and the lines after it count; of a file with damaged lines a copy is kept as `journal.jsonl.damaged`.
 
     Begun     the run, its plan and the texts it was made of; the first line and no other
     Step      a step was started, or is done
@@ -21,11 +21,11 @@ from __future__ import annotations
 
 import json
 import os
-import zlib
 from asyncio import Task, create_task, gather
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 from typing import Literal, cast
 
@@ -35,12 +35,13 @@ from drivers.lane import Lane
 from stand.helper import Line
 from stand.recording.disk import JOURNAL_LINE, Disk
 from stand.recording.home import FolderLost
+from stand.recording.journal_lines import JOURNAL_NAME, damage_text, journal_line, lines_of
 from stand.recording.locks import lock
 from stand.recording.sink import sync_folder
+from stand.recording.whole_file import write_whole
 from stand.running.journal_file import JournalFile, taken_over
 
-JOURNAL_NAME = "journal.jsonl"
-_CRC_DIGITS = 8
+_DAMAGED = ".damaged"  # the ending of the copy of a journal with damaged lines
 _KEPT = "journal"  # its name in the disk process
 
 
@@ -132,28 +133,16 @@ _ENTRIES: dict[str, type[Entry]] = {
 
 def encode_line(entry: Entry) -> bytes:
     """The entry as a line."""
-    text = json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode()
-    return b"%08x %s\n" % (zlib.crc32(text), text)
+    return journal_line(json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode())
 
 
 def read_lines(data: bytes) -> tuple[list[Entry], int]:
-    """The entries before the first line that is not whole, and how many bytes they are.
+    """The entries of all sound lines, and how many bytes there are up to the end of the last one.
 
-    SessionError when a whole line holds an entry that is not known here.
+    SessionError when a sound line holds an entry that is not known here.
     """
-    entries: list[Entry] = []
-    size_bytes = 0
-    for line in data.splitlines(keepends=True):
-        if not _is_whole(line):
-            break
-        entries.append(_decoded(line[_CRC_DIGITS + 1 :]))
-        size_bytes += len(line)
-    return entries, size_bytes
-
-
-def _is_whole(line: bytes) -> bool:
-    crc, _, text = line.removesuffix(b"\n").partition(b" ")
-    return line.endswith(b"\n") and crc == b"%08x" % zlib.crc32(text)
+    lines = lines_of(data)
+    return [_decoded(text) for text in lines.sound], lines.size_bytes
 
 
 def _decoded(text: bytes) -> Entry:
@@ -172,8 +161,9 @@ class Journal:
     are kept in memory: a journal that was removed under its run is written anew when an operator has cleared that.
     """
 
-    def __init__(self, path: Path, fd: int, data: bytes) -> None:
+    def __init__(self, path: Path, fd: int, data: bytes, damage: str = "") -> None:
         self.path = path
+        self.damage = damage  # a sentence, when lines of it are damaged
         self.name = path.name
         self.lost = ""
         self._file: JournalFile | None = JournalFile(path, fd, len(data))
@@ -200,7 +190,8 @@ class Journal:
 
     @classmethod
     def open(cls, directory: Path) -> tuple[Journal, list[Entry]]:
-        """The journal of a session and its entries, none when not even the first was written; a torn tail is cut off.
+        """The journal of a session and the entries of its sound lines, none when not even the first was written; a torn
+        tail is cut off. Of a journal with damaged lines a copy is kept, and its `damage` says so.
 
         SessionError when there is none, or when a daemon is running this session.
         """
@@ -210,7 +201,7 @@ class Journal:
         except OSError as error:
             raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
         try:
-            entries, data = _opened(fd)
+            entries, data, damage = _opened(fd, path)
         except BaseException as error:
             os.close(fd)
             if isinstance(error, BlockingIOError):
@@ -218,7 +209,7 @@ class Journal:
             if isinstance(error, OSError):
                 raise SessionError(f"{path}: cannot be read ({error.strerror})") from error
             raise
-        return cls(path, fd, data), entries
+        return cls(path, fd, data, damage), entries
 
     def start(self, clock: Clock, trouble: Callable[[str], None], disk: Disk | None = None) -> None:
         """Before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence, `disk` is the
@@ -305,16 +296,36 @@ class Journal:
         return getattr(self._file, method)(data)
 
 
-def _opened(fd: int) -> tuple[list[Entry], bytes]:
-    """Lock, read, and cut off what was not acknowledged; OSError, SessionError."""
+def _opened(fd: int, path: Path) -> tuple[list[Entry], bytes, str]:
+    """Lock, read, keep a copy when lines are damaged, and cut off what was not acknowledged: the entries, the bytes
+    that stay and what is damaged; OSError, SessionError."""
     lock(fd)
     with open(fd, "rb", closefd=False) as file:
         data = file.read()
-    entries, size_bytes = read_lines(data)
-    if size_bytes < len(data):
-        os.ftruncate(fd, size_bytes)
+    lines = lines_of(data)
+    entries = [_decoded(text) for text in lines.sound]
+    damage = ""
+    if lines.damaged:
+        kept = _kept(path, data, lines.damaged[-1])
+        damage = f"{path.name}: {damage_text(lines)}; {kept.name} is a copy of it"
+    if lines.size_bytes < len(data):
+        os.ftruncate(fd, lines.size_bytes)
         os.fsync(fd)
-    return entries, data[:size_bytes]
+    return entries, data[: lines.size_bytes], damage
+
+
+def _kept(path: Path, data: bytes, last_damaged: int) -> Path:
+    """A copy of a journal with damaged lines, durably beside it; one that has these lines already will do."""
+    damaged = b"\n".join(data.split(b"\n")[:last_damaged])
+
+    def is_it(copy: Path) -> bool:
+        return copy.is_file() and copy.read_bytes().startswith(damaged)
+
+    names = (f"{path.name}{_DAMAGED}" if number == 1 else f"{path.name}.{number}{_DAMAGED}" for number in count(1))
+    copy = next(copy for copy in map(path.with_name, names) if not copy.exists() or is_it(copy))
+    if not copy.exists():
+        write_whole(copy, data)
+    return copy
 
 
 def _ignored(text: str) -> None:

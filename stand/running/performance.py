@@ -34,7 +34,7 @@ from stand.running.flap_care import keep_shut_in_holds
 from stand.running.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.running.journal import Again, Cleared, Ended, Entry, Gap, Journal
 from stand.running.logbook import Logbook
-from stand.running.resume import Interruption, begun
+from stand.running.resume import Interruption, begun, plan_hash
 from stand.running.scheduler import Progress, Scheduler
 from stand.running.session_setup import Order
 from stand.running.settling_watch import SettlingWatch
@@ -177,11 +177,11 @@ def _judge_camera(before: Interruption, assembly: Assembly) -> None:
 
 
 def _begin_data(work: Performance) -> dict[str, object]:
-    """For whoever resumes the run: whether the host has run on since. For whoever counts what is done: how many steps
-    and frames the plan has."""
+    """For whoever resumes the run: whether the host has run on since, and which plan it is, should the journal have
+    lost that. For whoever counts what is done: how many steps and frames the plan has."""
     plan, boot = tuple(work.order.recipe.plan()), boot_of(work.assembly.clock)
     frames = sum(planned.step.frames for planned in plan if isinstance(planned.step, Capture))
-    data: dict[str, object] = {"steps": len(plan), "frames": frames}
+    data: dict[str, object] = {"steps": len(plan), "frames": frames, "plan": plan_hash(plan), "seed": work.seed}
     return data if boot is None else {**data, "boot_id": boot.id}
 
 

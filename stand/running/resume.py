@@ -15,14 +15,17 @@ from pathlib import Path
 from drivers.interface import SessionError
 from experiments.steps import Capture, PlannedStep
 from stand.config import StandConfig
-from stand.hub import StepState
+from stand.hub import Event, StepState
 from stand.order_files import parse_order
 from stand.progress import late_progress
 from stand.recipe import Recipe
+from stand.recording.contents import RUN_BEGINS, RUN_END
 from stand.recording.glance import glance
+from stand.recording.run_word import Run, last_run_event
 from stand.recording.salvage import Salvaged, salvage_unfinished
 from stand.recording.session import Session
 from stand.recording.settings import SessionInfo
+from stand.recording.superseded import begins_of
 from stand.running.camera_gap import CameraBefore, camera_before
 from stand.running.cold_start import cold_start
 from stand.running.journal import Again, Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
@@ -98,7 +101,7 @@ def _interruption(
     directory: Path, journal: Journal, entries: list[Entry], own: StandConfig, clear: bool
 ) -> Interruption:
     first = entries[0] if entries else None
-    if not isinstance(first, Begun):
+    if not entries or not (isinstance(first, Begun) or journal.damage):
         raise SessionError(f"{directory}: its run had not begun when it was killed; begin a new run")
     last = entries[-1]
     if isinstance(last, Ended) and last.status == "complete":
@@ -109,7 +112,11 @@ def _interruption(
     with late_progress("salvage", 1.0) as report:
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
-    order = _order(session, first)
+    if journal.damage:
+        tripped = tripped or _recorded_trip(session, entries)
+        _check_may_go_on(directory, session, entries, tripped, clear)
+    begun = first if isinstance(first, Begun) else _recorded_begun(session)
+    order = _order(session, begun)
     info = SessionInfo.of(session.metadata)
     config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
     order = replace(order, config=config)
@@ -127,7 +134,7 @@ def _interruption(
         progress,
         set_up,
         last_ns,
-        first.seed,
+        begun.seed,
         last.text if isinstance(last, Ended) else "",
         tripped,
         salvaged,
@@ -148,6 +155,42 @@ def _tripped(entries: Iterable[Entry]) -> str:
         if isinstance(entry, Cleared):
             text = ""
     return text
+
+
+def _recorded_end(session: Session, entries: Sequence[Entry]) -> Event | None:
+    """The end of the run by the recording, when its journal has lost that; None when it has an end or none is there."""
+    event = last_run_event(session.events())
+    if isinstance(entries[-1], Ended) or event is None or event.kind != RUN_END or event.time_ns < entries[-1].time_ns:
+        return None
+    return event
+
+
+def _recorded_trip(session: Session, entries: Sequence[Entry]) -> str:
+    """As `_tripped`, by the end that the recording tells of; of a damaged journal nobody knows what else is lost."""
+    event = _recorded_end(session, entries)
+    return event.text if event is not None and event.data.get("status") == Run.TRIPPED else ""
+
+
+def _check_may_go_on(directory: Path, session: Session, entries: Sequence[Entry], tripped: str, clear: bool) -> None:
+    """SessionError when the recording says that the run is complete, or has tripped, though the journal has lost it."""
+    event = _recorded_end(session, entries)
+    if event is not None and event.data.get("status") == Run.COMPLETE:
+        raise SessionError(f"{directory}: its run is complete; there is nothing to resume")
+    if tripped and not clear:
+        raise SessionError(f"{directory}: the stand tripped: {tripped}; look into it, then resume with --clear")
+
+
+def _recorded_begun(session: Session) -> Begun:
+    """The first line of a journal that has lost it, from what the recording says; SessionError when it does not."""
+    for event in session.events():
+        plan, seed = event.data.get("plan"), event.data.get("seed")
+        if event.kind in RUN_BEGINS and isinstance(plan, str) and isinstance(seed, int | None):
+            texts = _text_hashes(session.attachments)
+            return Begun(event.time_ns, session.metadata.get("session_id", ""), plan, texts, seed)
+    raise SessionError(
+        f"{session.path}: the line of its journal that says what was run is damaged, and the recording does not say "
+        "it; begin a new run"
+    )
 
 
 def _order(session: Session, first: Begun) -> Order:
@@ -203,7 +246,8 @@ class _Found:
 
 def _found(session: Session, entries: Sequence[Entry], recipe: Recipe) -> _Found:
     """What counts as done; of a warm-up that was interrupted nothing does from its cold start on."""
-    since_ns = {step_id: entry.time_ns for entry in entries if isinstance(entry, Again) for step_id in entry.step_ids}
+    since_ns = begins_of(session)  # what the journal says of it, too, unless that is damaged
+    since_ns |= {step_id: entry.time_ns for entry in entries if isinstance(entry, Again) for step_id in entry.step_ids}
     done, earned_s = journaled(entries)
     recorded = (mark for mark in session.steps() if mark.time_ns >= since_ns.get(mark.step_id, 0))
     done |= {mark.step_id for mark in recorded if mark.state is StepState.DONE}

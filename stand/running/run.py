@@ -169,6 +169,8 @@ async def _told(job: _Job, directory: Path, clock: Clock, time: _Time | None, st
     if accepted := job.order.config.accepted():
         hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
     assembly.notifier.start()
+    if job.before is not None and job.before.journal.damage:
+        hub.publish(Event(clock.now_ns(), "warning", "journal_damaged", job.before.journal.damage))
     for difference in () if job.before is None else job.before.differences:
         hub.publish(Event(clock.now_ns(), "warning", "stand_differs", str(difference), difference.data()))
     try:

@@ -88,16 +88,70 @@ def test_any_cut_gives_the_entries_before_it(written, data):
 
 
 @given(st.lists(entries, max_size=6), st.data())
-def test_garbage_at_the_end_or_a_flipped_bit_gives_a_prefix(written, data):
+def test_garbage_at_the_end_costs_nothing_and_a_flipped_bit_its_line(written, data):
     whole = b"".join(map(encode_line, written))
     assert read_lines(whole + data.draw(st.binary(max_size=200)))[0] == written
     if whole:
         damaged = bytearray(whole)
         place = data.draw(st.integers(0, len(whole) - 1))
+        hit = {whole[:place].count(b"\n")}
+        if whole[place : place + 1] == b"\n":
+            hit.add(max(hit) + 1)  # two lines are one now
         damaged[place] ^= 1 << data.draw(st.integers(0, 7))
         found, _ = read_lines(bytes(damaged))
-        assert found == written[: len(found)]
-        assert len(found) <= whole[:place].count(b"\n")
+        assert found == [entry for number, entry in enumerate(written) if number not in hit]
+
+
+def flipped(path: Path, number: int) -> bytes:
+    """The file with a bit flipped in its line of that number, from 0."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    lines[number] = lines[number][:20] + bytes([lines[number][20] ^ 4]) + lines[number][21:]
+    path.write_bytes(b"".join(lines))
+    return path.read_bytes()
+
+
+def test_a_damaged_line_is_told_and_kept_aside_and_the_lines_after_it_count(tmp_path):
+    path = new_journal(tmp_path, *ENTRIES)
+    damaged = flipped(path, 3)
+    path.write_bytes(damaged + encode_line(ENTRIES[3])[:-4])  # and a torn tail
+    for _ in range(2):  # the second time the copy is there
+        journal, found = Journal.open(tmp_path)
+        assert found == ENTRIES[:3] + ENTRIES[4:]
+        assert journal.damage == (
+            "journal.jsonl: line 4 of 10 is damaged; the lines after it count; journal.jsonl.damaged is a copy of it"
+        )
+        assert path.read_bytes() == damaged
+        asyncio.run(write(journal))
+    journal, _ = Journal.open(tmp_path)
+    asyncio.run(write(journal, ENTRIES[3]))
+    assert on_disk(tmp_path) == ENTRIES[:3] + ENTRIES[4:] + ENTRIES[3:4]
+    journal, _ = Journal.open(tmp_path)
+    asyncio.run(write(journal))
+    assert [copy.name for copy in sorted(tmp_path.iterdir())] == ["journal.jsonl", "journal.jsonl.damaged"]
+    assert (tmp_path / "journal.jsonl.damaged").read_bytes().startswith(damaged)
+
+
+def test_a_second_damage_is_kept_aside_as_well(tmp_path):
+    path = new_journal(tmp_path, *ENTRIES)
+    first = flipped(path, 3)
+    asyncio.run(write(Journal.open(tmp_path)[0]))
+    second = flipped(path, 1)
+    journal, found = Journal.open(tmp_path)
+    asyncio.run(write(journal))
+    assert found == [ENTRIES[0], ENTRIES[2], *ENTRIES[4:]]
+    assert "line 2 and 1 more of 10 are damaged; the lines after it count" in journal.damage
+    assert (tmp_path / "journal.jsonl.damaged").read_bytes() == first
+    assert (tmp_path / "journal.jsonl.2.damaged").read_bytes() == second
+
+
+def test_a_damaged_last_line_is_cut_off_but_not_lost(tmp_path):
+    path = new_journal(tmp_path, *ENTRIES)
+    damaged = flipped(path, len(ENTRIES) - 1)
+    journal, found = Journal.open(tmp_path)
+    asyncio.run(write(journal))
+    assert found == ENTRIES[:-1] == on_disk(tmp_path)
+    assert "line 10 of 10 is damaged" in journal.damage
+    assert (tmp_path / "journal.jsonl.damaged").read_bytes() == damaged
 
 
 def test_a_torn_tail_is_cut_off_and_the_journal_goes_on_behind_the_last_whole_line(tmp_path):

@@ -1,0 +1,78 @@
+"""A run goes on although lines of its journal are damaged: the lines after them and the recording say the rest."""
+
+import asyncio
+import os
+import shutil
+import signal
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.interface import SessionError
+from stand.hub import StepState
+from stand.recording.glance import glance
+from stand.recording.journal_lines import JOURNAL_NAME
+from stand.recording.run_word import Files, Run
+from stand.recording.session import Session
+from stand.recording.verify import verify
+from stand.running.resume import interruption
+from stand.running.run import Interrupted, resume, run_virtual
+from stand.running.session_setup import Order
+from tests.system.conftest import require_aravis
+from tests.system.test_run import at_step, ignore
+from tests.system.test_run_ends import SHORTER
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+def flip(directory: Path, *numbers: int) -> int:
+    """Flip a bit in these lines of the journal, from 0, or from its end; how many lines it has."""
+    path = directory / JOURNAL_NAME
+    lines = path.read_bytes().splitlines(keepends=True)
+    for number in numbers:
+        lines[number] = lines[number][:30] + bytes([lines[number][30] ^ 4]) + lines[number][31:]
+    path.write_bytes(b"".join(lines))
+    return len(lines)
+
+
+async def test_a_stopped_run_goes_on_without_the_first_line_of_its_journal_and_others(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    ordered, out = order(SHORTER), tmp_path / "out"
+    with pytest.raises(Interrupted):
+        await run_virtual(ordered, out, 7, at_step("Capture", lambda: os.kill(os.getpid(), signal.SIGINT)))
+    (directory,) = out.iterdir()
+    assert (glance(directory).run, verify(directory).files) == (Run.STOPPED, Files.SOUND)
+    count = flip(directory, 0, 2, -1)
+    assert (verify(directory).run, verify(directory).files) == (Run.STOPPED, Files.DAMAGED)
+    before = await asyncio.to_thread(interruption, directory)
+    assert before.seed == 7
+    await resume(before, ignore)
+    session, plan = Session.open(directory), tuple(ordered.recipe.plan())
+    done = Counter(mark.step_id for mark in session.steps() if mark.state is StepState.DONE)
+    assert done == Counter(planned.step_id for planned in plan)
+    (told,) = [event for event in session.events() if event.kind == "journal_damaged"]
+    assert told.text.startswith(f"journal.jsonl: line 1 and 2 more of {count} are damaged; the lines after it count")
+    assert len((directory / "journal.jsonl.damaged").read_bytes().splitlines()) == count
+    assert (verify(directory).run, verify(directory).files) == (Run.COMPLETE, Files.DAMAGED)
+
+
+async def test_a_run_whose_end_its_journal_has_lost_is_ended_by_the_recording(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    directory = await run_virtual(order(SHORTER), tmp_path / "out", None, ignore)
+    assert (verify(directory).run, verify(directory).files) == (Run.COMPLETE, Files.SOUND)
+    copy = Path(shutil.copytree(directory, tmp_path / "copy"))
+    flip(copy, -1)
+    assert (glance(copy).run, verify(copy).files) == (Run.COMPLETE, Files.DAMAGED)
+    with pytest.raises(SessionError, match="its run is complete; there is nothing to resume"):
+        await asyncio.to_thread(interruption, copy)
+    info = [event.data for event in Session.open(directory).events() if event.kind == "run.start"]
+    assert [(data["steps"], data["frames"]) for data in info] == [
+        (len(tuple(order(SHORTER).recipe.plan())), Session.open(directory).frame_count)
+    ]
