@@ -27,6 +27,8 @@ __all__ = ["Camera", "CameraSettings", "EffectiveSettings", "Identity", "Tempera
 
 ATTEMPTS = 3  # frames in a row that may fail before the camera counts as lost
 
+_CLOCK_SLACK_S = 1.0  # its clock is read that well, and it is heard for longer than that before it may be lost
+
 
 class Camera:
     """A GigE Vision camera under `name`; channels `<name>.image` and `<name>.temperature`."""
@@ -38,6 +40,8 @@ class Camera:
         self._lane: Lane | None = None
         self._connection: Connection | None = None
         self._lost = ""
+        self._heard_ns: int | None = None  # since it was made, or closed
+        self.restarted = ""  # why it has, or may have, started anew between the last open and the one before; "" if not
         self._frames = FrameCount()
         self._counts: Counter[str] = Counter()
 
@@ -50,6 +54,12 @@ class Camera:
     def identity(self) -> Identity:
         """Vendor, model, serial number and version; Unreachable before `open`."""
         return self._usable().identity
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it is open and has not been lost since."""
+        connection = self._connection
+        return connection is not None and not self._lost and not connection.control_lost.is_set()
 
     @property
     def effective(self) -> EffectiveSettings:
@@ -70,6 +80,8 @@ class Camera:
         if self._lane is None:
             self._lane = Lane(self._name, self._clock)
         await self._call(self._connect)
+        self.restarted = self._why_restarted(self._usable().clock_began_ns)
+        self._heard_ns = self._clock.now_ns()
 
     async def close(self) -> None:
         """Stop and let go of the camera; never raises, up to 7.5 s when it is dead."""
@@ -77,6 +89,7 @@ class Camera:
             await self._lane.call(self._disconnect)
             self._lane.close()
             self._lane = None
+            self._heard_ns = None
 
     async def start(self) -> None:
         """Start acquisition, always on a new stream."""
@@ -123,6 +136,8 @@ class Camera:
         value_degC, reason, cause = await self._call(self._usable().temperature)
         self._usable()
         time_ns = self._clock.now_ns()
+        if cause != "wire":
+            self._heard_ns = time_ns
         if reason:
             return (bad_reading(channel, "degC", time_ns, reason, cause),)
         return (Reading(channel, value_degC, "degC", time_ns),)
@@ -177,6 +192,15 @@ class Camera:
         self._counts["lost"] += 1
         self._lost = reason
         return Unreachable(self._name, reason)
+
+    def _why_restarted(self, clock_began_ns: int | None) -> str:
+        """A camera that has started anew counts its time from then on."""
+        if self._heard_ns is None:
+            return ""
+        if clock_began_ns is None:
+            return "the camera was lost, and has no clock that tells whether it has started anew"
+        is_younger = clock_began_ns > self._heard_ns - seconds_ns(_CLOCK_SLACK_S)
+        return "the camera was lost and has started anew: its clock began after it was last heard" if is_younger else ""
 
     def _connect(self) -> None:
         self._disconnect()

@@ -134,9 +134,15 @@ class Connection:
             self._exposure_asked_s = settings.exposure_s
             self._exposure_s = self.effective.exposure_s
             self._temperature, self._no_temperature = self._find_temperature()
+            self._latch()
         except BaseException:
             self._device.close()
             raise
+
+    @property
+    def clock_began_ns(self) -> int | None:
+        """When the camera's clock read zero, which is when it started, on the stand's clock; None when it has none."""
+        return self._offset_ns
 
     @property
     def running(self) -> bool:

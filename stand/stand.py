@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,6 +33,7 @@ from stand.guarding.permits import PermitLimits, Permits
 from stand.guarding.safety import Safety
 from stand.hub import Event, Hub
 from stand.running.camera_cooling import Cooling, cool_down, last_word
+from stand.running.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
 from stand.running.equilibrium import CameraEquilibrium, EquilibriumLimits
 from stand.running.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
 from stand.running.motions import Motions
@@ -42,8 +43,6 @@ from stand.running.tasks import cancelled
 _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor must not be worn
 _OCCUPIED_AGAIN_S = 5.0
 _CAMERA_BOOT_LIMIT_S = 60.0
-_CAMERA_LOST_LIMIT_S = 1800.0
-_CAMERA_RETRY_S, _CAMERA_LONGEST_RETRY_S = 1.0, 10.0
 
 
 class Interlocked(StandTripped):
@@ -111,6 +110,9 @@ class Stand:
         self._commanded: dict[str, float] = {}  # axis -> mm or deg, where the plan put it last
         self.motions = Motions()
         self.equilibrium = CameraEquilibrium(limits.equilibrium, hub, clock)
+        self.opening = CameraOpening(
+            devices.camera, hub, clock, lambda: self._camera_supplied, lambda reason: self.lose_equilibrium(reason)
+        )
         self._moving_flap = asyncio.Lock()  # one after the other; making safe waits for nobody
         self._without_camera_ns = 0  # how long a lost camera was waited for since its last frame
         self._cooling: Cooling | None = None  # the camera's last word before it was switched off
@@ -231,18 +233,18 @@ class Stand:
     async def _regain(self, lost: Unreachable) -> None:
         """Hold the gate until the camera, lost for that reason, is open again, or is found to be without supply; `lost`
         when there was no frame for 30 min of such waiting."""
-        begin_ns, limit_ns = self._clock.now_ns(), seconds_ns(_CAMERA_LOST_LIMIT_S)
+        begin_ns, limit_ns = self._clock.now_ns(), seconds_ns(LOST_LIMIT_S)
         if self._without_camera_ns >= limit_ns:
             raise lost
         self._hub.publish(Event(begin_ns, "warning", "camera_lost", str(lost)))
         self.gate.hold(CAMERA_LOST)
         deadline_ns = begin_ns + limit_ns - self._without_camera_ns
         try:
-            is_open = await self._open_camera(deadline_ns, _CAMERA_LONGEST_RETRY_S, lambda: not self._camera_supplied)
+            is_open = await self.opening.until_open(self._check, deadline_ns, is_vain=lambda: not self._camera_supplied)
         finally:
             self.gate.clear(CAMERA_LOST)
             # One that opens at once and never gives a frame does not go on for ever either.
-            self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(_CAMERA_RETRY_S))
+            self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
         if is_open:
             self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
 
@@ -315,7 +317,7 @@ class Stand:
         for 30 min, the gate being held."""
         if self._camera_supplied:
             return
-        deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_LOST_LIMIT_S)
+        deadline_ns = self._clock.now_ns() + seconds_ns(LOST_LIMIT_S)
         self.gate.hold(CAMERA_LOST)
         try:
             while not self._camera_supplied:
@@ -343,7 +345,8 @@ class Stand:
             holding = asyncio.create_task(self._hold_supply(hold_s))
         try:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.camera_boot_s))
-            await self._open_camera(self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S), _CAMERA_RETRY_S)
+            deadline_ns = self._clock.now_ns() + seconds_ns(_CAMERA_BOOT_LIMIT_S)
+            await self.opening.until_open(self._check, deadline_ns, RETRY_S)
         except BaseException:
             if holding is not None:
                 await cancelled([holding])
@@ -370,25 +373,6 @@ class Stand:
     def camera_is_off(self, cooling: Cooling | None) -> None:
         """What an earlier daemon left: the camera is off, and this was its last word before it was switched off."""
         self._cooling = cooling
-
-    async def _open_camera(
-        self, deadline_ns: int, longest_retry_s: float, is_vain: Callable[[], bool] = lambda: False
-    ) -> bool:
-        """Open the camera, trying again after 1 s, 2 s, 4 s ... until `deadline_ns`; what the last try raised. False
-        when it is in vain."""
-        retry_s = _CAMERA_RETRY_S
-        while not is_vain():
-            self._check()
-            try:
-                await self.devices.camera.open()
-            except Unreachable:
-                if self._clock.now_ns() >= deadline_ns:
-                    raise
-            else:
-                return True
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(retry_s))
-            retry_s = min(2 * retry_s, longest_retry_s)
-        return False
 
     def _dropped(self) -> None:
         """The camera's supply reads off though it was switched on."""

@@ -81,6 +81,7 @@ async def perform(work: Performance) -> None:
         watchers.append(asyncio.create_task(guard.run()))
         watchers.append(asyncio.create_task(assembly.stand.keeper.run()))
         watchers.append(asyncio.create_task(keep_shut_in_holds(assembly.stand, assembly.hub, assembly.clock)))
+        watchers.append(asyncio.create_task(assembly.stand.opening.keep_open()))
         if isinstance(assembly.clock, VirtualClock):
             limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
             watchers.append(asyncio.create_task(end_endless_holds(assembly.stand.gate, assembly.clock, limit_h)))

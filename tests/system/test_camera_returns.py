@@ -8,6 +8,7 @@ import pytest
 from drivers.interface import Frame
 from stand.hub import Event, Hub, Item
 from stand.recording.session import Session
+from stand.recording.superseded import begins_of, is_superseded
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
@@ -39,6 +40,12 @@ async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_
 
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, watch))
     assert session.events()[-1].text == "complete"
-    assert session.frame_count == 3
+    begins_ns = begins_of(session)
+    assert (
+        len([meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]) == 3
+    )
+    kinds = [event.kind for event in session.events()]
+    assert "camera_equilibrium_lost" in kinds  # it has started anew: the frame before is taken again when it has soaked
+    assert kinds.index("camera_equilibrium") > kinds.index("camera_equilibrium_lost")
     assert len(lost) >= 2
     assert "stream channel" in lost[-1]
