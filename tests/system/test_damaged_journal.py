@@ -15,12 +15,16 @@ from stand.hub import StepState
 from stand.recording.glance import glance
 from stand.recording.journal_lines import JOURNAL_NAME
 from stand.recording.run_word import Files, Run
+from stand.recording.salvage import salvage_session
 from stand.recording.session import Session
+from stand.recording.using import open_whole
 from stand.recording.verify import verify
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
+from tests.system.resume_process import Daemon
+from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, ignore
 from tests.system.test_run_ends import SHORTER
 
@@ -76,3 +80,21 @@ async def test_a_run_whose_end_its_journal_has_lost_is_ended_by_the_recording(
     assert [(data["steps"], data["frames"]) for data in info] == [
         (len(tuple(order(SHORTER).recipe.plan())), Session.open(directory).frame_count)
     ]
+
+
+@pytest.mark.parametrize(("items", "kind"), [(1, "Frame"), (80, ""), (3, "StepMark")])
+def test_a_killed_run_is_interrupted_and_once_salvaged_its_files_are_sound(
+    tmp_path: Path, order: Callable[..., Order], items: int, kind: str
+):
+    ordered = order(SHORTER)
+    daemon = Daemon(ordered, tmp_path / "out")
+    assert daemon.lives_for(items, kind)
+    daemon.kill()
+    asyncio.run(end_laboratory(ordered))
+    (directory,) = (tmp_path / "out").iterdir()
+    assert (glance(directory).run, verify(directory).files) == (Run.INTERRUPTED, Files.INCOMPLETE)
+    salvage_session(directory)
+    found = verify(directory)
+    assert (found.run, found.files) == (Run.INTERRUPTED, Files.SOUND), found.findings
+    assert (glance(directory).run, glance(directory).state) == (found.run, found.files)
+    assert all(hole.excused for hole in open_whole(directory).holes)

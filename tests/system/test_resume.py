@@ -14,6 +14,8 @@ import pytest
 from drivers.interface import SessionError, StandTripped, Unreachable
 from experiments.steps import Capture
 from stand.hub import Hub, StepState
+from stand.recording.glance import glance
+from stand.recording.run_word import Files, Run
 from stand.recording.session import Session
 from stand.recording.superseded import begins_of, is_superseded
 from stand.recording.verify import verify
@@ -87,6 +89,10 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
     """One sound session with every step done once and every frame there, of which nothing is left to do."""
     session, plan = Session.open(directory), tuple(order.recipe.plan())
     assert (session.incomplete, session.damaged) == ((), ())
+    found = verify(directory)
+    assert (found.run, found.files) == (Run.COMPLETE, Files.SOUND), found.findings
+    assert (glance(directory).run, glance(directory).state) == (found.run, found.files)
+    assert [hole for hole in session.holes if not hole.excused] == []
     done = Counter(mark.step_id for mark in session.steps() if mark.state is StepState.DONE)
     assert done == Counter(planned.step_id for planned in plan)
     times_ns = set(session.frame_times_ns.tolist())
