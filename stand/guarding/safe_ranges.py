@@ -45,6 +45,7 @@ SAFE_RANGES = (
     SafeRange("guard.stale_after_s", " s", "it would be heated for so long without knowing the temperature", high=30),
     SafeRange("guard.keys_s", " s", "a set-point changed by hand would be followed for so long", high=120),
     SafeRange("guard.flap_open_s", " s", "an open flap lets the chamber's air at the optics and the room", high=3600),
+    SafeRange("guard.flap_capture_s", " s", "a capture that hangs would leave the flap open for so long", high=7200),
     SafeRange("guard.disk_low_s", " s", "it would be heated for so long without recording frames", high=1800),
     SafeRange(
         "guard.camera_temperature_s", " s", "frames without the camera's temperature fit no model of drift", high=300

@@ -129,6 +129,7 @@ SAFE_EDGES = [  # path, the last safe value, one that is not, what the refusal s
     ("guard.stale_after_s", 30, 31, "31 s is outside the safe range (at most 30 s): it would be heated"),
     ("guard.keys_s", 120, 121, "121 s is outside the safe range (at most 120 s): a set-point changed by hand"),
     ("guard.flap_open_s", 3600, 3601, "3601 s is outside the safe range (at most 3600 s): an open flap"),
+    ("guard.flap_capture_s", 7200, 7201, "7201 s is outside the safe range (at most 7200 s): a capture that hangs"),
     ("guard.disk_low_s", 1800, 1801, "1801 s is outside the safe range (at most 1800 s): it would be heated"),
     ("recording.stop_frames_below_GB", 0.5, 0.4, "0.4 GB is outside the safe range (at least 0.5 GB): telemetry"),
     ("bus.timeout_s", 2, 2.1, "2.1 s is outside the safe range (at most 2 s): the guard could wait"),
