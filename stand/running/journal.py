@@ -150,7 +150,7 @@ def _decoded(text: bytes) -> Entry:
         fields = cast("dict[str, object]", json.loads(text))
         kind = _ENTRIES[cast("str", fields.pop("entry"))]
         return kind(**fields)  # pyright: ignore[reportArgumentType] - a CRC vouches for what was written here
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({text[:80]!r})") from error
 
 
