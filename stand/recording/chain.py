@@ -13,6 +13,8 @@ from itertools import pairwise
 from stand.recording.holes import Hole
 from stand.recording.layout import SESSION_CRC, segment_metadata
 
+MOST_MISSING = 10_000  # segments; a night has hundreds
+
 
 @dataclass(frozen=True, slots=True)
 class Link:
@@ -33,9 +35,19 @@ def misplaced(series: str, number: int, place: Mapping[str, str], session: Mappi
     return bool(place.keys() - due.keys()) or any(place.get(key) != due[key] for key in due.keys() - {SESSION_CRC})
 
 
+def foreign_numbers(numbers: Iterable[int]) -> set[int]:
+    """Those that no segment of the session can have: behind more missing ones than any session has segments."""
+    known = sorted(set(numbers))
+    for place, (before, after) in enumerate(pairwise([-1, *known])):
+        if after - before > MOST_MISSING:
+            return set(known[place:])
+    return set()
+
+
 def missing_numbers(numbers: Iterable[int]) -> Iterator[tuple[int, int]]:
-    """(first, last) of each range of numbers from 0 on that is not there."""
-    for before, after in pairwise([-1, *sorted(set(numbers))]):
+    """(first, last) of each range of numbers from 0 on that is not there; foreign ones do not count."""
+    known = set(numbers)
+    for before, after in pairwise([-1, *sorted(known - foreign_numbers(known))]):
         if after > before + 1:
             yield before + 1, after - 1
 

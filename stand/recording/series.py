@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
+from stand.recording.chain import foreign_numbers
 from stand.recording.home import Home
 from stand.recording.layout import TEMPORARY
 from stand.recording.segment import Record, Segment, SeriesForm
@@ -150,6 +151,7 @@ class Series:
 
 
 def next_number(folder: Path) -> int:
-    """The number after the highest segment in `folder`, finished or not, damaged or half copied; 0 in an empty one."""
+    """The number after the highest segment in `folder`, finished or not, damaged or half copied; 0 in an empty one. A
+    file that somebody has put there under a number far outside does not count."""
     numbers = [int(match[1]) for path in folder.iterdir() if (match := re.match(r"(\d{4,})\.mcap", path.name))]
-    return max(numbers, default=-1) + 1
+    return max(set(numbers) - foreign_numbers(numbers), default=-1) + 1

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from drivers.interface import SessionError
 from stand.recording.camera_temperature import NO_TEMPERATURE, has_temperature
-from stand.recording.chain import Link, misplaced, missing_segments
+from stand.recording.chain import MOST_MISSING, Link, foreign_numbers, misplaced, missing_segments
 from stand.recording.contents import Contents, FrameKey
 from stand.recording.coverage import Coverage, coverage_of
 from stand.recording.ends import is_of_a_run, lost_end
@@ -224,6 +224,11 @@ def _missing(coverage: Coverage, utc: UtcOffsets) -> Iterator[Finding]:
     """Segments are numbered from 0 without a gap; a copy of a session with gaps has them in its record."""
     for series in (TELEMETRY, FRAMES):
         numbers = {file.number for file in coverage.files if file.series == series}
+        for number in sorted(foreign_numbers(numbers)):
+            yield _error(
+                f"is foreign: no segment of this session has a number beyond {MOST_MISSING} missing ones",
+                f"{series}/{number:04d}.mcap",
+            )
         for hole in missing_segments(series, numbers, coverage.links.values()):
             yield _missing_part(_are_missing(hole, utc), f"{series}/{hole.first:04d}.mcap")
         if not numbers and series == TELEMETRY:

@@ -143,6 +143,13 @@ def test_a_name_that_is_taken_is_not_used_again_whatever_it_ends_in(tmp_path):
     assert next_number(tmp_path) == 8
 
 
+def test_a_file_under_a_number_far_outside_does_not_count(tmp_path):
+    """Twelve digits are no segment for a salvage: what would be written behind it could be lost."""
+    for name in ("0000.mcap", "0003.mcap.part", "99999999999.mcap", f"{'9' * 200}.mcap"):
+        (tmp_path / name).touch()
+    assert next_number(tmp_path) == 4
+
+
 def test_no_next_segment_is_begun_while_a_refused_block_may_still_be_in_the_last_one(tmp_path, limited):
     """An append-only file cannot be made shorter, whoever asks."""
     with ext4(tmp_path / "disk", 16 << 20) as disk:
