@@ -7,8 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation.cli import app
+from compensation.drift.model_file import save_model
+from stand.recording.session import Session
 
 from .conftest import SEQUENCE, Recorded
+from .test_apply import paper
 
 runner = CliRunner()
 
@@ -58,3 +61,18 @@ def test_each_command_refuses_it_with_the_same_sentence(holed: Path, tmp_path: P
     assert not out.exists()
     _, said = ask(*(text.format(session=holed, out=out) for text in command), "--incomplete")
     assert said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap (to ")
+
+
+def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded, tmp_path: Path):
+    model, points = tmp_path / "model.json", tmp_path / "points.csv"
+    save_model(paper(), model)
+    time_ns = Session.open(recorded.path).frame_times_ns[-1]
+    points.write_text(f"x_px,y_px,time_ns\n320,240,{time_ns}\n")
+    for source in ((holed,), (points, "--session", holed)):
+        out = tmp_path / "out"
+        status, said = ask("apply", model, *source, "-o", out)
+        assert status == 2
+        assert said.endswith("with --incomplete what is there is used")
+        assert not out.exists()
+    status, said = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")
+    assert (status, said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap")) == (0, True)

@@ -6,11 +6,12 @@ import shutil
 import signal
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError
+from drivers.interface import SessionError, StandTripped
 from stand.hub import StepState
 from stand.recording.glance import glance
 from stand.recording.journal_lines import JOURNAL_NAME
@@ -19,13 +20,14 @@ from stand.recording.salvage import salvage_session
 from stand.recording.session import Session
 from stand.recording.using import open_whole
 from stand.recording.verify import verify
+from stand.running.journal import Tripped, read_lines
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import end_laboratory
-from tests.system.test_run import at_step, ignore
+from tests.system.test_run import at_step, fault, ignore
 from tests.system.test_run_ends import SHORTER
 
 
@@ -98,3 +100,22 @@ def test_a_killed_run_is_interrupted_and_once_salvaged_its_files_are_sound(
     assert (found.run, found.files) == (Run.INTERRUPTED, Files.SOUND), found.findings
     assert (glance(directory).run, glance(directory).state) == (found.run, found.files)
     assert all(hole.excused for hole in open_whole(directory).holes)
+
+
+async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path: Path, order: Callable[..., Order]):
+    ordered, tasks = order(SHORTER, guard={"safe_limit_s": 5}), list[asyncio.Task[None]]()
+    break_sensor = at_step("Soak", lambda: tasks.append(asyncio.create_task(fault(ordered, "thermometer.open", "air"))))
+    with pytest.raises(StandTripped):
+        await run_virtual(ordered, tmp_path / "out", None, break_sensor)
+    await asyncio.gather(*tasks)
+    (directory,) = (tmp_path / "out").iterdir()
+    assert (verify(directory).run, verify(directory).files) == (Run.TRIPPED, Files.SOUND)
+    entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
+    flip(directory, -1, *(number for number, entry in enumerate(entries) if isinstance(entry, Tripped)))
+    assert (verify(directory).run, verify(directory).files) == (Run.TRIPPED, Files.DAMAGED)
+    for _ in range(2):  # also when the last line has been cut off
+        with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --clear"):
+            await asyncio.to_thread(interruption, directory)
+    before = await asyncio.to_thread(partial(interruption, directory, clear=True))
+    assert before.tripped
+    before.release()
