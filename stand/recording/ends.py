@@ -18,7 +18,7 @@ from stand.recording.coverage import Coverage
 from stand.recording.holes import Hole
 from stand.recording.inventory import State
 from stand.recording.journal_lines import JOURNAL_NAME, JournalFacts
-from stand.recording.layout import TELEMETRY
+from stand.recording.layout import FRAMES, TELEMETRY
 from stand.recording.run_word import last_run_event
 from stand.recording.utc_offsets import UtcOffsets
 
@@ -49,11 +49,21 @@ def lost_end(
     if not links or is_open or series[-1].state is State.UNFINISHED:
         return None
     last, end_ns = links[-1], int(max(link.last_ns for link in links))
+    events = tuple(events)
     why = _why(end_ns, last.salvaged, last_run_event(events), frozenset(_done(marks)), journal, utc)
     if not why:
         return None
+    why += frames_of_plan(events, sum(link.count for link in coverage.links.values() if link.series == FRAMES))
     to_ns = None if journal is None or journal.last_ns <= end_ns else journal.last_ns
     return LostEnd(Hole(TELEMETRY, series[-1].number + 1, None, end_ns, to_ns), why)
+
+
+def frames_of_plan(events: Iterable[Event], frames: int) -> str:
+    """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the recording does not tell of
+    its plan (format 1 does not), or when there are as many."""
+    planned = [event.data.get("frames") for event in events if event.kind in RUN_BEGINS]
+    told = planned[-1] if planned else None
+    return f"; {frames} of the {told} frames of the plan are there" if isinstance(told, int) and frames < told else ""
 
 
 def is_of_a_run(events: Iterable[Event], marks: Iterable[StepMark]) -> bool:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from drivers.interface import SessionError
+from stand.recording.ends import frames_of_plan
+from stand.recording.run_word import Run
 from stand.recording.session import Session
 
 _MOST = 6  # holes in a sentence before the rest is only counted
@@ -27,7 +29,8 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
         return
     texts = [hole.text(session.utc) for hole in missing]
     more = [f"{len(texts) - _MOST} more"] if len(texts) > _MOST else []
-    sentence = f"{session.path}: is incomplete; missing: {'; '.join([*texts[:_MOST], *more])}"
+    plan = frames_of_plan(session.events(), session.frame_count) if session.run is Run.COMPLETE else ""
+    sentence = f"{session.path}: is incomplete; missing: {'; '.join([*texts[:_MOST], *more])}{plan}"
     if incomplete is None:
         raise SessionError(f"{sentence}; with --incomplete what is there is used")
     incomplete(f"{sentence}; only what is there is used")

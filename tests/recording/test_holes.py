@@ -82,13 +82,15 @@ def test_a_lost_tail_of_both_series_is_incomplete(session):
     assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
     assert errors(session) == [
         "error: telemetry/0004.mcap: is missing, with all that followed: journal.jsonl says that the run ended at "
-        "2026-01-01 18:00:20 UTC, the telemetry stops at 2026-01-01 18:00:14 UTC",
+        "2026-01-01 18:00:20 UTC, the telemetry stops at 2026-01-01 18:00:14 UTC; "
+        "12 of the 20 frames of the plan are there",
         "error: 3 frames are missing, though described in the telemetry: blocks 12 to 14, "
         "2026-01-01 18:00:12 to 2026-01-01 18:00:14 UTC",
     ]
     assert refused(session) == (
         f"{session}: is incomplete; missing: telemetry/0004.mcap and what follows it (from 2026-01-01 18:00:14 UTC); "
-        "frames/0003.mcap and what follows it (from 2026-01-01 18:00:11 UTC, 3 frames that are described)"
+        "frames/0003.mcap and what follows it (from 2026-01-01 18:00:11 UTC, 3 frames that are described); "
+        "12 of the 20 frames of the plan are there"
     )
 
 
@@ -169,7 +171,8 @@ def test_a_gap_is_told_with_its_times_and_its_frames(session):
     assert refused(session) == (
         f"{session}: is incomplete; missing: telemetry/0001.mcap to 0002.mcap (from 2026-01-01 18:00:02 to "
         "2026-01-01 18:00:11 UTC, 4 frames without their descriptions); "
-        "frames/0001.mcap (from 2026-01-01 18:00:03 to 2026-01-01 18:00:08 UTC)"
+        "frames/0001.mcap (from 2026-01-01 18:00:03 to 2026-01-01 18:00:08 UTC); "
+        "16 of the 20 frames of the plan are there"
     )
 
 
