@@ -15,7 +15,7 @@ from typing import cast
 
 JOURNAL_NAME = "journal.jsonl"
 CRC_DIGITS = 8
-LIMIT_BYTES = 256_000_000  # a run of weeks has some megabytes
+LIMIT_BYTES = 32_000_000  # an entry a minute for 200 days; all of them are in memory
 
 
 @dataclass(frozen=True, slots=True)

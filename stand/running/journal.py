@@ -35,7 +35,7 @@ from drivers.lane import Lane
 from stand.helper import Line
 from stand.recording.disk import JOURNAL_LINE, Disk
 from stand.recording.home import FolderLost
-from stand.recording.journal_lines import JOURNAL_NAME, damage_text, journal_line, lines_of
+from stand.recording.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, journal_line, lines_of
 from stand.recording.locks import lock
 from stand.recording.sink import sync_folder
 from stand.recording.whole_file import write_whole
@@ -201,6 +201,12 @@ class Journal:
         except OSError as error:
             raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
         try:
+            if not path.is_file():  # nobody may ever write to a pipe of that name
+                raise SessionError(f"{path}: is no file, so no journal; begin a new run")
+            if path.stat().st_size > LIMIT_BYTES:
+                raise SessionError(
+                    f"{path}: is larger than {LIMIT_BYTES // 1_000_000} MB, so no journal; begin a new run"
+                )
             entries, data, damage = _opened(fd, path)
         except BaseException as error:
             os.close(fd)

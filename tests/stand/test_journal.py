@@ -1,6 +1,7 @@
 """The journal: what was acknowledged is read again, whatever follows it in the file."""
 
 import asyncio
+import os
 import resource
 import zlib
 from pathlib import Path
@@ -219,3 +220,22 @@ async def test_notes_are_on_the_disk_in_their_order_when_the_journal_is_closed(t
     await journal.close()
     await journal.close()
     assert on_disk(tmp_path) == ENTRIES
+
+
+def test_a_pipe_in_its_place_is_refused_and_not_waited_for(tmp_path: Path):
+    os.mkfifo(tmp_path / JOURNAL_NAME)
+    with pytest.raises(SessionError, match=r"journal\.jsonl: is no file, so no journal; begin a new run"):
+        Journal.open(tmp_path)
+
+
+def test_an_entry_nested_deeper_than_anything_is_of_another_version():
+    text = b"[" * 100_000
+    with pytest.raises(SessionError, match="an entry is of another version"):
+        read_lines(b"%08x %s\n" % (zlib.crc32(text), text))
+
+
+def test_one_that_fills_the_memory_is_refused(tmp_path: Path):
+    (tmp_path / JOURNAL_NAME).touch()
+    os.truncate(tmp_path / JOURNAL_NAME, 1 << 40)
+    with pytest.raises(SessionError, match=r"journal\.jsonl: is larger than 32 MB"):
+        Journal.open(tmp_path)
