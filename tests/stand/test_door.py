@@ -26,8 +26,12 @@ def connected(session: Path) -> socket.socket:
     """A client that has not said anything yet."""
     (daemon,) = [each for each in living() if each.entry.session == str(session)]
     client = socket.socket(socket.AF_UNIX)
-    with opened_folder(daemon.socket.parent) as folder:
-        client.connect(address_in(folder, daemon.socket.name))
+    try:
+        with opened_folder(daemon.socket.parent) as folder:
+            client.connect(address_in(folder, daemon.socket.name))
+    except OSError:
+        client.close()
+        raise
     return client
 
 
