@@ -20,12 +20,12 @@ from compensation.drift.history import recorded_history, states_at
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.states import States
-from compensation.files import check_writable, whole_file
-from compensation.markers.image_file import read_image
-from drivers.interface import ConfigError, SessionError
-from stand.progress import progress
-from stand.recording.session import Session
-from stand.recording.using import open_whole
+from foundation.errors import ConfigError, SessionError
+from foundation.files import check_writable, whole_file
+from foundation.progress import progress
+from markers.image_file import read_image
+from recording.reading.session import Session
+from recording.reading.using import open_whole
 
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")]
 CameraOption = Annotated[

@@ -12,9 +12,9 @@ from compensation.budget.budget import Budget, budget, table
 from compensation.budget.geometry import load_geometry
 from compensation.command_line import Incomplete, TargetOption, named_target, one_line_errors, said_if
 from compensation.observations import session_target
-from compensation.target import Target
-from stand.recording.session import Session
-from stand.recording.using import open_whole
+from markers.target import Target
+from recording.reading.session import Session
+from recording.reading.using import open_whole
 
 
 def budget_of_session(

@@ -15,12 +15,12 @@ from compensation.calibration.pinhole import NAMES
 from compensation.calibration.positions import observe_positions
 from compensation.calibration.table import TableSigma
 from compensation.command_line import Incomplete, TargetOption, named_target, one_line_errors, said_if
-from compensation.files import check_folder_writable, check_writable, write_whole
 from compensation.observations import session_target
 from compensation.report.calibration_report import report_page
-from stand.progress import progress
-from stand.recording.session import Session
-from stand.recording.using import open_whole
+from foundation.files import check_folder_writable, check_writable, write_whole
+from foundation.progress import progress
+from recording.reading.session import Session
+from recording.reading.using import open_whole
 
 _TABLE = TableSigma()
 

@@ -30,24 +30,24 @@ from compensation.drift.choosing import fit as fit_model
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
 from compensation.drift.validation import evaluate, table
-from compensation.files import check_writable
 from compensation.finding.found import finder
-from compensation.markers.detection import Detection, DetectionError, Image, detect, nothing_found
-from compensation.markers.image_file import read_image
-from compensation.markers.table import CENTRES, DetectedImage, write_detections
 from compensation.observations import observe_sessions, read_frames, session_target
 from compensation.report.extras import Extras
 from compensation.report.report import can_be_fitted, check_report_writable, write_report
 from compensation.report.table_positions import table_positions
-from compensation.target import Target
 from compensation.validate_cli import validate_session
 from compensation.validation3d.reading import load_validation
-from drivers.interface import ConfigError
-from stand.progress import Report, late_progress, progress
-from stand.recording.image_limit import GREATEST_MEGAPIXELS, images_up_to
-from stand.recording.session import Session
-from stand.recording.using import open_whole
-from stand.usage import OneLineUsage, one_line
+from foundation.errors import ConfigError
+from foundation.files import check_writable
+from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from foundation.progress import Report, late_progress, progress
+from foundation.usage import OneLineUsage, one_line
+from markers.detection import Detection, DetectionError, Image, detect, nothing_found
+from markers.image_file import read_image
+from markers.table import CENTRES, DetectedImage, write_detections
+from markers.target import Target
+from recording.reading.session import Session
+from recording.reading.using import open_whole
 
 app = typer.Typer(
     cls=OneLineUsage,

@@ -10,9 +10,9 @@ from typing import Annotated
 
 import typer
 
-from compensation.target import Target, load_target
-from drivers.interface import ConfigError, StandError
-from stand.usage import one_line, tell
+from foundation.errors import ConfigError, StandError
+from foundation.usage import one_line, tell
+from markers.target import Target, load_target
 
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")

@@ -1,6 +1,6 @@
 """Recorded session -> arrays over frames: marker centres, temperatures, what each frame was taken for.
 
-Pixels as in compensation/markers/detection.py: x = column = I to the right, y = row = J down, integers are centres.
+Pixels as in markers/detection.py: x = column = I to the right, y = row = J down, integers are centres.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from numpy.typing import NDArray
 from compensation.drift.history import History, recorded_history
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
-from compensation.markers.noise import Noise, estimate_noise
 from compensation.one_equilibrium import check_sessions
-from compensation.target import Target
-from drivers.documents import parse_document
-from drivers.interface import Frame, SessionError
-from stand.progress import Report
-from stand.recording.session import Session
-from stand.recording.superseded import begins_of, is_superseded
-from stand.recording.using import Say, open_whole
-from stand.recording.utc_offsets import UtcOffsets
+from foundation.documents import parse_document
+from foundation.errors import SessionError
+from foundation.progress import Report
+from foundation.readings import Frame
+from markers.noise import Noise, estimate_noise
+from markers.target import Target
+from recording.format.utc_offsets import UtcOffsets
+from recording.reading.session import Session
+from recording.reading.superseded import begins_of, is_superseded
+from recording.reading.using import Say, open_whole
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 Progress = Callable[[str, float], AbstractContextManager[Report]]
-"""stand.progress.progress, or anything like it: (title, total) -> a context that yields report(done, text)."""
+"""foundation.progress.progress, or anything like it: (title, total) -> a context that yields report(done, text)."""
 
 _NOISE_FRAMES = 4
 _AIR_CHANNEL = "thermometers.air"

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from drivers.interface import SessionError
-from stand.hub import Event
-from stand.recording.instants import utc_text
-from stand.recording.session import Session
-from stand.recording.superseded import begins_of, is_superseded
+from foundation.errors import SessionError
+from foundation.instants import utc_text
+from foundation.items import Event
+from recording.reading.session import Session
+from recording.reading.superseded import begins_of, is_superseded
 
 CHANGED = "camera_offset_changed"
 _TRANSIENT_ROLES = frozenset({"warm_up", "settling"})  # of a camera that is not in equilibrium anyway

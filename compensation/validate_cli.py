@@ -21,7 +21,6 @@ from compensation.command_line import (
     said_if,
 )
 from compensation.drift.model_file import load_model
-from compensation.files import check_writable, write_whole
 from compensation.finding.found import finder
 from compensation.observations import Float, observe_sessions
 from compensation.report.validation_report import validation_page
@@ -30,9 +29,10 @@ from compensation.validation3d.positions import validation_frames
 from compensation.validation3d.stand_part import StandPart, stand_part
 from compensation.validation3d.table import summary
 from compensation.validation3d.validation import LensModel, camera_of, check_same, validate
-from drivers.interface import ConfigError
-from stand.progress import progress
-from stand.recording.session import Session
+from foundation.errors import ConfigError
+from foundation.files import check_writable, write_whole
+from foundation.progress import progress
+from recording.reading.session import Session
 
 
 def validate_session(

@@ -9,27 +9,29 @@ from typing import Protocol, cast
 
 import usb.backend
 
-from drivers.bus import Bus, LineSettings
-from drivers.camera import Camera, CameraSettings, TemperatureFeature
-from drivers.clock import Clock, VirtualClock
-from drivers.flap import Flap, FlapSettings
-from drivers.interface import ConfigError, Sensor
-from drivers.registers import RegisterMap, load_register_map
-from drivers.regulator import Regulator
-from drivers.relays import Relays
-from drivers.stage import Axis, AxisSettings
-from drivers.thermometers import ThermometerChannel, Thermometers
-from stand.config import CameraConfig, StandConfig, packaged
-from stand.guarding.compressor import CompressorLimits
+from drivers.devices.camera import Camera, CameraSettings, TemperatureFeature
+from drivers.devices.flap import Flap, FlapSettings
+from drivers.devices.protocols import Sensor
+from drivers.devices.regulator import Regulator
+from drivers.devices.relays import Relays
+from drivers.devices.stage import Axis, AxisSettings
+from drivers.devices.thermometers import ThermometerChannel, Thermometers
+from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.registers import RegisterMap, load_register_map
+from foundation.clock import Clock, VirtualClock
+from foundation.errors import ConfigError
+from foundation.hub import Hub
+from stand.chamber.compressor import CompressorLimits
+from stand.chamber.permits import PermitLimits
+from stand.config.stand_config import CameraConfig, StandConfig, packaged
+from stand.fault import Fault
 from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Fault, Recording, Watch, intrusion
+from stand.guarding.interlocks import Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
-from stand.guarding.permits import PermitLimits
 from stand.guarding.rules import CAMERA, VITAL, Announcements, camera_measured, camera_stale, recorded, watches
-from stand.hub import Hub
+from stand.imaging.equilibrium import EquilibriumLimits
 from stand.poller import Poller
-from stand.running.equilibrium import EquilibriumLimits
 from stand.stand import Devices, Limits, Stand
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from drivers.clock import NS_PER_S, PIECE_S, WallClock, seconds_ns
-from stand.hub import Event, Hub
-from stand.recording.instants import duration
-from stand.recording.utc_offsets import CLOCK_STEP, REPEATED_NS, offset_event
+from foundation.clock import NS_PER_S, PIECE_S, WallClock, seconds_ns
+from foundation.hub import Hub
+from foundation.instants import duration
+from foundation.items import Event
+from recording.format.utc_offsets import CLOCK_STEP, REPEATED_NS, offset_event
 
 HOST_SUSPENDED = "host_suspended"  # kind of the event with the length of a suspend
 _PERIOD_S = PIECE_S

@@ -8,9 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.clock import Clock, seconds_ns
-from drivers.interface import Cause, DeviceError, Reading, Sensor, bad_reading
-from stand.hub import Batch, Event, Hub
+from drivers.devices.protocols import Sensor
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError
+from foundation.hub import Hub
+from foundation.items import Batch, Event
+from foundation.readings import Cause, Reading, bad_reading
 
 _AGAIN_S = 1.0  # after a poll that failed on the wire
 

@@ -10,7 +10,7 @@ import os
 import stat
 from pathlib import Path
 
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 NAME = "thermostand"
 SYSTEM_FOLDER = Path("/run/lock") / NAME

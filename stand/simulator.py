@@ -10,9 +10,9 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 
-from drivers.clock import seconds_ns
-from drivers.interface import ConfigError, Unreachable
-from stand.config import StandConfig
+from foundation.clock import seconds_ns
+from foundation.errors import ConfigError, Unreachable
+from stand.config.stand_config import StandConfig
 
 _STOP_LIMIT_S = 5.0
 _FREE_TCP, _FREE_SERIAL = "tcp:127.0.0.1:0", "serial:"

@@ -8,37 +8,31 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from drivers.camera import Camera
-from drivers.clock import Clock, boot_of, seconds_ns
-from drivers.flap import Flap
-from drivers.interface import (
-    Actuator,
-    ConfigError,
-    DeviceError,
-    DeviceFault,
-    Frame,
-    Occupied,
-    StandTripped,
-    Unreachable,
-)
-from drivers.regulator import Regulator
-from drivers.relays import CAMERA_POWER, Relays
-from drivers.stage import Axis
-from drivers.thermometers import Thermometers
-from stand.guarding.compressor import restored
-from stand.guarding.compressor_file import CompressorFile
-from stand.guarding.interlocks import Fault
-from stand.guarding.keeper import Keeper
-from stand.guarding.permits import PermitLimits, Permits
-from stand.guarding.safety import Safety
-from stand.hub import Event, Hub
-from stand.running.camera_cooling import Cooling, cool_down, last_word
-from stand.running.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
-from stand.running.equilibrium import CameraEquilibrium, EquilibriumLimits
-from stand.running.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
-from stand.running.motions import Motions
-from stand.running.stage_care import check_home, ready
-from stand.running.tasks import cancelled
+from drivers.devices.camera import Camera
+from drivers.devices.flap import Flap
+from drivers.devices.protocols import Actuator
+from drivers.devices.regulator import Regulator
+from drivers.devices.relays import CAMERA_POWER, Relays
+from drivers.devices.stage import Axis
+from drivers.devices.thermometers import Thermometers
+from foundation.clock import Clock, boot_of, seconds_ns
+from foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied, StandTripped, Unreachable
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.readings import Frame
+from foundation.tasks import cancelled
+from stand.chamber.compressor import restored
+from stand.chamber.compressor_file import CompressorFile
+from stand.chamber.keeper import Keeper
+from stand.chamber.permits import PermitLimits, Permits
+from stand.fault import Fault
+from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
+from stand.imaging.camera_cooling import Cooling, cool_down, last_word
+from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
+from stand.imaging.equilibrium import CameraEquilibrium, EquilibriumLimits
+from stand.safety import Safety
+from stand.table.motions import Motions
+from stand.table.stage_care import check_home, ready
 
 _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor must not be worn
 _OCCUPIED_AGAIN_S = 5.0

@@ -1,6 +1,6 @@
 """A host whose clocks a test moves."""
 
-from drivers.clock import WallClock, seconds_ns
+from foundation.clock import WallClock, seconds_ns
 
 
 class Host:

@@ -11,7 +11,7 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.polynomial import exponents
 from compensation.drift.thermal_model import ThermalModel
-from compensation.files import make_folder, write_whole
+from foundation.files import make_folder, write_whole
 
 MODEL_NAME, MODULE_NAME = "drift.json", "drift_runtime.py"
 

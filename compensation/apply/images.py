@@ -14,8 +14,8 @@ from compensation.apply.warp import warp
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.lags import Float
 from compensation.drift.states import States
-from compensation.files import write_whole_bytes
-from drivers.interface import SessionError
+from foundation.errors import SessionError
+from foundation.files import write_whole_bytes
 
 Form = Literal["tiff", "png"]
 

@@ -12,8 +12,8 @@ import numpy as np
 from compensation.drift.drift_model import DriftModel, Outside
 from compensation.drift.lags import Float
 from compensation.drift.states import States
-from compensation.files import whole_file
-from drivers.interface import ConfigError, SessionError
+from foundation.errors import ConfigError, SessionError
+from foundation.files import whole_file
 
 X, Y, TIME, CAMERA = "x_px", "y_px", "time_ns", "camera_degC"
 ADDED = ("x_reference_px", "y_reference_px", "var_x_correction_px2", "cov_xy_correction_px2", "var_y_correction_px2",

@@ -14,9 +14,9 @@ from compensation.budget.geometry import Geometry, StandState
 from compensation.budget.refraction import tilted_shift_mm
 from compensation.budget.states import capture_states, mean_state, states_at
 from compensation.budget.table import Repeatability, home_residuals, v0_repeats
-from compensation.target import Target
-from drivers.interface import SessionError
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from markers.target import Target
+from recording.reading.session import Session
 
 Effect = Callable[[StandState, Geometry], tuple[float, float]]
 """(state, geometry) -> (um on or of the target, px in the image)."""

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from drivers.documents import Document, load_document
+from foundation.documents import Document, load_document
 
 
 class Quantity(Document):

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.budget.geometry import StandState
-from drivers.interface import SessionError
-from stand.hub import StepState
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from foundation.items import StepState
+from recording.reading.session import Session
 
 _GAP_NS = 120_000_000_000
 """A temperature is interpolated between readings this close together, and unknown elsewhere."""

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.budget.states import CaptureState, capture_states
-from compensation.markers.detection import Detection, DetectionError, detect
-from compensation.target import Target
-from stand.hub import Event
-from stand.recording.session import Session
+from foundation.items import Event
+from markers.detection import Detection, DetectionError, detect
+from markers.target import Target
+from recording.reading.session import Session
 
 _HOME_KINDS = ("home_residual", "home_residual_large")
 _HOME_TEXT = re.compile(r"(?P<axis>\S+): home was at (?P<residual>-?\d+(\.\d+)?(e-?\d+)?) (?P<unit>mm|deg)\b")

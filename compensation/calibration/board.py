@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensation.calibration.least_squares import Float
-from compensation.target import Target
+from markers.target import Target
 
 
 @dataclass(frozen=True, slots=True, eq=False)

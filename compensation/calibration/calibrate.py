@@ -23,7 +23,7 @@ from compensation.calibration.validation import (
     rays_of,
     score_models,
 )
-from compensation.target import Target
+from markers.target import Target
 
 
 class Model(StrEnum):

@@ -19,9 +19,9 @@ from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES, Pinhole
 from compensation.calibration.rays import RayLens, exponents
 from compensation.calibration.table import PARAMETERS, Table
-from compensation.files import write_whole
-from drivers.documents import Document
-from drivers.interface import SessionError
+from foundation.documents import Document
+from foundation.errors import SessionError
+from foundation.files import write_whole
 
 FORMAT = "thermostand camera"
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from compensation.calibration.least_squares import Float
-from compensation.markers.eccentricity import centroid_offsets_px, disc_centres_by_homography_px
+from markers.eccentricity import centroid_offsets_px, disc_centres_by_homography_px
 
 Project = Callable[[Float], Float]
 """Points (..., 3) of the camera frame, mm -> pixels (..., 2)."""

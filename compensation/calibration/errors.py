@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.interface import StandError
+from foundation.errors import StandError
 
 
 class CalibrationError(StandError):

@@ -17,7 +17,7 @@ import yaml
 from compensation.calibration.least_squares import Float, minimise
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.uncertainty import grid_pixels
-from compensation.files import make_folder, write_whole
+from foundation.files import make_folder, write_whole
 
 _GRID_COLUMNS = 33
 

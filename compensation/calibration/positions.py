@@ -17,12 +17,12 @@ from compensation.calibration.averages import MeanCentres, mean_centres, scatter
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
 from compensation.calibration.visits import AXES, place, visits_for
-from compensation.markers.detection import Detection, DetectionError, detect
-from compensation.target import Target
-from drivers.interface import SessionError
-from stand.progress import Report
-from stand.recording.items import frame_of
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from foundation.progress import Report
+from markers.detection import Detection, DetectionError, detect
+from markers.target import Target
+from recording.format.items import frame_of
+from recording.reading.session import Session
 
 ROLE = "calibration"
 _LEAST_MARKERS = 12

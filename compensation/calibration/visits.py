@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.interface import SessionError
-from stand.hub import StepMark, StepState
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from foundation.items import StepMark, StepState
+from recording.reading.session import Session
 
 Axis = Literal["linear", "rotary"]
 AXES: tuple[Axis, Axis] = ("linear", "rotary")

@@ -8,7 +8,7 @@ import numpy as np
 
 from compensation.drift.displacements import Displacements
 from compensation.drift.lags import Float
-from drivers.documents import Document
+from foundation.documents import Document
 
 Pair = tuple[float, float]
 

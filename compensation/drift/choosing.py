@@ -15,7 +15,7 @@ from compensation.drift.paper_model import PaperModel
 from compensation.drift.thermal_choice import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.observations import Observations
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 Form = Literal["paper", "thermal"]
 FORMS: tuple[Form, ...] = ("paper", "thermal")

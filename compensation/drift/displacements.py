@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.observations import Float, Mask, Observations, Role
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 _ANCHOR_FRAMES = 20
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from compensation.drift.lags import Float
 from compensation.drift.states import Memory, States, ThermalState
-from drivers.clock import NS_PER_S
-from drivers.interface import SessionError
-from stand.hub import StepState
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.items import StepState
+from recording.reading.session import Session
 
 TimesNs = NDArray[np.int64]
 

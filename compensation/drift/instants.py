@@ -15,7 +15,7 @@ from compensation.drift.displacements import Displacements
 from compensation.drift.lags import Float
 from compensation.drift.terms import MOTIONS, motions
 from compensation.observations import Mask, Observations
-from drivers.clock import NS_PER_S
+from foundation.clock import NS_PER_S
 
 _INSTANT_NS = 60 * NS_PER_S
 _FLOOR_PX = 0.002

@@ -21,9 +21,9 @@ from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Scaling, exponents
 from compensation.drift.terms import MOTIONS, Kind, Origin, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
-from compensation.files import write_whole
-from drivers.documents import Document
-from drivers.interface import SessionError
+from foundation.documents import Document
+from foundation.errors import SessionError
+from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
 SCHEMA_VERSION = 3

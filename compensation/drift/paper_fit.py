@@ -14,7 +14,7 @@ from compensation.drift.hull import convex_hull, is_area
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from compensation.observations import Mask, Observations, Role
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 _LEAST_TEMPERATURES = 3
 _LEAST_RANGE_K = 1.0

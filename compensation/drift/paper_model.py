@@ -26,7 +26,7 @@ from compensation.drift.drift_model import (
 )
 from compensation.drift.polynomial import Float, Scaling, design
 from compensation.drift.states import Memory
-from drivers.documents import Document
+from foundation.documents import Document
 
 MAX_DEGREE = 5
 Pair = tuple[float, float]

@@ -23,7 +23,7 @@ from compensation.drift.thermal_fit import RIDGE, RIDGE_WITH_PLAYS, Equations, e
 from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
 from compensation.drift.training import Training, self_heating_K, training
 from compensation.observations import Observations, Role
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 _FEWEST_FOLDS = 3
 _NO_MATTER_PX = 0.0005

@@ -13,7 +13,7 @@ from compensation.drift.lags import Float
 from compensation.drift.states import Memory, States
 from compensation.drift.terms import Kind, Origin, Term, features
 from compensation.observations import Mask, Observations, Role
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 _TRUSTED_S = 3600.0
 """After a gap the state is a guess; frames within this time teach nothing, unless the reference is one of them."""

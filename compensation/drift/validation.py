@@ -15,7 +15,7 @@ from compensation.drift.thermal_choice import left_out_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.observations import Float, Mask, Observations, Role
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 PAPER_BEFORE_PX = (0.191, 0.576)
 PAPER_AFTER_PX = (0.100, 0.090)

@@ -19,8 +19,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-import compensation.markers
-import compensation.target
+import markers
+import markers.target
 from compensation.finding.piece import FoundMarkers, Piece
 
 _BLOCK_BYTES = 1 << 20
@@ -75,7 +75,7 @@ def keep(folder: Path, key: str, found: FoundMarkers) -> None:
 def _program() -> str:
     """A hash of what finds markers: our own text and the version of OpenCV."""
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
-    (folder,) = compensation.markers.__path__
-    for path in (*sorted(Path(folder).glob("*.py")), Path(str(compensation.target.__file__))):
+    (folder,) = markers.__path__
+    for path in (*sorted(Path(folder).glob("*.py")), Path(str(markers.target.__file__))):
         digest.update(path.read_bytes())
     return digest.hexdigest()

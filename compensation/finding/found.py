@@ -10,7 +10,7 @@ from pathlib import Path
 from compensation.finding.cache import cache_folder, content_of, keep, kept, key_of
 from compensation.finding.piece import FoundMarkers, Piece
 from compensation.finding.workers import Work, in_processes, in_turn, on_cluster
-from drivers.interface import ConfigError
+from foundation.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,15 +18,15 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from compensation.finding.png_rows import decode_rows
-from compensation.markers.detection import Detection, DetectionError, Noise, detect, nothing_found
-from compensation.target import Target
-from drivers.interface import SessionError
-from stand.recording.damage import naming
-from stand.recording.images import decode_image
-from stand.recording.instants import utc_text
-from stand.recording.png import ImageArray
-from stand.recording.records import FramePlace, Message, frame_places, read_frame
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from foundation.instants import utc_text
+from markers.detection import Detection, DetectionError, Noise, detect, nothing_found
+from markers.target import Target
+from recording.format.damage import naming
+from recording.format.images import decode_image
+from recording.format.png import ImageArray
+from recording.format.records import FramePlace, Message, frame_places, read_frame
+from recording.reading.session import Session
 
 Float = NDArray[np.float64]
 

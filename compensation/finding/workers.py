@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 
 from compensation.finding.piece import FoundMarkers, Piece, find_markers
-from drivers.interface import ConfigError, SessionError
+from foundation.errors import ConfigError, SessionError
 
 Work = Callable[[Sequence[Piece]], Iterator[tuple[int, FoundMarkers]]]
 """Pieces -> (index, its markers), each piece once, in any order."""

@@ -16,7 +16,6 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.training import frame_states
 from compensation.drift.validation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
-from compensation.markers.detection import Flag
 from compensation.observations import Float, Mask, Observations, Role
 from compensation.report.extras import Extras
 from compensation.report.numbers import (
@@ -32,6 +31,7 @@ from compensation.report.numbers import (
 )
 from compensation.report.tracks import WarmUp, warm_ups
 from compensation.validation3d.document import as_json as validation_json
+from markers.detection import Flag
 
 PAPER_WARM_UP_PX = (0.3, 1.1)
 """Mean drift of the paper's camera, not modified, while it warmed itself by 20 K at 24 degC (section 3.1)."""

@@ -12,7 +12,6 @@ from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.model_file import save_model
 from compensation.drift.validation import Evaluation, evaluate
-from compensation.files import check_writable, write_whole
 from compensation.observations import Observations, Progress, Role, observe_sessions
 from compensation.report.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.report.data_section import data_section, utc
@@ -25,8 +24,9 @@ from compensation.report.result_section import result_section
 from compensation.report.space_section import space_section
 from compensation.report.stand_section import stand_section
 from compensation.report.table_positions import table_positions
-from drivers.interface import SessionError
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from foundation.files import check_writable, write_whole
+from recording.reading.session import Session
 
 
 def analyse(
@@ -34,7 +34,7 @@ def analyse(
 ) -> Evaluation | None:
     """Sessions in; model, report and its numbers out, each file whole or not there; the markers are looked for once.
 
-    Without a thermal cycle there is no model, and None. `progress` is stand.progress.progress or alike. Raises
+    Without a thermal cycle there is no model, and None. `progress` is foundation.progress.progress or alike. Raises
     SessionError or ConfigError with a sentence.
     """
     check_writable(model_path)

@@ -8,8 +8,8 @@ from compensation.report.figures import as_svg
 from compensation.report.page import figure, heading, paragraph
 from compensation.report.table_positions import TablePositions, positions_figure
 from compensation.report.validation_report import validation_parts
-from compensation.target import Target
 from compensation.validation3d.validation import Validation
+from markers.target import Target
 
 
 def space_section(positions: TablePositions, target: Target, validation: Validation | None) -> Iterator[str]:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from compensation.calibration.visits import visits_for
 from compensation.observations import Role
 from compensation.report.figures import FULL_WIDTH_IN, GREY, J_COLOUR, legend_above, new_figure, style
-from compensation.target import Target
-from stand.hub import StepMark
+from foundation.items import StepMark
+from markers.target import Target
 
 _LABEL_MM = 12.0
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from compensation.calibration.visits import Visit, place, visits_for
 from compensation.observations import Float, Observations, Role
-from drivers.interface import SessionError
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from recording.reading.session import Session
 
 FrameIndices = NDArray[np.int64]
 

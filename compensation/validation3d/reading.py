@@ -12,8 +12,8 @@ from compensation.drift.drift_model import Outside
 from compensation.observations import Float
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.validation import Validation
-from drivers.documents import Document
-from drivers.interface import SessionError
+from foundation.documents import Document
+from foundation.errors import SessionError
 
 _Number = float | None
 _Row = tuple[_Number, ...]

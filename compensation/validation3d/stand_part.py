@@ -16,8 +16,8 @@ from compensation.budget.geometry import Geometry, Quantity, StandState
 from compensation.budget.states import mean_state, states_at
 from compensation.observations import Float, Observations
 from compensation.validation3d.positions import ValidationFrames
-from drivers.interface import SessionError
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from recording.reading.session import Session
 
 
 @dataclass(frozen=True, slots=True, eq=False)

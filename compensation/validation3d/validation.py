@@ -21,7 +21,7 @@ from compensation.validation3d.correction import Corrected, corrected
 from compensation.validation3d.deviations import Camera, Deviations, deviations
 from compensation.validation3d.positions import ValidationFrames
 from compensation.validation3d.stand_part import StandPart
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 StandAt = Callable[[Float], StandPart | None]
 """(distances of the positions (P,), mm) -> the stand's part in their frames, None when nobody asked for it."""

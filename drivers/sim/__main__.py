@@ -12,11 +12,11 @@ import os
 import signal
 import sys
 
-from drivers.documents import parse_document
-from drivers.ending import Ending
-from drivers.interface import ConfigError
 from drivers.sim.control import serve_control
 from drivers.sim.laboratory import Laboratory, LaboratorySpec
+from foundation.documents import parse_document
+from foundation.ending import Ending
+from foundation.errors import ConfigError
 
 _ORPHAN_LIMIT_S = 60
 

@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 from drivers.sim import gvcp, gvsp
 from drivers.sim.camera_registers import Registers
 from drivers.sim.camera_schedule import Schedule, Shot
@@ -22,6 +21,7 @@ from drivers.sim.genicam import features
 from drivers.sim.gvcp import Nack, Resend, Status
 from drivers.sim.gvcp_device import ControlChannel, Peer
 from drivers.sim.gvsp_sender import CameraFaults, StreamCounts, StreamSender
+from foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 
 Render = Callable[[int, float, float], NDArray[np.uint8]]
 

@@ -10,8 +10,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from drivers.clock import NS_PER_S, Now
 from drivers.sim.usb import Stall, TimedOut
+from foundation.clock import NS_PER_S, Now
 
 if TYPE_CHECKING:
     from drivers.sim.plant import Plant

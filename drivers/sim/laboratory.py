@@ -11,9 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.clock import FollowedClock, WallClock
-from drivers.documents import Document
-from drivers.interface import ConfigError
 from drivers.sim.camera import FakeCamera
 from drivers.sim.faults import LinkFaults
 from drivers.sim.flap import FakeFlap
@@ -28,6 +25,9 @@ from drivers.sim.usb import UsbServer
 from drivers.sim.wire import Engine, PtyWire, TcpWire
 from drivers.sim.ximc import FakeAxis
 from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from foundation.clock import FollowedClock, WallClock
+from foundation.documents import Document
+from foundation.errors import ConfigError
 
 PROFILES = {"8MT160-300": LINEAR_8MT160_300, "8MR151": ROTARY_8MR151}
 

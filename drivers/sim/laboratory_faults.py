@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from pydantic import TypeAdapter
 
-from drivers.clock import seconds_ns
 from drivers.sim.laboratory import Laboratory
 from drivers.sim.wire import TcpWire
+from foundation.clock import seconds_ns
 
 
 def inject(laboratory: Laboratory, name: str, value: object) -> None:

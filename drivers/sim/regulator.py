@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from enum import IntEnum
 from typing import Protocol
 
-from drivers.clock import Now, seconds_ns
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
@@ -48,6 +47,7 @@ from drivers.sim.regulator_table import (
     to_value,
     to_word,
 )
+from foundation.clock import Now, seconds_ns
 
 MOST_WORDS = 104
 STILL_AIR_LAG_S = 30.0  # of a probe that hangs in the laboratory

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.clock import NS_PER_S, Now
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
@@ -23,6 +22,7 @@ from drivers.sim.modbus import (
     writes_bits,
     writes_one,
 )
+from foundation.clock import NS_PER_S, Now
 
 RELAYS = 8
 ALL_RELAYS = 0x00FF

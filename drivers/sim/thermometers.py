@@ -11,7 +11,6 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.clock import Now
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
@@ -23,6 +22,7 @@ from drivers.sim.modbus import (
     reads_words,
     writes_one,
 )
+from foundation.clock import Now
 
 CHANNELS = 6
 FAULT_BITS = 0x80

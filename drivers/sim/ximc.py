@@ -12,11 +12,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
-from drivers.clock import Now
 from drivers.sim import ximc_table as table
 from drivers.sim.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Run, Shift, Stepper
 from drivers.sim.ximc_settings import Settings
-from drivers.ximc import Damage, Frame, decode, encode
+from drivers.wires.ximc import Damage, Frame, decode, encode
+from foundation.clock import Now
 
 if TYPE_CHECKING:
     from drivers.sim.plant import Plant

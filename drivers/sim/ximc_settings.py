@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import struct
 
-from drivers.clock import seconds_ns
 from drivers.sim import ximc_table as table
 from drivers.sim.kinematics import Pace
 from drivers.sim.stepper import LEFT, RIGHT, Leg, Run, Shift, Stops
+from foundation.clock import seconds_ns
 
 
 class Settings:

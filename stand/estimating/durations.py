@@ -11,8 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from drivers.interface import ConfigError
-from drivers.stage import PROFILES
+from drivers.devices.stage import PROFILES
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -28,7 +27,8 @@ from experiments.steps import (
     estimate_s,
     kind_of,
 )
-from stand.config import AxisConfig, StandConfig
+from foundation.errors import ConfigError
+from stand.config.stand_config import AxisConfig, StandConfig
 from stand.estimating.thermal_model import ChamberModel
 
 # Until recorded nights have shown better, s: a flap's travel with its confirmation, homing from near the switch.

@@ -6,8 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from drivers.interface import ConfigError
-from drivers.stage import PROFILES
+from drivers.devices.stage import PROFILES
 from experiments.steps import (
     AnySoak,
     Capture,
@@ -25,7 +24,8 @@ from experiments.steps import (
     longest_s,
     parameters_of,
 )
-from stand.config import StandConfig
+from foundation.errors import ConfigError
+from stand.config.stand_config import StandConfig
 from stand.estimating.durations import COOL_DOWN_AS_FOUND, LABORATORY_degC, Situation, axis_of, expect
 from stand.estimating.learned import Learned
 from stand.estimating.thermal_model import ChamberModel

@@ -8,9 +8,9 @@ from dataclasses import replace
 from statistics import median_low
 from types import MappingProxyType
 
-from drivers.clock import NS_PER_S
+from foundation.clock import NS_PER_S
+from foundation.items import Event, StepMark, StepState
 from stand.estimating.estimate import PricedStep
-from stand.hub import Event, StepMark, StepState
 
 _REMEMBERED = 9  # the last measurements of a kind of work count
 

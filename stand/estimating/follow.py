@@ -6,13 +6,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from types import MappingProxyType
 
-from drivers.clock import NS_PER_S, seconds_ns
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.instants import duration
+from foundation.items import Event, Item, StepMark
+from foundation.progress import Report
+from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
 from stand.estimating.estimate import PricedStep
 from stand.estimating.eta import Eta
-from stand.hub import Event, Item, StepMark
-from stand.progress import Report
-from stand.recording.instants import duration
-from stand.recording.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
 
 _LEAST_S = 1.0  # of stand time between two reports, or a thousandth of the night: terminals are slow
 _SHARE = 1e-3

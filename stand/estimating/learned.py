@@ -12,16 +12,16 @@ from typing import get_args
 
 from pydantic import Field
 
-from drivers.clock import NS_PER_S
-from drivers.documents import Document, yaml_data
-from drivers.interface import SessionError
 from experiments.steps import Role, Step
-from stand.config import StandConfig
+from foundation.clock import NS_PER_S
+from foundation.documents import Document, yaml_data
+from foundation.errors import SessionError
+from foundation.items import StepMark, StepState
+from foundation.whole_file import write_whole
+from recording.reading.session import Session
+from stand.config.stand_config import StandConfig
 from stand.estimating.durations import Situation, expect
 from stand.estimating.thermal_model import ChamberModel, Ramp, fit, ramps_of
-from stand.hub import StepMark, StepState
-from stand.recording.session import Session
-from stand.recording.whole_file import write_whole
 
 LEARNED_FILE = "learned.json"
 _NIGHTS = 5  # as far back as a stand is likely to be as it is now

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.clock import NS_PER_S
-from drivers.documents import Document
-from drivers.interface import SessionError
-from stand.hub import StepMark, StepState
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.documents import Document
+from foundation.errors import SessionError
+from foundation.items import StepMark, StepState
+from recording.reading.session import Session
 
 BAND_K = 0.5  # the air is at its set-point: five digits of the regulator's display
 

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, median
 
-from drivers.clock import NS_PER_S, seconds_ns
-from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from foundation.clock import NS_PER_S, seconds_ns
+from stand.fault import Fault, Readings, value_of
+from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
 _GAP_S = 60.0  # between two readings; after a longer one the window begins anew

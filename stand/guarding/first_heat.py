@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from drivers.clock import seconds_ns
+from foundation.clock import seconds_ns
+from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
-from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
 _LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds

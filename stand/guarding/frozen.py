@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from drivers.clock import seconds_ns
-from drivers.interface import Quality, Reading
-from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from foundation.clock import seconds_ns
+from foundation.readings import Quality, Reading
+from stand.fault import Fault, Readings, value_of
+from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
 _STEPS_BEHIND = 3.0

@@ -1,7 +1,7 @@
 """Watches the rules, and waits for nothing but the time: no disk, no bus, no client.
 
-Each look judges the latest readings. While all is well it allows the permits to be renewed (stand.guarding.keeper does
-that); when a rule objects it latches the stand and demands that it is made safe (stand.guarding.safety does that).
+Each look judges the latest readings. While all is well it allows the permits to be renewed (stand.chamber.keeper does
+that); when a rule objects it latches the stand and demands that it is made safe (stand.safety does that).
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.clock import NS_PER_S, Clock, seconds_ns
-from stand.guarding.interlocks import Fault, Watch
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.fault import Fault
+from stand.guarding.interlocks import Watch
 from stand.guarding.notify import Notifier
-from stand.guarding.safety import Safety
-from stand.hub import Event, Hub
+from stand.safety import Safety
 
 _LATE_PERIODS = 2
 _STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stopped is read within this after it goes on

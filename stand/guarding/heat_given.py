@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from drivers.clock import NS_PER_S, seconds_ns
-from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from foundation.clock import NS_PER_S, seconds_ns
+from stand.fault import Fault, Readings, value_of
+from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
 _LONGEST_LOOK_S = 60.0  # between two looks; what was given in a longer gap is not known

@@ -5,48 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
-from drivers.clock import NS_PER_S, seconds_ns
-from drivers.interface import Quality, Reading
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.readings import Quality
+from stand.fault import Action, Fault, Readings, value_of
 
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
-_AXIS_ALARM = "controller alarm"  # how drivers.stage begins the reason of a position in an alarm
-
-
-class Readings(Protocol):
-    """What a rule may look at; the hub is one."""
-
-    def latest(self, channel: str) -> Reading | None:
-        """The last reading, whatever its quality."""
-        ...
-
-    def known(self, channel: str) -> Reading | None:
-        """The last reading that is not BAD by the wire."""
-        ...
-
-    def last_good_ns(self, channel: str) -> int | None:
-        """When the channel last gave a GOOD reading."""
-        ...
-
-
-# abort: make safe and end the run. hold: make safe and wait for an operator. warn: say so.
-Action = Literal["abort", "hold", "warn"]
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """What a rule objects to, and what has to be done about it.
-
-    ends_itself: the hold is over when the rule objects no more; else an operator has to clear it. cuts_camera: the
-    camera's supply is switched off as well.
-    """
-
-    rule: str
-    text: str
-    action: Action = "abort"
-    ends_itself: bool = False
-    cuts_camera: bool = False
+_AXIS_ALARM = "controller alarm"  # how drivers.devices.stage begins the reason of a position in an alarm
 
 
 Rule = Callable[[Readings, int], Fault | None]
@@ -74,13 +40,6 @@ class Watch:
             return None
         lasting = f", for {self.grace_s:g} s" if self.grace_s > 0 else ""
         return replace(fault, text=fault.text + lasting, action=self.action, ends_itself=self.ends_itself)
-
-
-def value_of(readings: Readings, channel: str) -> float:
-    """The last known value, over polls that failed on the wire: whether it is too old is the business of `trustworthy`.
-    NaN when the device says itself that it has none, or it was never read, and every comparison with that is false."""
-    reading = readings.known(channel)
-    return math.nan if reading is None else reading.value
 
 
 def over_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False) -> Rule:

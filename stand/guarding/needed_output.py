@@ -6,9 +6,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from drivers.clock import seconds_ns
+from foundation.clock import seconds_ns
+from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
-from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
 _FLAP_OPEN_ABOVE = 0.05

@@ -7,10 +7,10 @@ import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 
-from drivers.clock import Clock
-from drivers.lane import Lane
+from foundation.clock import Clock
+from foundation.helper import Helper
+from foundation.lane import Lane
 from stand.guarding.notify_process import KILLED_LIMIT_S, MODULE, run_command
-from stand.helper import Helper
 
 _LINE = "tell"
 _SPARE_S = 4.0  # real seconds beyond what the command may take, for a machine that is busy

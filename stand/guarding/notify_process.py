@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from stand.helper_process import serve
+from foundation.helper_process import serve
 
 MODULE = "stand.guarding.notify_process"
 _LEFT_NAME = "stand-tell-left"  # of a process whose daemon has gone

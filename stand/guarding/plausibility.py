@@ -10,8 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from drivers.clock import NS_PER_S, seconds_ns
-from stand.guarding.interlocks import Fault, Readings, Rule, value_of
+from foundation.clock import NS_PER_S, seconds_ns
+from stand.fault import Fault, Readings, value_of
+from stand.guarding.interlocks import Rule
 
 Memory = TypeVar("Memory")
 

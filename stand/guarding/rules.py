@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from experiments.steps import Capture
-from stand.config import StandConfig
+from foundation.items import Event, Item, StepMark, StepState
+from stand.config.stand_config import StandConfig
+from stand.gate import OPERATOR
 from stand.guarding.felt_air import CameraLimits, FeltLimits, GraniteLimits, camera_feels, granite_feels
 from stand.guarding.first_heat import FirstHeatLimits, first_heat
 from stand.guarding.frozen import frozen, stale_by_air
@@ -40,8 +42,6 @@ from stand.guarding.plausibility import (
     stuck_while_other_moves,
     warming_while_off,
 )
-from stand.hub import Event, Item, StepMark, StepState
-from stand.running.gate import OPERATOR
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",

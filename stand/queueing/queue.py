@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.interface import SessionError, StandTripped
+from foundation.errors import SessionError, StandTripped
 from stand.estimating.estimate import price
-from stand.order_files import parse_order
 from stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
+from stand.running.order_files import parse_order
 from stand.running.session_setup import Order
 
 

@@ -17,9 +17,9 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from drivers.documents import Document
-from drivers.interface import SessionError
-from stand.recording.sink import sync_folder
+from foundation.documents import Document
+from foundation.errors import SessionError
+from foundation.sink import sync_folder
 
 QUEUE_NAME = "queue.json"
 LAST_NAME = "queue.json.last"

@@ -7,15 +7,15 @@ from collections.abc import Callable, Collection, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from drivers.interface import ConfigError, SessionError, StandError, StandTripped
+from foundation.errors import ConfigError, SessionError, StandError, StandTripped
+from foundation.hub import Hub
+from foundation.items import Event, Item, StepMark, StepState
+from foundation.progress import progress
 from stand.aside import aside
-from stand.commandline.session_report import NotReported, check_reportable, report_session
-from stand.config import StandConfig
+from stand.config.stand_config import StandConfig
 from stand.estimating.estimate import price
 from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
-from stand.hub import Event, Hub, Item, StepMark, StepState
-from stand.progress import progress
 from stand.queueing.queue import order_of
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Halt, Notes
@@ -24,6 +24,7 @@ from stand.running.resume import Interruption, interruption
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.session_setup import Order
 from stand.running.stop import Interrupted
+from stand.session_report import NotReported, check_reportable, report_session
 
 
 async def run_entry(

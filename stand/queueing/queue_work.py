@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.clock import Now
-from drivers.interface import DeviceError, InUse, SessionError, StandError, StandTripped
+from foundation.clock import Now
+from foundation.errors import DeviceError, InUse, SessionError, StandError, StandTripped
 from stand.queueing.queue import finish, note_session, note_step, queued, take
 from stand.queueing.queue_file import Entry, State, working
 from stand.running.stop import Interrupted

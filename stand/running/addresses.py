@@ -8,7 +8,7 @@ import socket
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from stand.config import StandConfig
+from stand.config.stand_config import StandConfig
 
 
 class Address(NamedTuple):

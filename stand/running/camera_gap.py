@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from drivers.interface import Quality, Reading
-from stand.recording.session import Session
-from stand.running.camera_cooling import Cooling
+from foundation.readings import Quality, Reading
+from recording.reading.session import Session
+from stand.imaging.camera_cooling import Cooling
+from stand.imaging.equilibrium import CAMERA, LOST, REACHED
 from stand.running.camera_offset import settled_offsets
-from stand.running.equilibrium import CAMERA, LOST, REACHED
 
 _SAME_K = 1.0  # a camera that is as warm as it was last has been on
 

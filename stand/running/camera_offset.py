@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.clock import NS_PER_S, Clock, seconds_ns
-from stand.hub import Batch, Event, Hub, Item, StepState
-from stand.recording.session import Session
-from stand.running.equilibrium import CAMERA, LOST
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepState
+from recording.reading.session import Session
+from stand.imaging.equilibrium import CAMERA, LOST
 
 AIR = "thermometers.air"
 CHANGED, SAME = "camera_offset_changed", "camera_offset_same"  # kinds of events

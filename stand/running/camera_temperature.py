@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 
-from drivers.camera import Camera
-from drivers.clock import Clock, seconds_ns
-from drivers.interface import Quality, Refused
+from drivers.devices.camera import Camera
 from experiments.steps import Capture, PlannedStep
-from stand.hub import Event, Hub, Item, StepMark, StepState
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import Refused
+from foundation.hub import Hub
+from foundation.items import Event, Item, StepMark, StepState
+from foundation.readings import Quality
 
 _TRIES, _PAUSE_S = 3, 1.0
 

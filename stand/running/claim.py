@@ -20,9 +20,9 @@ from contextlib import AbstractContextManager, ExitStack, asynccontextmanager, c
 from pathlib import Path
 from typing import cast
 
-from drivers.interface import InUse, SessionError
-from stand.config import StandConfig
-from stand.lock_file import remove, take, try_lock
+from foundation.errors import InUse, SessionError
+from foundation.lock_file import remove, take, try_lock
+from stand.config.stand_config import StandConfig
 from stand.running.addresses import Address, addresses
 from stand.runtime import runtime_folder, runtime_folders
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 
-from drivers.clock import NS_PER_S, Clock, seconds_ns
 from experiments.steps import AnySoak, PlannedStep, longest_s
+from foundation.clock import NS_PER_S, Clock, seconds_ns
 from stand.running.journal import Dwell, Journal
 
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.clock import Clock, seconds_ns
-from drivers.interface import DeviceError
-from stand.hub import Event, Hub
-from stand.running.gate import STOPPING, Gate
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.gate import STOPPING, Gate
 from stand.stand import Stand
 
 # Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.

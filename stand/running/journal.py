@@ -1,6 +1,6 @@
 """What a run has done, durable: `journal.jsonl` in the session's folder, from which a killed run goes on.
 
-Append-only, one entry a line (stand/recording/journal_lines.py). A line is on the disk (fdatasync) when `write`
+Append-only, one entry a line (recording/reading/journal_lines.py). A line is on the disk (fdatasync) when `write`
 returns. What follows the last sound line is cut off before anything is appended. A damaged line before it stays where
 it is, and the lines after it count; of a file with damaged lines a copy is kept as `journal.jsonl.damaged`.
 
@@ -29,16 +29,16 @@ from itertools import count
 from pathlib import Path
 from typing import Literal, cast
 
-from drivers.clock import Clock
-from drivers.interface import SessionError
-from drivers.lane import Lane
-from stand.helper import Line
-from stand.recording.disk import JOURNAL_LINE, Disk
-from stand.recording.home import FolderLost
-from stand.recording.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, journal_line, lines_of
-from stand.recording.locks import lock
-from stand.recording.sink import sync_folder
-from stand.recording.whole_file import write_whole
+from foundation.clock import Clock
+from foundation.errors import SessionError
+from foundation.helper import Line
+from foundation.lane import Lane
+from foundation.sink import sync_folder
+from foundation.whole_file import write_whole
+from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, journal_line, lines_of
+from recording.writing.disk import JOURNAL_LINE, Disk
+from recording.writing.home import FolderLost
+from recording.writing.locks import lock
 from stand.running.journal_file import JournalFile, taken_over
 
 _DAMAGED = ".damaged"  # the ending of the copy of a journal with damaged lines

@@ -7,9 +7,9 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from stand.recording.home import FolderLost
-from stand.recording.locks import lock
-from stand.recording.sink import sync_folder
+from foundation.sink import sync_folder
+from recording.writing.home import FolderLost
+from recording.writing.locks import lock
 
 
 class JournalFile:

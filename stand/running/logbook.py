@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 
-from drivers.clock import Clock
-from drivers.interface import SessionError
-from stand.guarding.interlocks import Fault
-from stand.hub import Event, Hub
-from stand.recording.disk import Disk
-from stand.running.gate import INTERLOCK, STOPPING
+from foundation.clock import Clock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Event
+from recording.writing.disk import Disk
+from stand.fault import Fault
+from stand.gate import INTERLOCK, STOPPING
 from stand.running.journal import Cleared, Ended, Entry, Held, Journal, Tripped
 
 _END_WITHIN_S, _COMPLETE_WITHIN_S = 1.0, 10.0  # real seconds that a disk may take for the last entry

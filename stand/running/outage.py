@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 
-from drivers.clock import Clock
-from stand.running.gate import Gate
+from foundation.clock import Clock
+from stand.gate import Gate
 
 
 class Outage:

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.interface import ConfigError
-from stand.config import StandConfig, load_config, packaged
+from foundation.errors import ConfigError
+from stand.config.stand_config import StandConfig, load_config, packaged
 
 # Of the camera and the recording: frames before and after the interruption belong together.
 _CAMERA = (

@@ -8,39 +8,39 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from compensation.target import Target
-from drivers.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
-from drivers.documents import parse_document
-from drivers.interface import SessionError, StandTripped
 from experiments.steps import Capture
+from foundation.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
+from foundation.documents import parse_document
+from foundation.errors import SessionError, StandTripped
+from foundation.instants import utc_text
+from foundation.items import Event, Item
+from foundation.tasks import cancelled, cause_of, failure_text, watched
+from markers.target import Target
+from recording.format.restarts import restarted
+from recording.reading.contents import RUN_END
+from recording.reading.run_word import Run
+from recording.writing.recorder import Recorder
 from stand.assembly import Assembly
 from stand.estimating.estimate import price
 from stand.estimating.learned import load_learned
+from stand.fault import Fault
+from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Fault
-from stand.hub import Event, Item
 from stand.poller import Poller
-from stand.recording.contents import RUN_END
-from stand.recording.instants import utc_text
-from stand.recording.recorder import Recorder
-from stand.recording.restarts import restarted
-from stand.recording.run_word import Run
-from stand.remote.control import handlers, serve
-from stand.remote.status import StatusBoard
 from stand.running.camera_gap import doubt
 from stand.running.camera_offset import OffsetGap, OffsetWatch
 from stand.running.camera_temperature import FramesToCome
 from stand.running.flap_care import keep_shut_in_holds
-from stand.running.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.running.journal import Again, Cleared, Ended, Entry, Gap, Journal
 from stand.running.logbook import Logbook
 from stand.running.resume import Interruption, begun, plan_hash
 from stand.running.scheduler import Progress, Scheduler
 from stand.running.session_setup import Order
 from stand.running.settling_watch import SettlingWatch
+from stand.running.status import StatusBoard
 from stand.running.stop import OPERATOR, Stop
-from stand.running.tasks import cancelled, cause_of, failure_text, watched
 from stand.running.virtual_hold import end_endless_holds
+from stand.serving.control import handlers, serve
 
 # The recorder's events that hold a run, and those that let it go on.
 _HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}

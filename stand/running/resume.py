@@ -12,23 +12,23 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from drivers.interface import SessionError
 from experiments.steps import Capture, PlannedStep
-from stand.config import StandConfig
-from stand.hub import Event, StepState
-from stand.order_files import parse_order
-from stand.progress import late_progress
-from stand.recipe import Recipe
-from stand.recording.contents import RUN_BEGINS, RUN_END
-from stand.recording.glance import glance
-from stand.recording.run_word import Run, last_run_event
-from stand.recording.salvage import Salvaged, salvage_unfinished
-from stand.recording.session import Session
-from stand.recording.settings import SessionInfo
-from stand.recording.superseded import begins_of
+from foundation.errors import SessionError
+from foundation.items import Event, StepState
+from foundation.progress import late_progress
+from recording.reading.contents import RUN_BEGINS, RUN_END
+from recording.reading.glance import glance
+from recording.reading.run_word import Run, last_run_event
+from recording.reading.session import Session
+from recording.reading.superseded import begins_of
+from recording.repair.salvage import Salvaged, salvage_unfinished
+from recording.writing.settings import SessionInfo
+from stand.config.recipe import Recipe
+from stand.config.stand_config import StandConfig
 from stand.running.camera_gap import CameraBefore, camera_before
 from stand.running.cold_start import cold_start
 from stand.running.journal import Again, Begun, Cleared, Dwell, Ended, Entry, Journal, Step, Tripped
+from stand.running.order_files import parse_order
 from stand.running.own_stand import Difference, default_stand, on_this_stand
 from stand.running.scheduler import Progress
 from stand.running.session_setup import Order

@@ -8,26 +8,26 @@ from contextlib import AsyncExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from drivers.clock import Clock, VirtualClock, WallClock, seconds_ns
-from drivers.interface import ConfigError, SessionError, StandError, StandTripped
+from foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
+from foundation.errors import ConfigError, SessionError, StandError, StandTripped
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from foundation.progress import late_progress
+from foundation.tasks import cancelled, cause_of, failure_text, watched
+from recording.repair.salvage import Salvaged, salvage_line, salvage_unfinished
+from recording.writing.disk import FILES_LINE, Disk
+from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
+from recording.writing.settings import SessionInfo
 from stand.assembly import Assembly, assemble
 from stand.clock_watch import ClockWatch
-from stand.commandline.session_text import salvage_line
-from stand.guarding.safe_ranges import accepted_text
-from stand.hub import Event, Hub, Item
+from stand.config.safe_ranges import accepted_text
 from stand.one_cpu import one_cpu
-from stand.progress import late_progress
-from stand.recording.disk import FILES_LINE, Disk
-from stand.recording.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
-from stand.recording.salvage import Salvaged, salvage_unfinished
-from stand.recording.settings import SessionInfo
 from stand.running.camera_temperature import check_temperature
 from stand.running.claim import claimed
 from stand.running.performance import Performance, perform
 from stand.running.resume import Interruption
 from stand.running.session_setup import Order, info_of, recorder_of, session_directory
 from stand.running.stop import Interrupted, Stop
-from stand.running.tasks import cancelled, cause_of, failure_text, watched
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
 __all__ = ["Interrupted", "resume", "run_real", "run_virtual"]

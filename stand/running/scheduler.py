@@ -14,8 +14,6 @@ import math
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from drivers.clock import NS_PER_S, Clock, seconds_ns
-from drivers.interface import DeviceError
 from experiments.steps import (
     AnySoak,
     Capture,
@@ -36,12 +34,15 @@ from experiments.steps import (
     kind_of,
     parameters_of,
 )
-from stand.hub import Event, Hub, StepMark, StepState
-from stand.recording.restarts import restarted
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.errors import DeviceError
+from foundation.hub import Hub
+from foundation.items import Event, StepMark, StepState
+from recording.format.restarts import restarted
+from stand.gate import INTERLOCK
 from stand.running.camera_offset import OffsetWatch
 from stand.running.cold_start import cold_start
 from stand.running.earned import Earned, duration_of
-from stand.running.gate import INTERLOCK
 from stand.running.journal import Again, Journal, Step
 from stand.running.outage import Outage
 from stand.running.set_up import SetUp

@@ -11,17 +11,17 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from compensation.markers.windows import marker_windows
-from compensation.target import Target
-from drivers.clock import NS_PER_S, Clock, VirtualClock
-from drivers.documents import parse_document
+from foundation.clock import NS_PER_S, Clock, VirtualClock
+from foundation.documents import parse_document
+from markers.target import Target
+from markers.windows import marker_windows
+from recording.format.roi import RoiEncoder
+from recording.writing.disk import Disk
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from recording.writing.settings import VIRTUAL_COMMIT_S
 from stand.assembly import Assembly
-from stand.config import RecordingConfig, StandConfig
-from stand.recipe import Recipe
-from stand.recording.disk import Disk
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.roi import RoiEncoder
-from stand.recording.settings import VIRTUAL_COMMIT_S
+from stand.config.recipe import Recipe
+from stand.config.stand_config import RecordingConfig, StandConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,15 +7,16 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from compensation.markers.detection import Detection, DetectionError, detect
-from compensation.target import Target
-from drivers.clock import Clock, seconds_ns
-from drivers.interface import Frame, Reading
-from drivers.lane import Lane
 from experiments.steps import SoakUntilSettled
+from foundation.clock import Clock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item
+from foundation.lane import Lane
+from foundation.readings import Frame, Reading
+from markers.detection import Detection, DetectionError, detect
+from markers.target import Target
 from stand.estimating.thermal_model import BAND_K
-from stand.hub import Batch, Event, Hub, Item
-from stand.running.settling import Float, Seen, digit_K, judge, movement, seconds
+from stand.imaging.settling import Float, Seen, digit_K, judge, movement, seconds
 from stand.stand import Stand
 
 CHAMBER, CAMERA = "regulator.pv", "camera.temperature"

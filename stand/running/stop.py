@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import signal
 
-from drivers.interface import SessionError, StandError, StandTripped
-from stand.guarding.interlocks import Fault
-from stand.running.gate import Gate, Phase, Turn, next_phase
+from foundation.errors import SessionError, StandError, StandTripped
+from stand.fault import Fault
+from stand.gate import Gate, Phase, Turn, next_phase
 from stand.stand import Stand
 
 OPERATOR = "operator"  # the rule of a fault that is no fault

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.clock import Clock, seconds_ns
-from drivers.interface import StandError
-from stand.running.gate import Gate
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import StandError
+from stand.gate import Gate
 
 
 async def end_endless_holds(gate: Gate, clock: Clock, limit_h: float) -> None:

@@ -19,19 +19,19 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from drivers.clock import WallClock, seconds_ns
-from drivers.interface import StandTripped
-from drivers.registers import load_register_map
-from drivers.relays import Relays
+from drivers.devices.relays import Relays
+from drivers.wires.registers import load_register_map
+from foundation.clock import WallClock, seconds_ns
+from foundation.errors import StandTripped
+from foundation.hub import Hub
+from foundation.tasks import cancelled
 from stand.assembly import Assembly, assemble
-from stand.config import StandConfig, packaged
-from stand.guarding.compressor import CompressorLimits
+from stand.chamber.compressor import CompressorLimits
+from stand.chamber.permits import PermitLimits
+from stand.config.stand_config import StandConfig, packaged
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Watch, over_temperature
-from stand.guarding.permits import PermitLimits
-from stand.hub import Hub
 from stand.running.stop import Interrupted, Stop
-from stand.running.tasks import cancelled
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from stand.stand import Devices, Limits, Stand
 from tests.bench.figures import Figure, at_most, progress

@@ -12,10 +12,10 @@ import math
 import time
 from pathlib import Path
 
-from drivers.aravis_library import library
-from drivers.camera import Camera, CameraSettings
-from drivers.clock import WallClock
-from drivers.interface import StandError
+from drivers.devices.camera import Camera, CameraSettings
+from drivers.wires.aravis_library import library
+from foundation.clock import WallClock
+from foundation.errors import StandError
 from tests.bench.fakes import fakes
 from tests.bench.figures import Figure, progress, side_by_side, skipped
 

@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.markers.windows import marker_windows
-from compensation.target import load_target
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame
-from stand.config import packaged
-from stand.recording.images import IMAGE_CLASS, decode_image, encode_image
-from stand.recording.roi import RoiEncoder
+from foundation.clock import NS_PER_S
+from foundation.readings import Frame
+from markers.target import load_target
+from markers.windows import marker_windows
+from recording.format.images import IMAGE_CLASS, decode_image, encode_image
+from recording.format.roi import RoiEncoder
+from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, at_most, in_turns, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, render, shaded_light
 

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import WallClock
 from drivers.sim.camera import FakeCamera, HEIGHT_px, WIDTH_px
 from drivers.sim.faults import LinkFaults
 from drivers.sim.modbus import RtuEngine, TcpEngine
@@ -24,6 +23,7 @@ from drivers.sim.regulator import FakeRegulator
 from drivers.sim.wire import PtyWire, TcpWire
 from drivers.sim.ximc import FakeAxis
 from drivers.sim.ximc_table import LINEAR_8MT160_300
+from foundation.clock import WallClock
 
 Close = Callable[[], None]
 

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.markers.bootstrap import disc_sizes_px, find_candidates
-from compensation.markers.grid import DetectionError, identify
-from compensation.target import Target, load_target
-from stand.config import packaged
+from markers.bootstrap import disc_sizes_px, find_candidates
+from markers.grid import DetectionError, identify
+from markers.target import Target, load_target
+from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, at_least, progress
 from tests.compensation.rendered import Float, Scene, photograph, project, render, true_centres_px
 

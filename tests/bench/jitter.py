@@ -11,10 +11,12 @@ import shutil
 import statistics
 from pathlib import Path
 
-from drivers.aravis_library import library
-from drivers.clock import seconds_ns
-from drivers.interface import Frame, StandError
-from stand.hub import Hub, Item
+from drivers.wires.aravis_library import library
+from foundation.clock import seconds_ns
+from foundation.errors import StandError
+from foundation.hub import Hub
+from foundation.items import Item
+from foundation.readings import Frame
 from stand.running.run import run_real
 from stand.running.session_setup import Order
 from stand.simulator import Simulator, laboratory_of

@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import Frame
-from stand.hub import Hub
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from foundation.clock import NS_PER_S, WallClock
+from foundation.hub import Hub
+from foundation.readings import Frame
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.bench.figures import Figure, absolute, at_least, at_most, in_turns, progress, ratio_at_least, side_by_side
 
 LINE_RATE_MB_S = 118.0

@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from compensation.markers.detection import Detection, Flag, Noise, detect
-from compensation.target import Target, load_target
-from stand.config import packaged
+from markers.detection import Detection, Flag, Noise, detect
+from markers.target import Target, load_target
+from stand.config.stand_config import packaged
 from tests.bench.figures import (
     Figure,
     absolute,

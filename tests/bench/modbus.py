@@ -15,11 +15,11 @@ from pathlib import Path
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.client.base import ModbusBaseSyncClient
 
-from drivers.bus import Bus, LineSettings
-from drivers.clock import WallClock
-from drivers.registers import Block, RegisterMap, load_register_map, plan_blocks
-from drivers.regulator import Regulator
-from stand.config import packaged
+from drivers.devices.regulator import Regulator
+from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.registers import Block, RegisterMap, load_register_map, plan_blocks
+from foundation.clock import WallClock
+from stand.config.stand_config import packaged
 from tests.bench.fakes import fakes
 from tests.bench.figures import Figure, in_turns, per_second, progress, side_by_side
 

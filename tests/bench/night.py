@@ -20,10 +20,11 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from drivers.aravis_library import library
-from drivers.clock import NS_PER_S
-from drivers.interface import StandError
-from stand.hub import Hub, Item
+from drivers.wires.aravis_library import library
+from foundation.clock import NS_PER_S
+from foundation.errors import StandError
+from foundation.hub import Hub
+from foundation.items import Item
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.bench.figures import Figure, at_least, at_most, progress, skipped

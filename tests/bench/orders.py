@@ -7,8 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from stand.config import load_config, packaged
-from stand.recipe import load_recipe
+from stand.config.recipe import load_recipe
+from stand.config.stand_config import load_config, packaged
 from stand.running.session_setup import Order
 
 CAMERA_ADDRESS = "127.0.0.92"

@@ -22,18 +22,18 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame, Reading
-from stand.config import packaged
-from stand.hub import Batch, Item, StepMark, StepState
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.messages import timestamp
-from stand.recording.png import encode_png
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
-from stand.recording.session import Session
-from stand.recording.telemetry import TelemetryEncoder
+from foundation.clock import NS_PER_S
+from foundation.items import Batch, Item, StepMark, StepState
+from foundation.readings import Frame, Reading
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.messages import timestamp
+from recording.format.png import encode_png
+from recording.reading.session import Session
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
+from recording.writing.telemetry import TelemetryEncoder
+from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, photograph, render
 

@@ -21,16 +21,16 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame, Reading
-from stand.hub import Batch
-from stand.recording import messages
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
-from stand.recording.session import Session
-from stand.recording.telemetry import TelemetryEncoder
+from foundation.clock import NS_PER_S
+from foundation.items import Batch
+from foundation.readings import Frame, Reading
+from recording.format import messages
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
+from recording.writing.telemetry import TelemetryEncoder
 from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
 
 ROUNDS = 50

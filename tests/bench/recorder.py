@@ -18,13 +18,13 @@ import numpy as np
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.scene import Scene, SceneSpec
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
+from foundation.clock import NS_PER_S
+from foundation.readings import Frame
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
 from tests.bench.figures import Figure, at_most, in_turns, progress, side_by_side
 
 ROUNDS = 15

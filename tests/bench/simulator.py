@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.clock import NS_PER_S, FollowedClock
 from drivers.sim.plant import Plant, PlantSpec, STEP_ns
 from drivers.sim.regulator import FakeRegulator
 from drivers.sim.relays import FakeRelays
 from drivers.sim.scene import Scene, SceneSpec
+from foundation.clock import NS_PER_S, FollowedClock
 from tests.bench.figures import Figure, absolute, milliseconds, progress
 
 ROUNDS = 7

@@ -13,10 +13,11 @@ import shutil
 import time
 from pathlib import Path
 
-from drivers.aravis_library import library
-from drivers.clock import NS_PER_S, seconds_ns
-from drivers.interface import StandError
-from stand.hub import Hub, Item, StepMark, StepState
+from drivers.wires.aravis_library import library
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.errors import StandError
+from foundation.hub import Hub
+from foundation.items import Item, StepMark, StepState
 from stand.one_cpu import one_cpu
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order

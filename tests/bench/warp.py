@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.apply.warp import source_offset, warp
-from compensation.markers.detection import detect
-from compensation.target import load_target
-from stand.config import packaged
+from markers.detection import detect
+from markers.target import load_target
+from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, at_most, in_turns, milliseconds, progress, side_by_side
 from tests.compensation.rendered import Scene, render
 

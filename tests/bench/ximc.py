@@ -12,10 +12,10 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-from drivers.clock import WallClock
-from drivers.link import SerialSettings, open_link
-from drivers.stage import Axis, AxisSettings
-from drivers.ximc_client import XimcClient
+from drivers.devices.stage import Axis, AxisSettings
+from drivers.wires.link import SerialSettings, open_link
+from drivers.wires.ximc_client import XimcClient
+from foundation.clock import WallClock
 from tests.bench.fakes import fakes
 from tests.bench.figures import Figure, in_turns, per_second, progress, side_by_side, skipped
 

@@ -9,7 +9,7 @@ from compensation.calibration.board import Board, board_of
 from compensation.calibration.pose import Lens, find_pose
 from compensation.calibration.positions import Positions
 from compensation.calibration.table import Table
-from compensation.target import Target
+from markers.target import Target
 
 from .calibration_truth import SIZE, Laboratory, true_table_frame
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import Frame, Reading
-from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepMark, StepState
+from foundation.readings import Frame, Reading
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
 

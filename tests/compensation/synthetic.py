@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.observations import Observations, SessionFacts
-from compensation.target import Target
+from markers.target import Target
 
 Float = NDArray[np.float64]
 Drift = Callable[[Float, float], Float]

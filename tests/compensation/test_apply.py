@@ -25,10 +25,10 @@ from compensation.drift.polynomial import Scaling, exponents
 from compensation.drift.states import States, ThermalState
 from compensation.drift.terms import Kind, Origin, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
-from compensation.markers.detection import detect
 from compensation.observations import session_target
-from drivers.interface import SessionError
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from markers.detection import detect
+from recording.reading.session import Session
 
 from .conftest import Recorded
 

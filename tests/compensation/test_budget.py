@@ -19,14 +19,16 @@ from compensation.budget.correction import displacement_px, granite_mm, post_mm,
 from compensation.budget.geometry import Geometry, StandState, load_geometry
 from compensation.budget.states import mean_state
 from compensation.budget.table import home_residuals
-from compensation.target import load_target
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import ConfigError, Frame, Reading
 from drivers.sim import optics
-from stand.config import packaged
-from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.errors import ConfigError
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepMark, StepState
+from foundation.readings import Frame, Reading
+from markers.target import load_target
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from stand.config.stand_config import packaged
 
 from .rendered import Scene, photograph, render
 

@@ -13,7 +13,7 @@ import yaml
 
 from compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
 from compensation.calibration.pinhole import Pinhole
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 SIZE = (2448, 2048)
 BROWN = Pinhole(np.array([7246.1234567, 7251.7, 1231.8, 1015.4, -0.12, 0.35, 2e-4, -3e-4, 0.7]), SIZE)

@@ -19,11 +19,13 @@ from compensation.calibration.errors import CalibrationError
 from compensation.calibration.pose import find_pose
 from compensation.calibration.positions import observe_positions
 from compensation.observations import session_target
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import Frame, Quality, Reading, SessionError
-from stand.hub import Batch, Hub, StepMark, StepState
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Batch, StepMark, StepState
+from foundation.readings import Frame, Quality, Reading
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
 

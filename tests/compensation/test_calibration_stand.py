@@ -11,9 +11,9 @@ from compensation.calibration.pose import find_pose
 from compensation.calibration.positions import Positions
 from compensation.calibration.table import TableSigma
 from compensation.calibration.validation import rays_of
-from compensation.target import load_target
 from drivers.sim.optics import Nodes, Optics, Placement, optics_at, true_centres_px
-from stand.config import packaged
+from markers.target import load_target
+from stand.config.stand_config import packaged
 
 NOISE_px = 0.0012  # the mean of five frames
 WARM = Nodes(43.0, 39.0, 38.0, 24.0, 24.25, 24.2)  # after hours in a chamber at 24 degC

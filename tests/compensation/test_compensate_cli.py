@@ -18,10 +18,10 @@ from compensation import cli
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import table
-from compensation.markers.table import COLUMNS
 from compensation.report.report import analyse
-from drivers.interface import SessionError
-from stand.progress import progress
+from foundation.errors import SessionError
+from foundation.progress import progress
+from markers.table import COLUMNS
 
 from .conftest import DARK, SEQUENCE, TARGET_YAML, Recorded, photo
 

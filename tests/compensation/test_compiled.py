@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from compensation import compiled
-from compensation.compiled import digest
+from markers import compiled
+from markers.compiled import digest
 
 PROGRAM = """
-from compensation.compiled import entry
+from markers.compiled import entry
 from thing import twice
 print(twice(21), len(twice.stats.cache_hits))
 """
 THING = """
-from compensation.compiled import entry
+from markers.compiled import entry
 @entry
 def twice(x):
     return 2 * x

@@ -15,9 +15,9 @@ from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_fit import choose, fit_paper
 from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import condense, design, solve
-from compensation.files import write_whole
 from compensation.observations import Observations, Role, concatenate
-from drivers.interface import SessionError
+from foundation.errors import SessionError
+from foundation.files import write_whole
 
 from .synthetic import CAMERA_ABOVE_CHAMBER_K, FIT_DEGC, facts, observations, places_px, polynomial_drift, quadratic
 

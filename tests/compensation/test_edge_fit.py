@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from compensation.markers.edge_fit import EdgeFit, Flag, fit_edges
-from compensation.markers.edge_model import (
+from markers.edge_fit import EdgeFit, Flag, fit_edges
+from markers.edge_model import (
     B0,
     BX,
     BY,
@@ -28,8 +28,8 @@ from compensation.markers.edge_model import (
     normal_distribution,
     normal_equations,
 )
-from compensation.markers.noise import Noise
-from compensation.markers.pixels import VALUE, Limits, U, V, empty_pixels, gather
+from markers.noise import Noise
+from markers.pixels import VALUE, Limits, U, V, empty_pixels, gather
 
 from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
 

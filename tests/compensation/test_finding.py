@@ -16,10 +16,10 @@ from compensation.finding.cache import keep, kept
 from compensation.finding.found import Finder, finder
 from compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
 from compensation.finding.workers import in_processes, in_turn, on_cluster
-from compensation.markers.noise import Noise
 from compensation.observations import session_target
-from drivers.interface import ConfigError, SessionError
-from stand.recording.session import Session
+from foundation.errors import ConfigError, SessionError
+from markers.noise import Noise
+from recording.reading.session import Session
 
 from .conftest import Recorded
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.markers.bootstrap import Candidates
-from compensation.markers.grid import DetectionError, Identified, identify, roll_deg
-from compensation.markers.placement import placements
-from compensation.target import OddMarker, Target, load_target
+from markers.bootstrap import Candidates
+from markers.grid import DetectionError, Identified, identify, roll_deg
+from markers.placement import placements
+from markers.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, true_centres_px
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.markers.detection import detect
-from compensation.target import load_target
-from stand.config import packaged
+from markers.detection import detect
+from markers.target import load_target
+from stand.config.stand_config import packaged
 from tests.bench.identification import TARGETS, judged, own, posed
 from tests.compensation.rendered import photograph, render, true_centres_px
 

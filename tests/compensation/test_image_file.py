@@ -18,12 +18,12 @@ from typer.testing import CliRunner
 
 from compensation.cli import app
 from compensation.finding.png_rows import decode_rows
-from compensation.markers.detection import DetectionError
-from compensation.markers.image_file import read_image
-from drivers.interface import SessionError
-from stand.recording.image_limit import images_up_to
-from stand.recording.images import decode_image
-from stand.recording.png import SIGNATURE
+from foundation.errors import SessionError
+from foundation.image_limit import images_up_to
+from markers.detection import DetectionError
+from markers.image_file import read_image
+from recording.format.images import decode_image
+from recording.format.png import SIGNATURE
 
 LIMIT_S = 120
 MOST_BYTES = 1_500_000_000

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from compensation.cli import app
 from compensation.drift.model_file import save_model
-from stand.recording.session import Session
+from recording.reading.session import Session
 
 from .conftest import SEQUENCE, Recorded
 from .test_apply import paper

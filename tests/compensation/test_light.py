@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensation.markers.edge_fit import EdgeFit, fit_edges
-from compensation.markers.light import under_common_light
-from compensation.markers.noise import Noise
+from markers.edge_fit import EdgeFit, fit_edges
+from markers.light import under_common_light
+from markers.noise import Noise
 
 from .rendered import Float, Scene, photograph, render, shaded_light, true_centres_px
 from .test_edge_fit import rms_mpx, start_from

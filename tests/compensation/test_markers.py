@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image
-from compensation.markers.eccentricity import disc_centres
-from compensation.markers.image_file import read_image
-from compensation.markers.table import COLUMNS, DetectedImage, flags_text, write_detections
-from compensation.target import OddMarker, Target, load_target
-from drivers.interface import SessionError
+from foundation.errors import SessionError
+from markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image
+from markers.eccentricity import disc_centres
+from markers.image_file import read_image
+from markers.table import COLUMNS, DetectedImage, flags_text, write_detections
+from markers.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, photograph, render, true_centres_px
 

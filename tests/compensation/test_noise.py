@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensation.markers.noise import estimate_noise, full_scale_DN
+from markers.noise import estimate_noise, full_scale_DN
 
 from .rendered import Scene, photograph, render, shaded_light
 

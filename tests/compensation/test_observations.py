@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from compensation.drift.displacements import displacements, reference_centres
-from compensation.markers.detection import Flag
 from compensation.observations import Observations, Role, concatenate, observe, session_target
-from drivers.clock import NS_PER_S
-from drivers.interface import ConfigError, SessionError
-from stand.recording.instants import utc_text
-from stand.recording.records import frame_places
-from stand.recording.restarts import restarted
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.errors import ConfigError, SessionError
+from foundation.instants import utc_text
+from markers.detection import Flag
+from recording.format.records import frame_places
+from recording.format.restarts import restarted
+from recording.reading.session import Session
 
 from .conftest import DARK, GLARE, SEQUENCE, START_NS, TARGET_YAML, Recorded, record
 from .synthetic import facts, observations, quadratic

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.markers.bootstrap import Candidates
-from compensation.markers.detection import DetectionError, detect
-from compensation.markers.grid import identify
-from compensation.markers.plane import fit_homography, project
-from compensation.target import load_target
-from stand.config import packaged
+from markers.bootstrap import Candidates
+from markers.detection import DetectionError, detect
+from markers.grid import identify
+from markers.plane import fit_homography, project
+from markers.target import load_target
+from stand.config.stand_config import packaged
 
 TARGET = load_target(packaged("targets", "paper-9x6"))
 LONGEST_CPU_S = 30.0

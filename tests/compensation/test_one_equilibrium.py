@@ -7,11 +7,11 @@ from typer.testing import CliRunner
 
 from compensation.cli import app
 from compensation.one_equilibrium import check_one_equilibrium
-from drivers.clock import NS_PER_S
-from drivers.interface import SessionError
-from stand.hub import Event, StepMark, StepState
-from stand.recording.restarts import restarted
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.items import Event, StepMark, StepState
+from recording.format.restarts import restarted
+from recording.reading.session import Session
 from tests.recording.recorded import START_NS, frame, record
 
 

@@ -13,10 +13,10 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation import cli
-from compensation.markers.detection import Detection, detect
-from compensation.markers.grid import project
-from compensation.markers.image_file import read_image
-from compensation.target import load_target
+from markers.detection import Detection, detect
+from markers.grid import project
+from markers.image_file import read_image
+from markers.target import load_target
 
 ROOT = Path(__file__).parents[2]
 TARGET = load_target(ROOT / "configs" / "targets" / "robot-cal-tools-10x10.yaml")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from compensation.finding.png_rows import decode_rows
-from drivers.interface import SessionError
-from stand.recording.png import decode_png, encode_png
+from foundation.errors import SessionError
+from recording.format.png import decode_png, encode_png
 
 FILTERS = {
     "none": cv2.IMWRITE_PNG_FILTER_NONE,

@@ -23,7 +23,7 @@ from compensation.report.gather import numbers_of
 from compensation.report.numbers import Numbers, as_json
 from compensation.report.report import can_be_fitted, check_report_writable, report_page, write_report
 from compensation.report.result_section import result_section
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 from .synthetic import facts, observations, places_px, quadratic
 

@@ -19,8 +19,8 @@ from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.document import as_json
 from compensation.validation3d.reading import load_validation
 from compensation.validation3d.validation import Validation
-from drivers.interface import SessionError
-from stand.hub import StepMark, StepState
+from foundation.errors import SessionError
+from foundation.items import StepMark, StepState
 
 from .synthetic import TARGET, observations, quadratic
 

@@ -21,7 +21,7 @@ from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.drift.validation import evaluate
 from compensation.observations import Observations, Role, concatenate
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 from .reservoirs import cycle, reference, session, warm_up
 from .synthetic import observations as without_histories

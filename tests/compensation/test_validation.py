@@ -11,7 +11,7 @@ from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.validation import evaluate, improvement_percent, table
 from compensation.observations import Observations
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 from .synthetic import HELD_OUT_DEGC, facts, observations, places_px, quadratic
 

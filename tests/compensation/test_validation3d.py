@@ -26,7 +26,7 @@ from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
 from compensation.validation3d.poses import Doubts, find
 from compensation.validation3d.table import summary
 from compensation.validation3d.validation import LensModel, Validation, camera_of, check_same, validate
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 
 from .calibration_cases import board, positions, target_of
 from .calibration_truth import SIZE, Laboratory, Truth, draw

@@ -24,14 +24,16 @@ from compensation.calibration.table import TableSigma
 from compensation.drift.model_file import save_model
 from compensation.drift.paper_fit import fit_paper
 from compensation.observations import Float, Observations, Role, observe, session_target
-from compensation.target import Target
 from compensation.validation3d.positions import validation_frames
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.documents import parse_document
-from drivers.interface import Frame, Quality, Reading, SessionError
-from stand.hub import Batch, Hub, Item, StepMark, StepState
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.documents import parse_document
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Batch, Item, StepMark, StepState
+from foundation.readings import Frame, Quality, Reading
+from markers.target import Target
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
 from .synthetic import observations as thermal_cycle

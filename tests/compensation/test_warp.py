@@ -6,9 +6,9 @@ from scipy import ndimage
 
 from compensation.apply.spline import coefficients
 from compensation.apply.warp import LATTICE_PX, source_offset, warp
-from compensation.markers.detection import detect
-from compensation.target import load_target
-from stand.config import packaged
+from markers.detection import detect
+from markers.target import load_target
+from stand.config.stand_config import packaged
 from tests.compensation.rendered import Scene, render
 
 SMALL = (200, 160)

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.markers.detection import Flag, detect
-from compensation.markers.windows import MARGIN_px, marker_windows
-from compensation.target import load_target
-from drivers.interface import Frame
-from stand.recording.images import decode_image
-from stand.recording.roi import RoiEncoder
+from foundation.readings import Frame
+from markers.detection import Flag, detect
+from markers.target import load_target
+from markers.windows import MARGIN_px, marker_windows
+from recording.format.images import decode_image
+from recording.format.roi import RoiEncoder
 
 from .rendered import Scene, photograph, project, render
 

@@ -2,9 +2,9 @@ import os
 
 import pytest
 
-from drivers.aravis import GigeDevice
-from drivers.aravis_library import DEVICE_ERRORS, AravisError, Library, library, load
-from drivers.interface import StandError
+from drivers.wires.aravis import GigeDevice
+from drivers.wires.aravis_library import DEVICE_ERRORS, AravisError, Library, library, load
+from foundation.errors import StandError
 
 
 @pytest.fixture

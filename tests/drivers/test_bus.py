@@ -15,11 +15,11 @@ import pytest
 from pymodbus.framer.rtu import FramerRTU
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.bus import Bus, LineSettings
-from drivers.clock import VirtualClock, WallClock, seconds_ns
-from drivers.interface import ConfigError, DeviceError, GarbledReply, Refused, Unreachable
 from drivers.sim.faults import LinkFaults
 from drivers.sim.wire import PtyWire, TcpWire
+from drivers.wires.bus import Bus, LineSettings
+from foundation.clock import VirtualClock, WallClock, seconds_ns
+from foundation.errors import ConfigError, DeviceError, GarbledReply, Refused, Unreachable
 
 TIMEOUT_S = 0.05
 LATE_S = 0.08  # after the time-out, before the quarantine (0.1 s) ends
@@ -213,7 +213,7 @@ async def test_a_failed_read_is_asked_again_only_if_that_can_help_and_the_next_i
 async def test_a_late_reply_is_not_credited_to_the_next_request(
     bus: Bus, responder: Responder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.bus.READ_RETRIES", 0)
+    monkeypatch.setattr("drivers.wires.bus.READ_RETRIES", 0)
     responder.fault = late
     with pytest.raises(Unreachable):
         await read_is_right(bus, 100)
@@ -350,7 +350,9 @@ async def test_over_tcp_a_late_reply_dies_with_its_connection_and_a_hang_up_cost
 async def test_a_soak_with_a_fault_in_every_sixth_reply_gives_no_wrong_value(
     bus: Bus, responder: Responder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.bus.READ_RETRIES", 0)  # asking again would hide a shifted reply behind its own value
+    monkeypatch.setattr(
+        "drivers.wires.bus.READ_RETRIES", 0
+    )  # asking again would hide a shifted reply behind its own value
     seeded = random.Random(2018)
     right = failed = 0
     for _ in range(300):

@@ -7,12 +7,13 @@ diagonal ramp: pixel = (x + y + frame) mod 255 at 10 ms of exposure.
 import numpy as np
 import pytest
 
-from drivers.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
-from drivers.camera import Camera, CameraSettings, TemperatureFeature
-from drivers.camera_connection import FrameCount
-from drivers.camera_settings import device_error
-from drivers.clock import NS_PER_S, WallClock, seconds_ns
-from drivers.interface import DeviceError, Quality, Refused, Unreachable
+from drivers.devices.camera import Camera, CameraSettings, TemperatureFeature
+from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
+from drivers.wires.camera_connection import FrameCount
+from drivers.wires.camera_settings import device_error
+from foundation.clock import NS_PER_S, WallClock, seconds_ns
+from foundation.errors import DeviceError, Refused, Unreachable
+from foundation.readings import Quality
 from tests.stock_camera import ADDRESS, SERIAL
 
 EXPOSURE_S = 0.01

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.clock import (
+from foundation.clock import (
     NS_PER_S,
     FollowedClock,
     VirtualClock,
@@ -224,7 +224,7 @@ async def test_a_sleeper_is_late_by_no_more_than_a_second_after_a_suspend(monkey
 
     clock = host.clock()
     due_ns = clock.now_ns() + seconds_ns(30)
-    monkeypatch.setattr("drivers.clock.asyncio.sleep", pass_awake)
+    monkeypatch.setattr("foundation.clock.asyncio.sleep", pass_awake)
     await clock.sleep_until(due_ns)
     assert pieces_s == [0, 1, 1]
     assert clock.now_ns() == due_ns + seconds_ns(12)
@@ -237,7 +237,7 @@ def test_a_thread_that_waits_is_late_by_no_more_than_a_second_after_a_suspend(mo
         pieces_s.append(piece_s)
         host.suspended_ns += seconds_ns(40)
 
-    monkeypatch.setattr("drivers.clock.time.sleep", pass_awake)
+    monkeypatch.setattr("foundation.clock.time.sleep", pass_awake)
     clock = host.clock()
     block_until(clock, clock.now_ns() + seconds_ns(30))
     assert pieces_s == [1]

@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from drivers.clock import Clock, VirtualClock, WallClock
-from drivers.lane import Lane
+from foundation.clock import Clock, VirtualClock, WallClock
+from foundation.lane import Lane
 
 
 @pytest.fixture(params=[WallClock(), VirtualClock(0)], ids=["real", "virtual"])
@@ -81,8 +81,8 @@ async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goe
 
 HANGS = """
 import asyncio, threading
-from drivers.clock import WallClock
-from drivers.lane import Lane
+from foundation.clock import WallClock
+from foundation.lane import Lane
 
 async def main():
     asyncio.create_task(Lane("hangs", WallClock(), patient=False).call(threading.Event().wait))

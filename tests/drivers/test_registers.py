@@ -9,9 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.documents import parse_document
-from drivers.interface import ConfigError
-from drivers.registers import (
+from drivers.wires.registers import (
     Block,
     Point,
     RegisterMap,
@@ -22,6 +20,8 @@ from drivers.registers import (
     load_register_map,
     plan_blocks,
 )
+from foundation.documents import parse_document
+from foundation.errors import ConfigError
 
 MAPS = Path(__file__).parents[2] / "configs" / "registers"
 

@@ -9,11 +9,12 @@ import pytest
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.bus import Bus, LineSettings
-from drivers.clock import WallClock, seconds_ns
-from drivers.interface import ConfigError, DeviceFault, Occupied, Quality, Reading, Refused, Unreachable
-from drivers.registers import load_register_map
-from drivers.regulator import Regulator
+from drivers.devices.regulator import Regulator
+from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.registers import load_register_map
+from foundation.clock import WallClock, seconds_ns
+from foundation.errors import ConfigError, DeviceFault, Occupied, Refused, Unreachable
+from foundation.readings import Quality, Reading
 
 Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
 

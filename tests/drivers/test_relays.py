@@ -12,11 +12,11 @@ from pymodbus.datastore import ModbusServerContext
 from pymodbus.pdu import ModbusPDU
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.bus import Bus, LineSettings
-from drivers.clock import WallClock
-from drivers.interface import ConfigError, DeviceFault, GarbledReply, Refused, Unreachable
-from drivers.registers import load_register_map
-from drivers.relays import Relays
+from drivers.devices.relays import Relays
+from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.registers import load_register_map
+from foundation.clock import WallClock
+from foundation.errors import ConfigError, DeviceFault, GarbledReply, Refused, Unreachable
 
 Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
 

@@ -9,11 +9,12 @@ import pytest
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.bus import Bus, LineSettings
-from drivers.clock import WallClock
-from drivers.interface import ConfigError, DeviceFault, Quality, Reading, Unreachable
-from drivers.registers import load_register_map
-from drivers.thermometers import ThermometerChannel, Thermometers
+from drivers.devices.thermometers import ThermometerChannel, Thermometers
+from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.registers import load_register_map
+from foundation.clock import WallClock
+from foundation.errors import ConfigError, DeviceFault, Unreachable
+from foundation.readings import Quality, Reading
 
 Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
 

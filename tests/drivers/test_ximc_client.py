@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import DeviceError, GarbledReply, Refused, Unreachable
-from drivers.link import ByteLink, SerialSettings, open_link
 from drivers.sim.faults import LinkFaults
 from drivers.sim.wire import PtyWire, TcpWire
-from drivers.ximc import encode
-from drivers.ximc_client import XimcClient
+from drivers.wires.link import ByteLink, SerialSettings, open_link
+from drivers.wires.ximc import encode
+from drivers.wires.ximc_client import XimcClient
+from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 LINE = SerialSettings(baud=115200, stopbits=2)
 POSITION = struct.Struct("<ihq6x")

@@ -22,7 +22,7 @@ from experiments.steps import (
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
-from stand.recipe import Recipe
+from stand.config.recipe import Recipe
 
 CYCLE = ThermalCycle(set_points_degC=(34.0, 44.0, 24.0), held_out_degC=(34.0,), cycles=2)
 

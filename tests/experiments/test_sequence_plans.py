@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from drivers.interface import ConfigError
 from experiments.calibration import Calibration, calibration
 from experiments.steps import (
     Capture,
@@ -35,9 +34,10 @@ from experiments.steps import (
 )
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
-from stand.config import load_config, packaged
+from foundation.errors import ConfigError
+from stand.config.recipe import Experiment, Recipe, load_recipe
+from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price
-from stand.recipe import Experiment, Recipe, load_recipe
 
 RECIPES = [
     "calibration",

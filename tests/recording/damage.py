@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame, Reading
-from stand.hub import Batch, Event
-from stand.recording import messages
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.records import frame_places, read_frame, telemetry_messages
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
+from foundation.clock import NS_PER_S
+from foundation.items import Batch, Event
+from foundation.readings import Frame, Reading
+from recording.format import messages
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.records import frame_places, read_frame, telemetry_messages
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"session_id": "night-1", "operator": "Zoë"}

@@ -5,12 +5,13 @@ from contextlib import suppress
 
 import numpy as np
 
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import Frame, Quality, Reading, bad_reading
-from stand.hub import Batch, Event, Hub, StepMark, StepState
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.records import frame_places, read_frame, telemetry_messages
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.hub import Hub
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Quality, Reading, bad_reading
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.records import frame_places, read_frame, telemetry_messages
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S + 123_456_789
 MS = 1_000_000

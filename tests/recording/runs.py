@@ -2,9 +2,9 @@
 
 import json
 
-from drivers.clock import NS_PER_S
-from stand.hub import Event, StepMark, StepState
-from stand.recording.journal_lines import JOURNAL_NAME, journal_line
+from foundation.clock import NS_PER_S
+from foundation.items import Event, StepMark, StepState
+from recording.reading.journal_lines import JOURNAL_NAME, journal_line
 
 from .recorded import START_NS, half_second, record
 

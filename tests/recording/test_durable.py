@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from drivers.clock import NS_PER_S, VirtualClock, WallClock
-from drivers.interface import Frame, Reading, SessionError
-from stand.hub import Batch, Event, Hub
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, VirtualClock, WallClock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Batch, Event
+from foundation.readings import Frame, Reading
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import ext4, limit_files, run, tmpfs
 
 START_NS = 1_767_290_400 * NS_PER_S

@@ -11,17 +11,18 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Reading, SessionError, bad_reading
-from stand.hub import Batch, Event
-from stand.recording.export import export
-from stand.recording.images import CAMERA_IMAGE
-from stand.recording.instants import utc_text
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
-from stand.recording.session import Session
-from stand.recording.tables import GROUP_ROWS, Column, ParquetTable
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.instants import utc_text
+from foundation.items import Batch, Event
+from foundation.readings import Reading, bad_reading
+from recording.exporting.export import export
+from recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
+from recording.format.images import CAMERA_IMAGE
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
 from tests.recording.recorded import ATTACHMENTS, INFO, MS, START_NS, frame, half_second, record
 
 # channel of the session -> table and column of the export
@@ -328,11 +329,11 @@ PARQUET_WITHOUT_PYARROW = """
 import sys
 sys.modules["pyarrow"] = None  # as an interpreter that has none
 from pathlib import Path
-from stand.recording.export import export
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
-from stand.recording.session import Session
-from stand.recording.tables import GROUP_ROWS, Column, ParquetTable
+from recording.exporting.export import export
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
+from recording.reading.session import Session
+from recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
 export(Session.open(Path(sys.argv[1])), Path(sys.argv[2]), telemetry="parquet", report=print)
 """
 

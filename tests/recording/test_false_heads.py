@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.range_crc import RangeCrcs
-from stand.recording.salvage import salvage_session
-from stand.recording.wire import CHUNK, LENGTH, RECORD, Source
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.range_crc import RangeCrcs
+from recording.format.wire import CHUNK, LENGTH, RECORD, Source
+from recording.repair.salvage import salvage_session
 from tests.recording.damage import read_segment, write_segment
 
 ZSTD_HEAD = zstandard.ZstdCompressor().compress(bytes(1 << 20))[:9]
@@ -67,7 +67,7 @@ def false_heads(kind, size_bytes: int, step_bytes: int) -> bytes:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> type[Read]:
-    monkeypatch.setattr("stand.recording.salvage.Source", Read)
+    monkeypatch.setattr("recording.repair.salvage.Source", Read)
     Read.read_bytes = 0
     return Read
 

@@ -9,12 +9,13 @@ import pytest
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import Frame
-from stand.hub import Event, Hub
-from stand.recording.images import decode_image
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.readings import Frame
+from recording.format.images import decode_image
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import tmpfs
 
 START_NS = 1_767_290_400 * NS_PER_S

@@ -11,19 +11,20 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame, Reading, SessionError
-from stand.hub import Batch, Event, StepMark, StepState
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.overview import overview
-from stand.recording.records import frame_places, read_frame, telemetry_messages
-from stand.recording.salvage import salvage_session
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
-from stand.recording.session import Session
-from stand.recording.telemetry import TelemetryEncoder
-from stand.recording.verify import verify
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Reading
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.records import frame_places, read_frame, telemetry_messages
+from recording.reading.overview import overview
+from recording.reading.session import Session
+from recording.repair.salvage import salvage_session
+from recording.repair.verify import verify
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
+from recording.writing.telemetry import TelemetryEncoder
 from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
 
 START_NS = 1_767_290_400 * NS_PER_S

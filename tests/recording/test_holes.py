@@ -6,22 +6,22 @@ import time
 
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import SessionError
-from stand.recording.export import export
-from stand.recording.glance import glance
-from stand.recording.holes import Hole, holes_in, holes_text
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.messages import TABLE_POSE
-from stand.recording.overview import overview
-from stand.recording.replay import replay_and_record
-from stand.recording.run_word import Files, Run
-from stand.recording.salvage import salvage_session
-from stand.recording.session import Session
-from stand.recording.summary import read_summary
-from stand.recording.trim import trim
-from stand.recording.using import open_whole
-from stand.recording.verify import verify
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from recording.exporting.export import export
+from recording.exporting.replay import replay_and_record
+from recording.exporting.trim import trim
+from recording.format.holes import Hole, holes_in, holes_text
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.messages import TABLE_POSE
+from recording.format.summary import read_summary
+from recording.reading.glance import glance
+from recording.reading.overview import overview
+from recording.reading.run_word import Files, Run
+from recording.reading.session import Session
+from recording.reading.using import open_whole
+from recording.repair.salvage import salvage_session
+from recording.repair.verify import verify
 
 from .damage import METADATA, write_segment
 from .recorded import START_NS, images, record, telemetry

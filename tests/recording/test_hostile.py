@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from drivers.documents import yaml_data
-from drivers.interface import ConfigError
-from stand.commandline.session_cli import app
-from stand.config import load_config, packaged
+from foundation.documents import yaml_data
+from foundation.errors import ConfigError
+from recording.exporting.tables import Column, CsvTable
+from recording.repair.salvage import salvage_unfinished
+from stand.commands.session_cli import app
+from stand.config.stand_config import load_config, packaged
 from stand.estimating.learned import learn
-from stand.recording.salvage import salvage_unfinished
-from stand.recording.tables import Column, CsvTable
 
 RECORDED = Path(__file__).parent / "data" / "20260101T180000Z-format-1"
 LONGEST_S = 60  # for 10 s of a machine that has nothing else to do
@@ -95,7 +95,7 @@ def test_a_run_is_not_held_up_by_what_somebody_left_beside_its_sessions(session:
 )
 def test_an_odd_neighbour_never_ends_a_run(session: Path, text: str, monkeypatch: pytest.MonkeyPatch):
     """Its attached configuration is what somebody made it."""
-    monkeypatch.setattr("stand.recording.session.Session.attachment", lambda self, name: text)
+    monkeypatch.setattr("recording.reading.session.Session.attachment", lambda self, name: text)
     config = load_config(packaged("", "simulated"))
     learn(session.parent, config)
 
@@ -104,7 +104,7 @@ def test_a_neighbour_that_breaks_the_reader_never_ends_a_run(session: Path, monk
     def broken(self: object) -> object:
         raise RuntimeError("a mistake of the program")
 
-    monkeypatch.setattr("stand.recording.session.Session.steps", broken)
+    monkeypatch.setattr("recording.reading.session.Session.steps", broken)
     learn(session.parent, load_config(packaged("", "simulated")))
 
 

@@ -13,9 +13,10 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.interface import Frame, SessionError
-from stand.recording.images import IMAGE_CLASS, decode_image, encode_image
-from stand.recording.png import SIGNATURE, decode_png, encode_png
+from foundation.errors import SessionError
+from foundation.readings import Frame
+from recording.format.images import IMAGE_CLASS, decode_image, encode_image
+from recording.format.png import SIGNATURE, decode_png, encode_png
 
 TIME_NS = 1_767_290_400_123_456_789
 DEPTHS = {"8 bit": ("u1", 255), "10 bit": ("<u2", 1023), "12 bit": ("<u2", 4095), "16 bit, big-endian": (">u2", 65535)}

@@ -8,9 +8,10 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.interface import Frame, Quality, Reading, SessionError, bad_reading
-from stand.hub import Batch, Event, StepMark, StepState
-from stand.recording import messages
+from foundation.errors import SessionError
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Quality, Reading, bad_reading
+from recording.format import messages
 
 TIME_NS = 1_767_290_400_123_456_789
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from stand.recording.glance import glance
-from stand.recording.replay import replay_and_record
-from stand.recording.run_word import Files, Run
-from stand.recording.session import Session
-from stand.recording.trim import trim
-from stand.recording.using import open_whole
-from stand.recording.verify import verify
+from recording.exporting.replay import replay_and_record
+from recording.exporting.trim import trim
+from recording.reading.glance import glance
+from recording.reading.run_word import Files, Run
+from recording.reading.session import Session
+from recording.reading.using import open_whole
+from recording.repair.verify import verify
 
 SESSION = Path(__file__).parent / "data" / "20260101T180000Z-format-1"
 

@@ -7,13 +7,14 @@ import threading
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import ConfigError, Frame, Reading, SessionError, bad_reading
-from stand.hub import Batch, Event, StepMark, StepState
-from stand.recording.glance import glance
-from stand.recording.instants import date_time, duration, parse_instant, utc_text
-from stand.recording.inventory import State, inventory
-from stand.recording.overview import overview
+from foundation.clock import NS_PER_S
+from foundation.errors import ConfigError, SessionError
+from foundation.instants import date_time, duration, parse_instant, utc_text
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Reading, bad_reading
+from recording.format.inventory import State, inventory
+from recording.reading.glance import glance
+from recording.reading.overview import overview
 
 from .recorded import ATTACHMENTS, START_NS, record
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from drivers.interface import Frame
-from stand.recording.images import decode_image
-from stand.recording.raw import encode_raw
+from foundation.readings import Frame
+from recording.format.images import decode_image
+from recording.format.raw import encode_raw
 
 TIME_NS = 1_767_290_400_123_456_789
 

@@ -10,18 +10,20 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import Frame, Quality, Reading, SessionError, bad_reading
-from stand.hub import Batch, Hub
-from stand.recording import messages
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.recorder import Recorder
-from stand.recording.records import telemetry_messages
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
-from stand.recording.session import Session
-from stand.recording.telemetry import TelemetryEncoder
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Frame, Quality, Reading, bad_reading
+from recording.format import messages
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.records import telemetry_messages
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
+from recording.writing.telemetry import TelemetryEncoder
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
 

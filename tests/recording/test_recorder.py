@@ -11,13 +11,15 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import Frame, Reading, SessionError, bad_reading
-from stand.hub import Batch, Event, Hub, StepMark, StepState
-from stand.recording.images import encode_image
-from stand.recording.losses import Losses, ranges
-from stand.recording.recorder import Recorder, RecordingSettings, Saved, SessionInfo
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Reading, bad_reading
+from recording.format.images import encode_image
+from recording.reading.session import Session
+from recording.writing.losses import Losses, ranges
+from recording.writing.recorder import Recorder, RecordingSettings, Saved, SessionInfo
 from tests.recording.disks import limit_files
 
 START_NS = 1_767_290_400 * NS_PER_S

@@ -4,12 +4,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S, VirtualClock
-from drivers.interface import Frame, SessionError
-from stand.hub import Batch, Hub
-from stand.recording.replay import ReplayClock, replay, replay_and_record
-from stand.recording.session import Session
-from stand.recording.topics import recorded_devices, recorded_topics
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Frame
+from recording.exporting.replay import ReplayClock, replay, replay_and_record
+from recording.exporting.topics import recorded_devices, recorded_topics
+from recording.reading.session import Session
 from tests.recording.disks import tmpfs
 from tests.recording.recorded import (
     ATTACHMENTS,

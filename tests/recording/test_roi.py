@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame
-from stand.recording.images import decode_image, encode_image
-from stand.recording.roi import RoiEncoder
+from foundation.clock import NS_PER_S
+from foundation.readings import Frame
+from recording.format.images import decode_image, encode_image
+from recording.format.roi import RoiEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 WINDOWS = np.array([[10, 20, 30, 30], [30, 40, 25, 20], [90, 0, 10, 80]], np.int32)  # two overlap, one ends at the edge

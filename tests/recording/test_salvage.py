@@ -11,13 +11,13 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from drivers.interface import SessionError
-from stand.recording.layout import FRAMES, TELEMETRY, segment_metadata
-from stand.recording.records import read_head
-from stand.recording.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
-from stand.recording.session import Session
-from stand.recording.sink import CommitSink
-from stand.recording.verify import Severity, verify
+from foundation.errors import SessionError
+from foundation.sink import CommitSink
+from recording.format.layout import FRAMES, TELEMETRY, segment_metadata
+from recording.format.records import read_head
+from recording.reading.session import Session
+from recording.repair.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
+from recording.repair.verify import Severity, verify
 from tests.recording.damage import (
     ATTACHMENTS,
     DAMAGES,

@@ -13,11 +13,11 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 
-from stand.recording.home import FolderLost
-from stand.recording.layout import segment_metadata
-from stand.recording.messages import CLASSES, EVENT, LOG
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series, next_number
+from recording.format.layout import segment_metadata
+from recording.format.messages import CLASSES, EVENT, LOG
+from recording.writing.home import FolderLost
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series, next_number
 from tests.recording.disks import ext4, limit_files, run, tmpfs
 
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}

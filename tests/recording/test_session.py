@@ -5,15 +5,16 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame, Reading, SessionError
-from stand.hub import Batch, Event, StepMark, StepState
-from stand.recording import messages
-from stand.recording.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.segment import Record, SeriesForm, Topic
-from stand.recording.series import Series
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Reading
+from recording.format import messages
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"session_id": "night-1", "operator": "J. Krukowski"}

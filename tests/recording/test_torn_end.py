@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.salvage import salvage_session
-from stand.recording.verify import verify
+from foundation.errors import SessionError
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.repair.salvage import salvage_session
+from recording.repair.verify import verify
 from tests.recording.damage import names, read_segment, write_segment
 
 SERIES = [TELEMETRY, FRAMES]

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import SessionError
-from stand.hub import StepMark, StepState
-from stand.recording.layout import FRAMES
-from stand.recording.replay import replay_and_record
-from stand.recording.session import Session
-from stand.recording.trim import TRIMMED, trim
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.items import StepMark, StepState
+from recording.exporting.replay import replay_and_record
+from recording.exporting.trim import TRIMMED, trim
+from recording.format.layout import FRAMES
+from recording.reading.session import Session
 from tests.recording.recorded import INFO, MS, START_NS, frame, half_second, images, record, telemetry
 
 HALF_NS = NS_PER_S // 2

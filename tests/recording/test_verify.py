@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from mcap.reader import SeekingReader
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame, Reading, SessionError
-from stand.hub import Batch, Event, StepMark, StepState
-from stand.recording.gaps import silences
-from stand.recording.inventory import inventory
-from stand.recording.salvage import salvage_session
-from stand.recording.session import Session
-from stand.recording.verify import Severity, verify
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Reading
+from recording.format.inventory import inventory
+from recording.reading.gaps import silences
+from recording.reading.session import Session
+from recording.repair.salvage import salvage_session
+from recording.repair.verify import Severity, verify
 
 from .recorded import item_key, record
 

@@ -20,12 +20,12 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
-from drivers.interface import Reading
-from stand.hub import Batch
-from stand.recording import messages
-from stand.recording.images import CAMERA_IMAGE
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.session import Session
+from foundation.items import Batch
+from foundation.readings import Reading
+from recording.format import messages
+from recording.format.images import CAMERA_IMAGE
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
 from tests.recording.recorded import ATTACHMENTS, INFO, half_second, record
 
 FOXGLOVE = {message.DESCRIPTOR.full_name: message for message in (CompressedImage, RawImage, PoseInFrame, Log)}

@@ -6,13 +6,13 @@ import zlib
 import pytest
 import zstandard
 
-from drivers.interface import SessionError
-from stand.recording.layout import TELEMETRY
-from stand.recording.records import telemetry_messages
-from stand.recording.salvage import salvage_session
-from stand.recording.verify import verify
-from stand.recording.walk import stored_messages, survey
-from stand.recording.wire import INFLATED_LIMIT_BYTES, Source, chunk_content, records
+from foundation.errors import SessionError
+from recording.format.layout import TELEMETRY
+from recording.format.records import telemetry_messages
+from recording.format.wire import INFLATED_LIMIT_BYTES, Source, chunk_content, records
+from recording.reading.walk import stored_messages, survey
+from recording.repair.salvage import salvage_session
+from recording.repair.verify import verify
 from tests.recording.damage import write_segment
 from tests.recording.fuzzed import Record, put_together, take_apart
 

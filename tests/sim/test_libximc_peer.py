@@ -18,7 +18,7 @@ import pytest
 LABORATORY = """
 import sys, threading
 from pathlib import Path
-from drivers.clock import WallClock
+from foundation.clock import WallClock
 from drivers.sim.faults import LinkFaults
 from drivers.sim.wire import PtyWire, TcpWire
 from drivers.sim.ximc import FakeAxis

@@ -7,7 +7,6 @@ from typing import cast
 
 import pytest
 
-from drivers.clock import FollowedClock, seconds_ns
 from drivers.sim.flap import (
     ERROR_AWAITING_COMMAND,
     ERROR_FEEDBACK_DISCONNECT,
@@ -17,6 +16,7 @@ from drivers.sim.flap import (
 )
 from drivers.sim.plant import Plant
 from drivers.sim.usb import Stall, TimedOut
+from foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000
 

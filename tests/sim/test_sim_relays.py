@@ -8,12 +8,12 @@ import pytest
 from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
-from drivers.clock import FollowedClock, seconds_ns
 from drivers.sim.faults import LinkFaults
 from drivers.sim.modbus import RtuEngine
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.relays import FakeRelays
 from drivers.sim.wire import PtyWire
+from foundation.clock import FollowedClock, seconds_ns
 
 START_NS = 1_700_000_000_000_000_000
 HEATER, COMPRESSOR, CAMERA = 0, 2, 5

@@ -8,12 +8,12 @@ import struct
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from drivers.clock import FollowedClock, seconds_ns
 from drivers.sim.faults import LinkFaults
 from drivers.sim.modbus import RtuEngine, TcpEngine, crc16
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.thermometers import FakeThermometers
 from drivers.sim.wire import TcpWire
+from foundation.clock import FollowedClock, seconds_ns
 
 START_NS = 1_700_000_000_000_000_000
 CHANNELS = {"granite_inside": 0, "granite_outside": 1, "artifact": 2, "air": 3, "laboratory": 5}

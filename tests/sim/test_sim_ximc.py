@@ -7,11 +7,11 @@ from typing import Literal, NamedTuple, cast
 
 import pytest
 
-from drivers.clock import FollowedClock, seconds_ns
 from drivers.sim.plant import Plant
 from drivers.sim.ximc import FakeAxis
 from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
-from drivers.ximc import Damage, decode, encode
+from drivers.wires.ximc import Damage, decode, encode
+from foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000
 

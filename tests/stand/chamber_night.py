@@ -3,13 +3,14 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from drivers.clock import NS_PER_S, FollowedClock, seconds_ns
-from drivers.interface import Reading
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.regulator import FakeRegulator
-from stand.config import CompressorConfig
-from stand.guarding.compressor import CompressorLimits, CompressorState, decide
-from stand.hub import Batch, Hub
+from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Reading
+from stand.chamber.compressor import CompressorLimits, CompressorState, decide
+from stand.config.stand_config import CompressorConfig
 
 START_NS = 1_767_290_400 * NS_PER_S
 POLL_S = 5.0

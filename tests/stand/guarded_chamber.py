@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from drivers.clock import NS_PER_S, FollowedClock, seconds_ns
-from drivers.interface import Reading, bad_reading
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.regulator import FakeRegulator
 from drivers.sim.thermometers import FakeThermometers
-from stand.config import CompressorConfig
-from stand.guarding.compressor import CompressorLimits, CompressorState, decide
-from stand.hub import Batch, Hub
+from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Reading, bad_reading
+from stand.chamber.compressor import CompressorLimits, CompressorState, decide
+from stand.config.stand_config import CompressorConfig
 
 START_NS = 1_767_290_400 * NS_PER_S
 POLL_S, SLOW_POLL_S = 5.0, 10.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from stand.config import StandConfig
-from stand.guarding.interlocks import Fault
+from stand.config.stand_config import StandConfig
+from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
 from tests.stand.guarded_chamber import AIR, GRANITE, Action, Chamber, timed
 

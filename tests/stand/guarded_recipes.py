@@ -17,8 +17,8 @@ from experiments.steps import (
     StopChamber,
     estimate_s,
 )
-from stand.config import packaged
-from stand.recipe import load_recipe
+from stand.config.recipe import load_recipe
+from stand.config.stand_config import packaged
 from tests.stand.guarded_chamber import Action, Chamber
 
 RECIPES = (

@@ -34,7 +34,7 @@ class Answer:
 def run_here(words: list[str]) -> None:
     """In the forked process; does not return."""
     from compensation.cli import app as compensate
-    from stand.commandline.commands import app as stand
+    from stand.commands.commands import app as stand
 
     status = CRASHED
     try:
@@ -71,7 +71,7 @@ def answer(words: list[str]) -> dict[str, object]:
 
 def main() -> None:
     import compensation.cli  # noqa: F401 - once for all
-    import stand.commandline.commands  # noqa: F401 - once for all
+    import stand.commands.commands  # noqa: F401 - once for all
 
     answers = os.fdopen(os.dup(1), "w")
     for line in sys.stdin:

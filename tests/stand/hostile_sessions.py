@@ -19,10 +19,10 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from stand.recording import messages
-from stand.recording.images import CAMERA_IMAGE
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.wire import CHUNK, LENGTH, RECORD
+from recording.format import messages
+from recording.format.images import CAMERA_IMAGE
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.wire import CHUNK, LENGTH, RECORD
 
 SOUND, INCOMPLETE, DAMAGED, NONE = "sound", "incomplete", "damaged", ""
 GB = 1 << 30

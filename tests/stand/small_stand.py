@@ -5,20 +5,22 @@ import asyncio
 from collections import Counter
 from pathlib import Path
 
-from compensation.target import Target
-from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
-from drivers.interface import Frame, Reading, StandTripped, Unreachable
-from stand.guarding.safety import Safety
-from stand.hub import Batch, Event, Hub, StepMark, StepState
+from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from foundation.errors import StandTripped, Unreachable
+from foundation.hub import Hub
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Frame, Reading
+from markers.target import Target
+from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
+from stand.imaging.equilibrium import LOST, CameraEquilibrium, EquilibriumLimits
 from stand.running.camera_offset import OffsetWatch
-from stand.running.equilibrium import LOST, CameraEquilibrium, EquilibriumLimits
 from stand.running.flap_care import keep_shut_in_holds
-from stand.running.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
 from stand.running.journal import JOURNAL_NAME, Again, Journal
 from stand.running.resume import journaled
 from stand.running.scheduler import Progress, Scheduler
 from stand.running.settling_watch import SettlingWatch
 from stand.running.stop import Stop
+from stand.safety import Safety
 from stand.stand import Interlocked
 
 TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)

@@ -6,13 +6,14 @@ from contextlib import suppress
 
 import pytest
 
-from drivers.clock import VirtualClock, seconds_ns
-from drivers.interface import Quality, Reading, bad_reading
 from drivers.sim.plant import Plant, PlantSpec
 from experiments.steps import CoolDown, estimate_s
 from experiments.warm_up import WarmUp
-from stand.hub import Batch, Event, Hub, Item
-from stand.running.camera_cooling import Cooling, cool_down, last_word
+from foundation.clock import VirtualClock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item
+from foundation.readings import Quality, Reading, bad_reading
+from stand.imaging.camera_cooling import Cooling, cool_down, last_word
 
 BAND_K, TIME_CONSTANT_S = WarmUp().band_K, WarmUp().time_constant_s
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivers.documents import parse_document
-from drivers.interface import InUse, SessionError
-from stand.config import StandConfig, packaged
+from foundation.documents import parse_document
+from foundation.errors import InUse, SessionError
+from stand.config.stand_config import StandConfig, packaged
 from stand.running.addresses import addresses
 from stand.running.claim import claimed
 
@@ -151,7 +151,7 @@ async def test_a_runtime_folder_that_cannot_be_used_is_said(tmp_path: Path, monk
 HOLDER = """
 import asyncio, sys
 from pathlib import Path
-from stand.config import load_config
+from stand.config.stand_config import load_config
 from stand.running.claim import claimed
 
 async def run():

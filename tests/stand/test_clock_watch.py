@@ -1,7 +1,8 @@
-from drivers.clock import NS_PER_S, seconds_ns
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
 from stand.clock_watch import HOST_SUSPENDED, ClockWatch
-from stand.hub import Event, Hub, Item
-from stand.recording.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
 from tests.host import Host
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import Boot, seconds_ns
-from stand.guarding.compressor import CompressorLimits, CompressorState, decide, keep, restored
+from foundation.clock import Boot, seconds_ns
+from stand.chamber.compressor import CompressorLimits, CompressorState, decide, keep, restored
 
 LIMITS = CompressorLimits(
     min_off_s=300, min_on_s=180, max_starts_per_h=6, start_above_cool_percent=20, stop_above_heat_percent=60
@@ -124,7 +124,7 @@ def test_writers_at_once_do_not_meet_and_the_latest_call_stays(tmp_path: Path, m
             assert goes_on.wait(60)
         sync(fd)
 
-    monkeypatch.setattr("stand.guarding.compressor.os.fsync", hanging)
+    monkeypatch.setattr("stand.chamber.compressor.os.fsync", hanging)
     first = threading.Thread(target=keep, args=(path, CompressorState(True, NOW_NS - 2), BOOT))
     first.start()
     assert hangs.wait(60)

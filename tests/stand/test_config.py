@@ -3,13 +3,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivers.clock import WallClock
-from drivers.interface import ConfigError
+from foundation.clock import WallClock
+from foundation.errors import ConfigError
+from foundation.hub import Hub
 from stand.assembly import assemble
-from stand.config import load_config, packaged
-from stand.guarding.safe_ranges import largest_correction_K
-from stand.hub import Hub
-from stand.recipe import load_recipe
+from stand.config.recipe import load_recipe
+from stand.config.safe_ranges import largest_correction_K
+from stand.config.stand_config import load_config, packaged
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError
+from foundation.errors import SessionError
 from stand import runtime
-from stand.remote.control import RunStatus, handlers, serve
-from stand.remote.control_client import ask, ask_status, running_sessions
-from stand.remote.door import LINE_LIMIT_BYTES, MOST_CLIENTS
-from stand.remote.presence import Entry, Presence, address_in, living, opened_folder
-from stand.running.gate import Gate
+from stand.gate import Gate
+from stand.serving.control import RunStatus, handlers, serve
+from stand.serving.control_client import ask, ask_status, running_sessions
+from stand.serving.door import LINE_LIMIT_BYTES, MOST_CLIENTS
+from stand.serving.presence import Entry, Presence, address_in, living, opened_folder
 
 STATUS = RunStatus(
     recipe="thermal-cycle",
@@ -299,7 +299,7 @@ async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeyp
 DAEMON = """
 import asyncio, sys
 from pathlib import Path
-from stand.remote.control import serve
+from stand.serving.control import serve
 
 async def run():
     async with serve(Path(sys.argv[1]), "a stand", {"echo": lambda request: {}}):

@@ -10,16 +10,16 @@ import yaml
 from click.testing import Result
 from typer.testing import CliRunner
 
-from drivers.clock import NS_PER_S
-from stand.commandline.control_cli import app, status_lines
-from stand.config import packaged
-from stand.hub import Event
-from stand.remote.control import RunStatus, handlers, serve
-from stand.remote.control_client import ask
-from stand.remote.status import StatusBoard
-from stand.running.gate import Gate
+from foundation.clock import NS_PER_S
+from foundation.items import Event
+from stand.commands.control_cli import app, status_lines
+from stand.config.stand_config import packaged
+from stand.gate import Gate
 from stand.running.scheduler import Progress
+from stand.running.status import StatusBoard
 from stand.running.stop import Stop
+from stand.serving.control import RunStatus, handlers, serve
+from stand.serving.control_client import ask
 from tests.host import Host
 
 runner = CliRunner()

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from stand.commandline.session_cli import app
-from stand.recording.session import Session
+from recording.reading.session import Session
+from stand.commands.session_cli import app
 from tests.recording.runs import SECONDS, ended, entries, half_done, record_run, remove, write_journal
 
 runner = CliRunner()

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from stand.remote.control import serve
-from stand.remote.control_client import ask
-from stand.remote.door import MOST_CLIENTS
-from stand.remote.presence import address_in, living, opened_folder
+from stand.serving.control import serve
+from stand.serving.control_client import ask
+from stand.serving.door import MOST_CLIENTS
+from stand.serving.presence import address_in, living, opened_folder
 
 STAND = "a stand"
 HANDLER_S = 0.003
@@ -90,7 +90,7 @@ async def test_silent_clients_shut_nobody_out(tmp_path: Path, silence: bytes):
 DAEMON = """
 import asyncio, os, resource, sys, time
 from pathlib import Path
-from stand.remote.control import serve
+from stand.serving.control import serve
 
 async def run():
     ended = asyncio.Event()

@@ -6,13 +6,14 @@ import math
 
 import pytest
 
-from drivers.clock import NS_PER_S, VirtualClock, seconds_ns
-from drivers.interface import Reading, bad_reading
-from stand.hub import Batch, Event, Hub
-from stand.running.camera_cooling import Cooling
+from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event
+from foundation.readings import Reading, bad_reading
+from stand.imaging.camera_cooling import Cooling
+from stand.imaging.equilibrium import CameraEquilibrium, EquilibriumLimits
 from stand.running.camera_gap import CameraBefore, doubt
 from stand.running.camera_offset import OffsetGap, OffsetWatch
-from stand.running.equilibrium import CameraEquilibrium, EquilibriumLimits
 
 TIME_CONSTANT_S, RISE_K = 900.0, 20.0
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S, seconds_ns
-from drivers.interface import ConfigError
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -28,15 +26,17 @@ from experiments.steps import (
     number_steps,
     parameters_of,
 )
-from stand.config import StandConfig, load_config, packaged
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.errors import ConfigError
+from foundation.items import Batch, Event, StepMark, StepState
+from recording.reading.session import Session
+from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.durations import Pace, Situation, expect
 from stand.estimating.estimate import PricedStep, price
 from stand.estimating.eta import Eta
 from stand.estimating.follow import Follow
 from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
 from stand.estimating.thermal_model import ChamberModel, Response
-from stand.hub import Batch, Event, StepMark, StepState
-from stand.recording.session import Session
 from tests.recording.recorded import record
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S

@@ -9,14 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import Clock, VirtualClock, WallClock, block_until, seconds_ns
-from drivers.interface import DeviceFault, Reading
+from foundation.clock import Clock, VirtualClock, WallClock, block_until, seconds_ns
+from foundation.errors import DeviceFault
+from foundation.hub import Hub
+from foundation.items import Batch, Event
+from foundation.readings import Reading
+from stand.fault import Fault, Readings
 from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Fault, Readings, Rule, Watch
+from stand.guarding.interlocks import Rule, Watch
 from stand.guarding.notify import Notifier
 from stand.guarding.notify_process import run_command
-from stand.guarding.safety import Safety
-from stand.hub import Batch, Event, Hub
+from stand.safety import Safety
 
 
 class PlainActuator:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
-from stand.config import StandConfig, load_config, packaged
-from stand.guarding.interlocks import Fault
+from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
 from tests.stand.guarded_chamber import Action, Chamber, timed
 from tests.stand.guarded_failures import FAILURES, PHASES, Outcome, outcome, table

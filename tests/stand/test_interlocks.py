@@ -2,10 +2,12 @@ import math
 
 import pytest
 
-from drivers.clock import seconds_ns
-from drivers.interface import Cause, Quality, Reading, bad_reading
+from foundation.clock import seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Cause, Quality, Reading, bad_reading
+from stand.fault import Fault
 from stand.guarding.interlocks import (
-    Fault,
     Rule,
     Watch,
     disagreement,
@@ -18,7 +20,6 @@ from stand.guarding.interlocks import (
     stopped_while_permitted,
     trustworthy,
 )
-from stand.hub import Batch, Hub
 
 PV, AIR = "regulator.pv", "thermometers.air"
 RUNNING, PERMIT = "regulator.running", "relays.heater_enable"

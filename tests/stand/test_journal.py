@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import WallClock
-from drivers.interface import SessionError
+from foundation.clock import WallClock
+from foundation.errors import SessionError
 from stand.running.journal import (
     JOURNAL_NAME,
     Begun,

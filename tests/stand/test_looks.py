@@ -3,15 +3,16 @@
 import math
 from collections.abc import Callable
 
-from drivers.clock import seconds_ns
-from drivers.interface import Reading, bad_reading
+from foundation.clock import seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Reading, bad_reading
 from stand.guarding.felt_air import CameraLimits, FeltLimits, GraniteLimits, camera_feels, granite_feels
 from stand.guarding.first_heat import FirstHeatLimits, first_heat
 from stand.guarding.frozen import frozen, stale_by_air
 from stand.guarding.heat_given import HeatFeltLimits, heat_not_felt, too_much_heat
 from stand.guarding.interlocks import Rule
 from stand.guarding.needed_output import NeededLimits, output_not_as_needed
-from stand.hub import Batch, Hub
 
 POLL_S = 5
 PV, AIR, GRANITE, CAMERA = "regulator.pv", "thermometers.air", "thermometers.granite_inside", "camera.temperature"

@@ -5,10 +5,12 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.clock import NS_PER_S, seconds_ns
-from drivers.interface import Reading, bad_reading
-from stand.config import load_config, packaged
-from stand.guarding.interlocks import Fault
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Reading, bad_reading
+from stand.config.stand_config import load_config, packaged
+from stand.fault import Fault
 from stand.guarding.plausibility import (
     Heating,
     HeatingLimits,
@@ -20,7 +22,6 @@ from stand.guarding.plausibility import (
     warming_while_off,
 )
 from stand.guarding.rules import Announcements, watches
-from stand.hub import Batch, Hub
 from tests.stand.chamber_night import START_NS, Night
 
 LIMITS = HeatingLimits(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)

@@ -7,7 +7,7 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from stand.commandline.queue_cli import app
+from stand.commands.queue_cli import app
 from stand.queueing import queue
 from stand.queueing.queue_file import QUEUE_NAME, State, working
 

@@ -12,10 +12,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from drivers.interface import ConfigError, SessionError, StandTripped
-from stand.order_files import load_order
+from foundation.errors import ConfigError, SessionError, StandTripped
 from stand.queueing import queue
 from stand.queueing.queue_file import LAST_NAME, QUEUE_NAME, State, working
+from stand.running.order_files import load_order
 from stand.running.session_setup import Order
 
 ORDER = load_order("warm-up", "simulated")
@@ -225,7 +225,7 @@ ADDING = """
 import sys
 from pathlib import Path
 from stand.queueing import queue
-from stand.order_files import load_order
+from stand.running.order_files import load_order
 order = load_order("warm-up", "simulated")
 print("ready", flush=True)
 sys.stdin.readline()

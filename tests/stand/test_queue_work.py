@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import FollowedClock
-from drivers.interface import DeviceFault, InUse, SessionError, StandTripped, Unreachable
-from stand.order_files import load_order
+from foundation.clock import FollowedClock
+from foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Unreachable
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry, working
 from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, work
+from stand.running.order_files import load_order
 from stand.running.stop import Interrupted
 
 ORDER = load_order("warm-up", "simulated")
@@ -152,7 +152,7 @@ async def test_a_second_worker_is_refused(tmp_path: Path):
 KILLED = """
 import asyncio, os, signal, sys
 from pathlib import Path
-from drivers.clock import WallClock
+from foundation.clock import WallClock
 from stand.queueing.queue_work import work
 
 async def run(entry, notes):

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import seconds_ns
-from drivers.interface import Reading, bad_reading
-from stand.config import load_config, packaged
-from stand.guarding.interlocks import Fault
+from foundation.clock import seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Reading, bad_reading
+from recording.writing.space import Notice, SpaceWatch
+from stand.config.stand_config import load_config, packaged
+from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
-from stand.hub import Batch, Event, Hub, StepMark, StepState
-from stand.recording.space import Notice, SpaceWatch
 
 
 class Table:

@@ -4,10 +4,11 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from drivers.clock import VirtualClock, seconds_ns
-from drivers.interface import DeviceFault, Unreachable
-from stand.guarding.safety import Safety
-from stand.hub import Event, Hub
+from foundation.clock import VirtualClock, seconds_ns
+from foundation.errors import DeviceFault, Unreachable
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.safety import Safety
 
 
 class Actuator:

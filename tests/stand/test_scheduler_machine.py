@@ -11,8 +11,6 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from drivers.clock import NS_PER_S, seconds_ns
-from drivers.interface import Frame, StandTripped
 from experiments.steps import (
     Capture,
     CloseFlap,
@@ -24,9 +22,12 @@ from experiments.steps import (
     StopChamber,
     number_steps,
 )
-from stand.guarding.interlocks import Fault
-from stand.hub import StepMark, StepState
-from stand.running.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.errors import StandTripped
+from foundation.items import StepMark, StepState
+from foundation.readings import Frame
+from stand.fault import Fault
+from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from stand.running.journal import JOURNAL_NAME, Again, Dwell, Step, read_lines
 from stand.running.scheduler import BAND_K
 from stand.running.stop import Interrupted

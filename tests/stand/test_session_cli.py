@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from stand.commandline.session_cli import app
-from stand.hub import Event
-from stand.recording.session import Session
+from foundation.items import Event
+from recording.reading.session import Session
+from stand.commands.session_cli import app
 from tests.recording.recorded import START_NS, half_second, item_key, record
 
 runner = CliRunner()

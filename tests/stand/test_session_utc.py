@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from drivers.clock import NS_PER_S
-from stand.commandline.session_cli import app
-from stand.hub import Event
-from stand.recording.session import Session
-from stand.recording.utc_offsets import CLOCK_STEP
-from stand.recording.verify import verify
+from foundation.clock import NS_PER_S
+from foundation.items import Event
+from recording.format.utc_offsets import CLOCK_STEP
+from recording.reading.session import Session
+from recording.repair.verify import verify
+from stand.commands.session_cli import app
 from tests.recording.recorded import START_NS, half_second, record
 
 HOUR_NS = 3600 * NS_PER_S

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.markers.detection import Detection
-from compensation.markers.edge_model import EdgeState
 from experiments.steps import SoakUntilSettled
-from stand.running.settling import Rate, Seen, camera_rate, digit_K, drift_rate, judge, movement
+from markers.detection import Detection
+from markers.edge_model import EdgeState
+from stand.imaging.settling import Rate, Seen, camera_rate, digit_K, drift_rate, judge, movement
 
 SOAK = SoakUntilSettled(
     max_s=2700.0,

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Reading
 from experiments.steps import SoakUntilSettled, StartChamber, StopChamber, number_steps
-from stand.hub import Batch, Event, StepMark, StepState
-from stand.running.gate import INTERLOCK, OPERATOR
+from foundation.clock import NS_PER_S
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Reading
+from stand.gate import INTERLOCK, OPERATOR
 from tests.compensation.rendered import Scene, photograph, render
 from tests.stand.small_stand import Life
 

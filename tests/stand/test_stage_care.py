@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import seconds_ns
-from drivers.interface import DeviceFault, Quality
-from stand.hub import Event, Hub, Item
-from stand.running.stage_care import check_home, ready
+from foundation.clock import seconds_ns
+from foundation.errors import DeviceFault
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from foundation.readings import Quality
+from stand.table.stage_care import check_home, ready
 from tests.system.stage_bench import OVERSHOOT, UNIT_PER_STEP, Bench, Kind, running_bench
 
 

@@ -9,11 +9,11 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from stand.commandline.commands import app
-from stand.commandline.run_cli import small_disk
-from stand.config import packaged
+from stand.commands.commands import app
+from stand.commands.run_cli import small_disk
+from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
-from stand.order_files import load_order
+from stand.running.order_files import load_order
 
 runner = CliRunner()
 

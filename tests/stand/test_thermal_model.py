@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Reading, bad_reading
+from foundation.clock import NS_PER_S
+from foundation.items import Batch, StepMark, StepState
+from foundation.readings import Reading, bad_reading
+from recording.reading.session import Session
 from stand.estimating.thermal_model import BAND_K, ChamberModel, Ramp, Response, fit, ramps_of
-from stand.hub import Batch, StepMark, StepState
-from stand.recording.session import Session
 from tests.recording.recorded import record
 
 HEATING = Response(dead_s=20.0, rate_K_per_s=0.04, time_constant_s=90.0)

@@ -11,12 +11,12 @@ import os
 import sys
 from pathlib import Path
 
-from drivers.clock import NS_PER_S, WallClock
-from stand.guarding.compressor import CompressorState, keep
-from stand.hub import Hub
+from foundation.clock import NS_PER_S, WallClock
+from foundation.hub import Hub
+from recording.writing.disk import Disk
+from recording.writing.recorder import Recorder
+from stand.chamber.compressor import CompressorState, keep
 from stand.queueing.queue_file import changing
-from stand.recording.disk import Disk
-from stand.recording.recorder import Recorder
 from stand.running.journal import Begun, Dwell, Journal
 from tests.system.recording_process import INFO, MESSAGES_PER_ROUND, SETTINGS, batches_of, frame_of
 

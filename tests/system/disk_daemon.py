@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import Frame, SessionError
-from stand.hub import Event, Hub
-from stand.recording.disk import Disk
-from stand.recording.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
+from foundation.clock import NS_PER_S, WallClock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.readings import Frame
+from recording.writing.disk import Disk
+from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from stand.running.journal import Begun, Dwell, Ended, Journal
 from stand.running.logbook import Logbook
 

@@ -10,12 +10,12 @@ from typing import cast
 
 from usb.core import USBError
 
-from drivers.clock import FollowedClock, VirtualClock, seconds_ns
-from drivers.flap import Flap, FlapSettings
-from drivers.interface import Quality, Reading
+from drivers.devices.flap import Flap, FlapSettings
 from drivers.sim.flap import MAX_DUTY_FORWARD, FakeFlap
 from drivers.sim.plant import Plant
 from drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer
+from foundation.clock import FollowedClock, VirtualClock, seconds_ns
+from foundation.readings import Quality, Reading
 
 T0 = 1_700_000_000_000_000_000
 OURS, OTHER = "00351210", "00351299"

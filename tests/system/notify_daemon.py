@@ -10,7 +10,7 @@ import resource
 import sys
 from contextlib import suppress
 
-from drivers.clock import WallClock
+from foundation.clock import WallClock
 from stand.guarding.notify import Notifier
 
 

@@ -18,13 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import Frame, Reading
-from stand.hub import Batch, Hub
-from stand.recording import messages
-from stand.recording.images import CAMERA_IMAGE, encode_image
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.segment import Record
+from foundation.clock import NS_PER_S, WallClock
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Frame, Reading
+from recording.format import messages
+from recording.format.images import CAMERA_IMAGE, encode_image
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from recording.writing.segment import Record
 
 START_NS = 1_767_290_400 * NS_PER_S
 PERIOD_NS = NS_PER_S // 100

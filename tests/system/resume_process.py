@@ -11,8 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from drivers.interface import Frame
-from stand.hub import StepMark, StepState
+from foundation.items import StepMark, StepState
+from foundation.readings import Frame
 from stand.running.resume import interruption
 from stand.running.run import resume, run_virtual
 

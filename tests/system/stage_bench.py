@@ -8,15 +8,15 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Literal, cast
 
-from drivers.clock import FollowedClock, VirtualClock, seconds_ns
-from drivers.interface import Reading
+from drivers.devices.stage import Axis, AxisSettings
 from drivers.sim.faults import LinkFaults
 from drivers.sim.plant import Plant
 from drivers.sim.wire import PtyWire, TcpWire
 from drivers.sim.ximc import FakeAxis, XimcEngine
 from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
-from drivers.stage import Axis, AxisSettings
-from drivers.ximc import encode
+from drivers.wires.ximc import encode
+from foundation.clock import FollowedClock, VirtualClock, seconds_ns
+from foundation.readings import Reading
 
 T0 = 1_700_000_000_000_000_000
 SERIAL_NUMBER = 4101

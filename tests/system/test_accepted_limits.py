@@ -8,8 +8,8 @@ import yaml
 from click.testing import Result
 from typer.testing import CliRunner
 
-from stand.commandline.commands import app
-from stand.recording.session import Session
+from recording.reading.session import Session
+from stand.commands.commands import app
 from tests.system.conftest import require_aravis
 
 RECIPE = """

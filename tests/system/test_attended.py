@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from stand.recording.session import Session
+from recording.reading.session import Session
 from tests.system.conftest import require_aravis
 
 PROMPTED = """

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.interface import Quality
-from stand.hub import Batch
-from stand.recording.session import Session
+from foundation.items import Batch
+from foundation.readings import Quality
+from recording.reading.session import Session
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stand.hub import Batch
-from stand.recording.session import Session
+from foundation.items import Batch
+from recording.reading.session import Session
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault

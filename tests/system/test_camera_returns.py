@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import Frame
-from stand.hub import Event, Hub, Item
-from stand.recording.session import Session
-from stand.recording.superseded import begins_of, is_superseded
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from foundation.readings import Frame
+from recording.reading.session import Session
+from recording.reading.superseded import begins_of, is_superseded
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S
-from stand.hub import Hub
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.hub import Hub
+from recording.reading.session import Session
 from stand.running.journal import JOURNAL_NAME, Dwell, Gap, read_lines
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order

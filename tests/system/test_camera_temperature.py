@@ -9,14 +9,15 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Reading, bad_reading
 from experiments.steps import Capture, PlannedStep, Role, Soak
-from stand.commandline.commands import app
-from stand.config import load_config, packaged
+from foundation.clock import NS_PER_S
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepMark, StepState
+from foundation.readings import Reading, bad_reading
+from recording.reading.session import Session
+from stand.commands.commands import app
+from stand.config.stand_config import load_config, packaged
 from stand.guarding.rules import camera_measured
-from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
-from stand.recording.session import Session
 from stand.running.camera_temperature import FramesToCome
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order

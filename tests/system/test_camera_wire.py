@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.aravis_library import library
-from drivers.camera import Camera, CameraSettings, TemperatureFeature
-from drivers.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
-from drivers.interface import Quality, Refused, StandError, Unreachable
+from drivers.devices.camera import Camera, CameraSettings, TemperatureFeature
 from drivers.sim.camera import FakeCamera
+from drivers.wires.aravis_library import library
+from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
+from foundation.errors import Refused, StandError, Unreachable
+from foundation.readings import Quality
 from tests.addresses import camera_address
 
 ADDRESS = camera_address()
@@ -389,8 +390,8 @@ async def test_while_another_client_controls_the_camera_open_is_refused():
 
 CRASH = f"""
 import asyncio, os
-from drivers.camera import Camera, CameraSettings
-from drivers.clock import WallClock
+from drivers.devices.camera import Camera, CameraSettings
+from foundation.clock import WallClock
 asyncio.run(Camera("camera", CameraSettings("{ADDRESS}", heartbeat_s=1.5), WallClock()).open())
 os._exit(0)
 """

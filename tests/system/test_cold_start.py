@@ -9,17 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame
 from experiments.steps import Capture, PowerCamera, Prompt
-from stand.hub import Event, Hub, Item, StepMark, StepState
-from stand.recording.session import Session
-from stand.recording.superseded import begins_of, is_superseded
-from stand.remote.control_client import ask
+from foundation.clock import NS_PER_S
+from foundation.hub import Hub
+from foundation.items import Event, Item, StepMark, StepState
+from foundation.readings import Frame
+from recording.reading.session import Session
+from recording.reading.superseded import begins_of, is_superseded
 from stand.running.cold_start import cold_start
 from stand.running.resume import interruption
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
+from stand.serving.control_client import ask
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from drivers.clock import seconds_ns
-from stand.config import CompressorConfig
-from stand.guarding.compressor import restored
+from foundation.clock import seconds_ns
+from stand.chamber.compressor import restored
+from stand.config.stand_config import CompressorConfig
 from stand.running.session_setup import Order
 from tests.system.gateway import gateway
 from tests.system.test_guard_wire import Start, bench_from

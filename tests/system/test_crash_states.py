@@ -18,12 +18,12 @@ from dataclasses import dataclass
 
 import pytest
 
-from drivers.clock import NS_PER_S
-from stand.guarding.compressor import restored
+from foundation.clock import NS_PER_S
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
+from recording.repair.salvage import salvage_unfinished
+from stand.chamber.compressor import restored
 from stand.queueing.queue_file import read_queue
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.salvage import salvage_unfinished
-from stand.recording.session import Session
 from stand.running.journal import Journal
 from tests.system.crash_process import COMPRESSOR, CONTROL, QUEUE, SESSION, journal_entry
 from tests.system.logged_disk import FLUSH, LIMIT_S, MARK, WRITE, Entry, logged_disk, read_log

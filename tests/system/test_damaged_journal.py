@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError, StandTripped
-from stand.hub import StepState
-from stand.recording.glance import glance
-from stand.recording.journal_lines import JOURNAL_NAME
-from stand.recording.run_word import Files, Run
-from stand.recording.salvage import salvage_session
-from stand.recording.session import Session
-from stand.recording.using import open_whole
-from stand.recording.verify import verify
+from foundation.errors import SessionError, StandTripped
+from foundation.items import StepState
+from recording.reading.glance import glance
+from recording.reading.journal_lines import JOURNAL_NAME
+from recording.reading.run_word import Files, Run
+from recording.reading.session import Session
+from recording.reading.using import open_whole
+from recording.repair.salvage import salvage_session
+from recording.repair.verify import verify
 from stand.running.journal import Tripped, read_lines
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual

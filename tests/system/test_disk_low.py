@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import Frame
 from experiments.steps import Capture
-from stand.hub import Event, Item
-from stand.recording.session import Session
+from foundation.items import Event, Item
+from foundation.readings import Frame
+from recording.reading.session import Session
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError
-from stand.recording.disk_process import LEFT_NAME
-from stand.recording.salvage import salvage_session
-from stand.recording.session import Session
+from foundation.errors import SessionError
+from recording.reading.session import Session
+from recording.repair.salvage import salvage_session
+from recording.writing.disk_process import LEFT_NAME
 from stand.running.journal import Ended, Journal, read_lines
 from tests.recording.disks import ext4, run
 

@@ -16,9 +16,10 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.training import frame_states
 from compensation.drift.validation import evaluate
 from compensation.observations import Observations, Role, observe_sessions
-from drivers.interface import Frame
-from stand.hub import Hub, Item
-from stand.progress import progress
+from foundation.hub import Hub
+from foundation.items import Item
+from foundation.progress import progress
+from foundation.readings import Frame
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

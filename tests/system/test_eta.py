@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S
 from experiments.steps import Soak
-from stand.config import packaged
+from foundation.clock import NS_PER_S
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepMark, StepState
+from recording.reading.session import Session
+from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
-from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
-from stand.recording.session import Session
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
 from stand.running.session_setup import Order

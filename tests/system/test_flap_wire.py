@@ -6,9 +6,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.clock import WallClock
-from drivers.flap import Flap
-from drivers.interface import DeviceFault, Quality, Reading, Refused, Superseded, Unreachable
+from drivers.devices.flap import Flap
 from drivers.sim.flap import (
     ERROR_FEEDBACK_DISCONNECT,
     ERROR_HARD_OVER_CURRENT,
@@ -16,6 +14,9 @@ from drivers.sim.flap import (
     ERROR_SOFT_OVER_CURRENT,
 )
 from drivers.sim.usb import TimedOut
+from foundation.clock import WallClock
+from foundation.errors import DeviceFault, Refused, Superseded, Unreachable
+from foundation.readings import Quality, Reading
 
 from .flap_bench import GET_RAM_SETTINGS, GET_VARIABLES, SET_TARGET, SETTINGS, STOP_MOTOR, T0, Bench, running_bench
 

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import Quality, StandTripped
-from stand.hub import Batch, Event, Hub, Item
-from stand.recording.session import Session
+from foundation.errors import StandTripped
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item
+from foundation.readings import Quality
+from recording.reading.session import Session
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

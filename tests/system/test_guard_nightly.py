@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import SessionError
-from stand.remote.control_client import ask_status
+from foundation.clock import NS_PER_S, WallClock
+from foundation.errors import SessionError
 from stand.running.session_setup import Order
+from stand.serving.control_client import ask_status
 from tests.recording.disks import ext4, run
 from tests.stand.test_door import connected
 from tests.system.conftest import require_aravis

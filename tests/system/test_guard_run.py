@@ -11,15 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import seconds_ns
-from drivers.interface import SessionError, StandTripped
-from stand.hub import Batch, Event, Hub, Item
-from stand.recording.session import Session
-from stand.remote.control_client import ask, ask_status
+from foundation.clock import seconds_ns
+from foundation.errors import SessionError, StandTripped
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item
+from recording.reading.session import Session
 from stand.running.journal import JOURNAL_NAME, Cleared, Tripped, read_lines
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_virtual
 from stand.running.session_setup import Order
+from stand.serving.control_client import ask, ask_status
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step, fault

@@ -15,15 +15,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
-from drivers.interface import Quality
+from foundation.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.readings import Quality
+from recording.reading.session import Session
 from stand.assembly import Assembly, assemble
-from stand.config import CompressorConfig, StandConfig, packaged
-from stand.guarding.compressor import CompressorState, keep
-from stand.guarding.interlocks import Fault
+from stand.chamber.compressor import CompressorState, keep
+from stand.config.stand_config import CompressorConfig, StandConfig, packaged
+from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
-from stand.hub import Event, Hub
-from stand.recording.session import Session
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from stand.simulator import ControlSocket, Simulator

@@ -17,13 +17,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drivers.clock import NS_PER_S, seconds_ns
-from drivers.interface import StandError
-from stand.commandline.session_cli import app
-from stand.config import StandConfig
-from stand.hub import Hub, Item, StepMark
-from stand.recording.session import Session
-from stand.recording.utc_offsets import CLOCK_STEP
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.errors import StandError
+from foundation.hub import Hub
+from foundation.items import Item, StepMark
+from recording.format.utc_offsets import CLOCK_STEP
+from recording.reading.session import Session
+from stand.commands.session_cli import app
+from stand.config.stand_config import StandConfig
 from stand.running.run import run_real
 from stand.running.session_setup import Order
 from stand.simulator import ControlSocket, Simulator, laboratory_of
@@ -49,7 +50,7 @@ def _aravis() -> None:
 
 
 class MovedTime:
-    """What drivers.clock knows of the module `time`, of a host that a test suspends and steps."""
+    """What foundation.clock knows of the module `time`, of a host that a test suspends and steps."""
 
     def __init__(self) -> None:
         self.suspended_ns = self.step_ns = 0
@@ -68,7 +69,7 @@ async def test_a_suspend_and_a_step_of_the_system_clock_are_recorded_and_instant
     """The run may go on or trip on readings so old; either way it is recorded in instants that have passed."""
     ordered, host = order(BRIEF), MovedTime()
     await asyncio.to_thread(simulator, ordered.config, False)
-    monkeypatch.setattr("drivers.clock.time", host)
+    monkeypatch.setattr("foundation.clock.time", host)
 
     def watch(hub: Hub) -> None:
         def move(item: Item) -> None:

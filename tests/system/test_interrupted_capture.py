@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S, seconds_ns
-from drivers.interface import Frame
 from experiments.steps import Capture
-from stand.hub import Batch, Event, Hub, Item
-from stand.recording.session import Session
-from stand.recording.superseded import begins_of, is_superseded
-from stand.remote.control_client import ask
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item
+from foundation.readings import Frame
+from recording.reading.session import Session
+from recording.reading.superseded import begins_of, is_superseded
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
+from stand.serving.control_client import ask
 from tests.recording.disks import limit_files
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault

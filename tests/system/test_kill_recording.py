@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.salvage import salvage_session, salvage_unfinished
-from stand.recording.session import Session
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
+from recording.repair.salvage import salvage_session, salvage_unfinished
 from tests.recording.damage import names, read_segment
 from tests.system.recording_process import MESSAGES_PER_ROUND, frame_records, nursery, telemetry_records
 

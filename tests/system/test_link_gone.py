@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S
-from drivers.interface import StandTripped
-from stand.hub import Event, Hub
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.errors import StandTripped
+from foundation.hub import Hub
+from foundation.items import Event
+from recording.reading.session import Session
 from stand.running.run import Interrupted, run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

@@ -10,8 +10,8 @@ import pytest
 
 from compensation.drift.validation import Evaluation
 from compensation.report.report import analyse
-from stand.config import packaged
-from stand.progress import progress
+from foundation.progress import progress
+from stand.config.stand_config import packaged
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

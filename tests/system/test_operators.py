@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError, StandError
-from stand.hub import Event, Hub, Item, StepMark, StepState
-from stand.recording.session import Session
-from stand.remote.control_client import ask
+from foundation.errors import SessionError, StandError
+from foundation.hub import Hub
+from foundation.items import Event, Item, StepMark, StepState
+from recording.reading.session import Session
 from stand.running.journal import JOURNAL_NAME, Held, read_lines
 from stand.running.run import Interrupted, run_virtual
 from stand.running.session_setup import Order
+from stand.serving.control_client import ask
 from tests.system.conftest import require_aravis
 from tests.system.test_attended import PROMPTED
 from tests.system.test_guard_run import check_safe

@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-from stand.recording.session import Session
-from stand.remote.control import RunStatus, handlers
-from stand.remote.control_client import ask
+from recording.reading.session import Session
 from stand.running.session_setup import Order
+from stand.serving.control import RunStatus, handlers
+from stand.serving.control_client import ask
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from stand.recording.layout import FRAMES, TELEMETRY
-from stand.recording.salvage import salvage_unfinished
-from stand.recording.session import Session
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
+from recording.repair.salvage import salvage_unfinished
 from tests.system.recording_process import frame_records, nursery, telemetry_records
 from tests.system.test_kill_recording import read_series
 

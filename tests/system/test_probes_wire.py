@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from stand.config import StandConfig, packaged
-from stand.recording.session import Session
+from recording.reading.session import Session
+from stand.config.stand_config import StandConfig, packaged
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from stand.simulator import Simulator

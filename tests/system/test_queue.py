@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.steps import Capture
+from foundation.items import StepState
+from recording.reading.session import Session
 from stand.estimating.learned import load_learned
-from stand.hub import StepState
-from stand.order_files import load_order
 from stand.queueing import queue
 from stand.queueing.queue_work import MOST_FRUITLESS_STARTS
-from stand.recording.session import Session
+from stand.running.order_files import load_order
 from tests.system.conftest import require_aravis
 
 RECIPE = """
@@ -31,7 +31,7 @@ experiments:
 COMMAND = [
     sys.executable,
     "-c",
-    "from stand.commandline.queue_cli import app; app()",
+    "from stand.commands.queue_cli import app; app()",
     "start",
     "--virtual-time",
     "--out",

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.interface import Unreachable
-from stand.hub import Hub, Item, StepMark
-from stand.recording.session import Session
+from foundation.errors import Unreachable
+from foundation.hub import Hub
+from foundation.items import Item, StepMark
+from recording.reading.session import Session
 from stand.running.run import Interrupted, run_real
 from stand.running.session_setup import Order
 from stand.simulator import ControlSocket

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from compensation.observations import observe, session_target
-from stand.hub import Event, Hub
-from stand.recording.session import Session
+from foundation.hub import Hub
+from foundation.items import Event
+from recording.reading.session import Session
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.clock import seconds_ns
-from drivers.interface import DeviceFault, Unreachable
+from foundation.clock import seconds_ns
+from foundation.errors import DeviceFault, Unreachable
+from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
-from stand.hub import Hub
 from stand.running.session_setup import Order
 from tests.system.test_guard_wire import Bench, Start, bench_of, write_by_another_master
 

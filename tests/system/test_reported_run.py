@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from compensation.drift.model_file import load_model
-from stand.commandline.session_report import MODEL_NAME, REPORT_NAME
-from stand.config import packaged
+from foundation.exit_codes import NOT_REPORTED
+from recording.reading.session import Session
+from recording.repair.verify import verify
+from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
-from stand.exit_codes import NOT_REPORTED
-from stand.order_files import load_order
-from stand.recording.session import Session
-from stand.recording.verify import verify
+from stand.running.order_files import load_order
+from stand.session_report import MODEL_NAME, REPORT_NAME
 from tests.system.conftest import require_aravis
 
 EVERY_SEQUENCE = """

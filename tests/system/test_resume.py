@@ -11,19 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError, StandTripped, Unreachable
 from experiments.steps import Capture
-from stand.hub import Hub, StepState
-from stand.recording.glance import glance
-from stand.recording.run_word import Files, Run
-from stand.recording.session import Session
-from stand.recording.superseded import begins_of, is_superseded
-from stand.recording.verify import verify
-from stand.remote.control_client import ask, ask_status
+from foundation.errors import SessionError, StandTripped, Unreachable
+from foundation.hub import Hub
+from foundation.items import StepState
+from recording.reading.glance import glance
+from recording.reading.run_word import Files, Run
+from recording.reading.session import Session
+from recording.reading.superseded import begins_of, is_superseded
+from recording.repair.verify import verify
 from stand.running.journal import JOURNAL_NAME, Dwell, Gap, Step, encode_line, read_lines
 from stand.running.resume import Interruption, interruption
 from stand.running.run import Interrupted, resume, run_virtual
 from stand.running.session_setup import Order
+from stand.serving.control_client import ask, ask_status
 from stand.simulator import ControlSocket
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon

@@ -11,11 +11,11 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from drivers.interface import ConfigError, StandTripped
-from stand.commandline.commands import app
-from stand.config import StandConfig, load_config, packaged
+from foundation.errors import ConfigError, StandTripped
+from recording.reading.session import Session
+from stand.commands.commands import app
+from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.queueing.queue_file import QUEUE_NAME
-from stand.recording.session import Session
 from stand.running.own_stand import on_this_stand
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_real, run_virtual

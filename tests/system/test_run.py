@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import seconds_ns
-from drivers.interface import ConfigError, SessionError, StandError, StandTripped, Unreachable
-from stand.hub import Batch, Event, Hub, Item, StepMark, StepState
-from stand.recording.session import Session
+from foundation.clock import seconds_ns
+from foundation.errors import ConfigError, SessionError, StandError, StandTripped, Unreachable
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepMark, StepState
+from recording.reading.session import Session
 from stand.running.run import Interrupted, run_virtual
 from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
@@ -139,7 +140,7 @@ async def test_a_lost_safety_sensor_makes_the_stand_safe_and_ends_the_run(
 DAEMON = """
 import asyncio, pickle, sys
 from pathlib import Path
-from stand.hub import Batch
+from foundation.items import Batch
 from stand.running.run import run_virtual
 
 order, out = pickle.loads(sys.stdin.buffer.read())

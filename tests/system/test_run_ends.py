@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import DeviceFault, StandTripped
-from stand.config import StandConfig
-from stand.hub import Item, StepMark, StepState
-from stand.recording.session import Session
+from foundation.errors import DeviceFault, StandTripped
+from foundation.items import Item, StepMark, StepState
+from recording.reading.session import Session
+from stand.config.stand_config import StandConfig
 from stand.running.run import Interrupted, run_real, run_virtual
 from stand.running.session_setup import Order
 from stand.simulator import Simulator

@@ -8,9 +8,9 @@ import pytest
 from compensation.observations import Role as ObservedRole
 from compensation.observations import observe_sessions
 from experiments.steps import Role
-from stand.hub import Event, StepMark, StepState
-from stand.progress import progress
-from stand.recording.session import Session
+from foundation.items import Event, StepMark, StepState
+from foundation.progress import progress
+from recording.reading.session import Session
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from compensation.observations import Observations, Role, observe_sessions
-from drivers.clock import NS_PER_S
-from stand.hub import StepState
-from stand.progress import progress
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.items import StepState
+from foundation.progress import progress
+from recording.reading.session import Session
 from stand.running.journal import Dwell, read_lines
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order

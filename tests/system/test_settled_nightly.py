@@ -21,11 +21,12 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.training import frame_states
 from compensation.drift.validation import rms_px
 from compensation.observations import Observations, Role, observe_sessions
-from drivers.clock import NS_PER_S
-from drivers.interface import Frame
-from stand.hub import Hub, Item
-from stand.progress import progress
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S
+from foundation.hub import Hub
+from foundation.items import Item
+from foundation.progress import progress
+from foundation.readings import Frame
+from recording.reading.session import Session
 from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stand.recording.session import Session
+from recording.reading.session import Session
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_run import digests
 

@@ -7,11 +7,12 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import Frame, Reading
-from stand.hub import Batch, Event, Hub
-from stand.recording.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, WallClock
+from foundation.hub import Hub
+from foundation.items import Batch, Event
+from foundation.readings import Frame, Reading
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import ext4, run
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")

@@ -8,21 +8,22 @@ from pathlib import Path
 
 import pytest
 
-from drivers.bus import Bus, LineSettings
-from drivers.camera import Camera, CameraSettings
-from drivers.clock import Clock, WallClock, seconds_ns
-from drivers.flap import Flap
-from drivers.interface import DeviceError, DeviceFault, Quality, Refused, Superseded, Unreachable
-from drivers.registers import load_register_map
-from drivers.regulator import Regulator
-from drivers.relays import Relays
-from drivers.stage import Axis, AxisSettings
-from drivers.thermometers import Thermometers
-from stand.config import CompressorConfig, packaged
-from stand.guarding.compressor import CompressorLimits
-from stand.guarding.permits import PermitLimits
-from stand.hub import Hub
-from stand.running.gate import INTERLOCK
+from drivers.devices.camera import Camera, CameraSettings
+from drivers.devices.flap import Flap
+from drivers.devices.regulator import Regulator
+from drivers.devices.relays import Relays
+from drivers.devices.stage import Axis, AxisSettings
+from drivers.devices.thermometers import Thermometers
+from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.registers import load_register_map
+from foundation.clock import Clock, WallClock, seconds_ns
+from foundation.errors import DeviceError, DeviceFault, Refused, Superseded, Unreachable
+from foundation.hub import Hub
+from foundation.readings import Quality
+from stand.chamber.compressor import CompressorLimits
+from stand.chamber.permits import PermitLimits
+from stand.config.stand_config import CompressorConfig, packaged
+from stand.gate import INTERLOCK
 from stand.stand import Devices, Interlocked, Limits, Stand
 
 from .flap_bench import SETTINGS as FLAP

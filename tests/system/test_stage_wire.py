@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import VirtualClock, seconds_ns
-from drivers.interface import DeviceFault, Quality, Reading, Refused
-from drivers.stage import Axis, AxisSettings
+from drivers.devices.stage import Axis, AxisSettings
+from foundation.clock import VirtualClock, seconds_ns
+from foundation.errors import DeviceFault, Refused
+from foundation.readings import Quality, Reading
 
 from .stage_bench import OVERSHOOT, START_STEPS, T0, UNIT_PER_STEP, Bench, Kind, running_bench
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.camera import Camera
-from drivers.clock import WallClock
+from drivers.devices.camera import Camera
+from foundation.clock import WallClock
 from stand.assembly import camera_settings
-from stand.config import load_config
+from stand.config.stand_config import load_config
 from tests.stock_camera import ADDRESS, SERIAL
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import Frame
-from stand.hub import Hub, Item
-from stand.recording.session import Session
+from foundation.hub import Hub
+from foundation.items import Item
+from foundation.readings import Frame
+from recording.reading.session import Session
 from stand.running.run import Interrupted, run_virtual
 from stand.running.session_setup import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis

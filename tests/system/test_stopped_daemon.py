@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from stand.recording.session import Session
+from recording.reading.session import Session
 from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.gateway import gateway

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interface import SessionError
-from stand.config import load_config
-from stand.remote.control_client import ask_status, running_sessions
+from foundation.errors import SessionError
+from stand.config.stand_config import load_config
 from stand.running.session_setup import Order
+from stand.serving.control_client import ask_status, running_sessions
 from stand.simulator import ControlSocket
 from tests.stand.test_door import connected
 from tests.system.conftest import require_aravis

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S, WallClock
-from drivers.interface import StandError, StandTripped
-from stand.recording.disk_process import MODULE
-from stand.recording.salvage import salvage_session
-from stand.recording.session import Session
+from foundation.clock import NS_PER_S, WallClock
+from foundation.errors import StandError, StandTripped
+from recording.reading.session import Session
+from recording.repair.salvage import salvage_session
+from recording.writing.disk_process import MODULE
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_real
 from stand.running.session_setup import Order

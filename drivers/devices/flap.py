@@ -1,0 +1,308 @@
+"""The inspection flap: a Pololu Jrk G2 over its native USB interface (Jrk G2 user's guide, sections 9-14)."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+import usb.backend
+import usb.core
+import usb.util
+
+from drivers.devices.flap_travel import POLL_S, Travel
+from drivers.devices.motion import Motion, Turn
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Superseded, Unreachable
+from foundation.lane import Lane, Result
+from foundation.readings import Quality, Reading, bad_reading
+
+_VENDOR_POLOLU = 0x1FFB
+_PRODUCTS_JRK_G2 = {0x00B7, 0x00B9, 0x00BF, 0x00C1, 0x00C5}
+_TO_DEVICE, _TO_HOST = 0x40, 0xC0
+_SET_TARGET, _STOP_MOTOR, _GET_VARIABLES, _GET_RAM_SETTINGS = 0x84, 0x87, 0xE5, 0xEA
+_CLEAR_HALTING = 1  # value of _GET_VARIABLES: clear the errors whose cause is gone
+_TIMEOUT_MS = 1600  # the device may need 1,500 ms after restoring its defaults
+_VARIABLES_SIZE = 0x35
+_INPUT_MODE_OFFSET, _INPUT_MODE_SERIAL = 0x03, 0
+_MAX_DUTY_OFFSET, _MAX_DUTY = 0x68, struct.Struct("<HH")  # forward, reverse
+_ENGLISH = 0x0409  # the language of its string descriptors
+
+_AWAITING_COMMAND = 0x0001
+_FEEDBACK_DISCONNECT = 0x0020
+_ERROR_NAMES = (
+    "awaiting command", "no power", "motor driver error", "input invalid", "input disconnect", "feedback disconnect",
+    "soft over-current", "serial signal error", "serial overrun", "serial buffer full", "serial CRC error",
+    "serial protocol error", "serial time-out", "hard over-current",
+)  # fmt: skip
+
+_JAM_DUTY = 0.9  # of the configured maximum
+
+
+@dataclass(frozen=True, slots=True)
+class FlapSettings:
+    """`serial_number`: of the USB device. Targets, tolerance: scaled feedback counts, 0..4095. travel_s: longest time
+    a whole travel may take on the stand's clock."""
+
+    serial_number: str
+    open_target: int
+    closed_target: int
+    tolerance: int
+    travel_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Variables:
+    time_ns: int  # when they were read
+    target: int
+    position: int
+    duty: int
+    halting: int
+    current_mA: int
+
+
+class _UsbDevice(Protocol):
+    """What of a pyusb device is used here; pyusb makes these attributes at run time."""
+
+    idProduct: int
+    iSerialNumber: int
+
+    def ctrl_transfer(
+        self, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data_or_wLength: int | None, timeout: int
+    ) -> int | bytes: ...
+
+
+class Flap:
+    """The flap. `backend` is a pyusb backend, None for libusb; the position is unknown until it was read.
+
+    After any USB error the controller is found again, by its serial number, at the next call. There is one mover: the
+    newest movement wins, and one in the other direction that was under way ends with Superseded.
+    """
+
+    def __init__(self, name: str, settings: FlapSettings, clock: Clock, backend: usb.backend.IBackend | None) -> None:
+        self.name = name
+        self._settings = settings
+        self._clock = clock
+        self._backend = backend
+        self._lane: Lane | None = None
+        self._device: _UsbDevice | None = None
+        self._max_duty = (0, 0)
+        self.is_shut = False  # the last movement has confirmed it
+        self._commanded = False  # a target was sent and the motor not stopped since
+        self._motion = Motion(name)
+
+    async def open(self) -> None:
+        """Find the controller by its serial number and check its input mode; leaves the flap where it is."""
+        if self._lane is None:
+            self._lane = Lane(self.name, self._clock)
+        await self._call(self._find)
+
+    async def close(self) -> None:
+        """Let go of the USB device; the flap stays where it is. May be called twice."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._release)
+            lane.close()
+
+    async def read(self) -> tuple[Reading, ...]:
+        """(position 0 closed .. 1 open, motor current mA). The position is BAD when the feedback is disconnected, and
+        STALE, with the reason, when an error or a restart of the controller has taken the motor's force away."""
+        variables = await self._call(self._variables)
+        now_ns = self._clock.now_ns()
+        current = Reading(f"{self.name}.current", float(variables.current_mA), "mA", now_ns)
+        channel = f"{self.name}.position"
+        if variables.halting & _FEEDBACK_DISCONNECT:
+            return bad_reading(channel, "1", now_ns, "feedback disconnect"), current
+        span = self._settings.open_target - self._settings.closed_target
+        openness = (variables.position - self._settings.closed_target) / span
+        if variables.halting & ~_AWAITING_COMMAND or (variables.halting and self._commanded):
+            reason = f"the motor is without force: {_names(variables.halting)}"
+            return Reading(channel, openness, "1", now_ns, Quality.STALE, reason), current
+        return Reading(channel, openness, "1", now_ns), current
+
+    def allow(self) -> None:
+        """It may be opened again after it was made safe."""
+        self._motion.allow()
+
+    async def move_open(self) -> None:
+        """Open and confirm; DeviceFault on a jam, an error flag or when the travel takes too long, Superseded when it
+        is closed meanwhile, or was made safe and not allowed to move since.
+
+        Errors that stopped an earlier movement are cleared when their cause is gone.
+        """
+        await self._move(self._motion.take(self._settings.open_target), self._settings.open_target)
+
+    async def move_closed(self) -> None:
+        """Close and confirm, also when it was made safe; errors as in move_open."""
+        await self._move(self._motion.take(self._settings.closed_target, safe=True), self._settings.closed_target)
+
+    async def make_safe(self) -> None:
+        """Closed: the chamber is then a closed box, and the drive's own force limit protects what is in between. It
+        stays closed until `allow`."""
+        self._motion.bar()
+        await self.move_closed()
+
+    async def _move(self, turn: Turn, target: int) -> None:
+        self.is_shut = False
+        await self._move_to(turn, target)
+        self.is_shut = target == self._settings.closed_target
+
+    async def _move_to(self, turn: Turn, target: int) -> None:
+        settings = self._settings
+        begun = await self._call(self._set_target, turn, target)
+        travel = Travel(target, settings.tolerance, settings.travel_s, begun.position, begun.time_ns)
+        while not travel.arrived:
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(POLL_S))
+            variables = await self._call(self._variables)
+            turn.check()
+            if variables.halting or variables.target != target:
+                raise DeviceFault(self.name, f"the motor stopped: {_names(variables.halting)}")
+            if trouble := travel.look(variables.position, self._saturated(variables.duty), variables.time_ns):
+                await self._stop_after(turn, trouble)
+
+    def _saturated(self, duty: int) -> bool:
+        return duty != 0 and abs(duty) >= _JAM_DUTY * self._max_duty[duty < 0]
+
+    async def _stop_after(self, turn: Turn, reason: str) -> None:
+        try:
+            await self._call(self._stop_motor, turn)
+        except Superseded:
+            raise
+        except DeviceError as error:
+            raise DeviceFault(self.name, f"{reason}; the motor could not be stopped ({error})") from error
+        raise DeviceFault(self.name, f"{reason}; the motor is stopped")
+
+    async def _call(self, function: Callable[..., Result], *args: object) -> Result:
+        if self._lane is None:
+            raise Unreachable(self.name, "not open")
+        return await self._lane.call(function, *args)
+
+    # Below: in the lane's thread.
+
+    def _find(self) -> _UsbDevice:
+        """Our controller among those that are plugged in, its settings checked; the others are left alone."""
+        self._release()
+        try:
+            found = cast(
+                "Iterable[_UsbDevice]",
+                usb.core.find(find_all=True, backend=self._backend, idVendor=_VENDOR_POLOLU),
+            )
+            candidates = [device for device in found if device.idProduct in _PRODUCTS_JRK_G2]
+        except usb.core.NoBackendError as error:
+            raise Unreachable(self.name, "libusb is not installed (Debian package libusb-1.0-0)") from error
+        except (usb.core.USBError, ValueError, OSError) as error:
+            raise Unreachable(self.name, f"USB devices cannot be listed ({error})") from error
+        self._device = self._chosen(candidates)
+        try:
+            self._check_settings(self._device)
+        except DeviceError:
+            self._release()
+            raise
+        return self._device
+
+    def _chosen(self, candidates: Iterable[_UsbDevice]) -> _UsbDevice:
+        """The one with our serial number; one that does not tell its own (no permission, busy) hides no other."""
+        chosen: _UsbDevice | None = None
+        present: list[str] = []
+        denied: usb.core.USBError | None = None
+        for device in candidates:
+            try:
+                serial_number = str(usb.util.get_string(device, device.iSerialNumber, _ENGLISH))
+            except (usb.core.USBError, ValueError, LookupError) as error:
+                serial_number = f"one that does not tell its own ({error})"
+                if isinstance(error, usb.core.USBError) and error.errno == errno.EACCES:
+                    denied = error
+            present.append(serial_number)
+            if serial_number == self._settings.serial_number:
+                chosen = device
+            else:
+                usb.util.dispose_resources(device)
+        if chosen is not None:
+            return chosen
+        if denied is not None:  # it may be ours
+            raise self._error(denied, "serial number") from denied
+        text = f"no Jrk G2 with serial number {self._settings.serial_number}"
+        raise Unreachable(self.name, f"{text}, only {', '.join(sorted(present)) or 'none'}")
+
+    def _check_settings(self, device: _UsbDevice) -> None:
+        """Those in force, that is in RAM; they are read before every target, because a restart may change them."""
+        (mode,) = self._read(device, _GET_RAM_SETTINGS, 0, _INPUT_MODE_OFFSET, 1)
+        if mode != _INPUT_MODE_SERIAL:
+            raise Refused(self.name, f"the Jrk's input mode is {mode}, it must be 0 (serial) to obey targets")
+        self._max_duty = _MAX_DUTY.unpack(self._read(device, _GET_RAM_SETTINGS, 0, _MAX_DUTY_OFFSET, _MAX_DUTY.size))
+
+    def _release(self) -> None:
+        if self._device is not None:
+            usb.util.dispose_resources(self._device)
+        self._device = None
+
+    def _set_target(self, turn: Turn, target: int) -> _Variables:
+        """Send the target, then clear old errors: in this order the motor never starts towards the old target. All of
+        it is idempotent and may be repeated once. The variables are those before the errors were cleared."""
+        try:
+            return self._set_target_once(turn, target)
+        except Unreachable:
+            return self._set_target_once(turn, target)
+
+    def _set_target_once(self, turn: Turn, target: int) -> _Variables:
+        device = self._device or self._find()
+        self._check_settings(device)
+        turn.check()
+        self._transfer(device, _TO_DEVICE, _SET_TARGET, target, 0, 0)
+        self._commanded = True
+        return self._decoded(self._read(device, _GET_VARIABLES, _CLEAR_HALTING, 0, _VARIABLES_SIZE))
+
+    def _stop_motor(self, turn: Turn) -> None:
+        """Idempotent too; the motor of a newer movement is left alone."""
+        turn.check()
+        self._commanded = False
+        try:
+            self._transfer(self._device or self._find(), _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
+        except Unreachable:
+            self._transfer(self._device or self._find(), _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
+
+    def _variables(self) -> _Variables:
+        return self._decoded(self._read(self._device or self._find(), _GET_VARIABLES, 0, 0, _VARIABLES_SIZE))
+
+    def _decoded(self, block: bytes) -> _Variables:
+        """Jrk G2 user's guide, section 12: variables."""
+        target, position, duty, halting, current_mA = (
+            struct.unpack_from(kind, block, offset)[0]
+            for kind, offset in (("<H", 0x02), ("<H", 0x06), ("<h", 0x0C), ("<H", 0x12), ("<H", 0x19))
+        )
+        return _Variables(self._clock.now_ns(), target, position, duty, halting, current_mA)
+
+    def _read(self, device: _UsbDevice, request: int, value: int, index: int, size: int) -> bytes:
+        """`size` bytes from the device; a short answer is asked for once more."""
+        try:
+            return self._transfer(device, _TO_HOST, request, value, index, size)
+        except GarbledReply:
+            return self._transfer(device, _TO_HOST, request, value, index, size)
+
+    def _transfer(
+        self, device: _UsbDevice, request_type: int, request: int, value: int, index: int, size: int
+    ) -> bytes:
+        try:
+            answer = device.ctrl_transfer(request_type, request, value, index, size or None, _TIMEOUT_MS)
+        except usb.core.USBError as error:
+            self._release()
+            raise self._error(error, f"request 0x{request:02X}") from error
+        data = b"" if isinstance(answer, int) else bytes(answer)
+        if len(data) != size:
+            raise GarbledReply(self.name, f"request 0x{request:02X} gave {len(data)} of {size} bytes")
+        return data
+
+    def _error(self, error: usb.core.USBError, what: str) -> DeviceError:
+        """pyusb's errors by errno, never by text."""
+        if error.errno == errno.EPIPE:
+            return Refused(self.name, f"the Jrk stalled {what}")
+        if error.errno == errno.EACCES:
+            return Refused(self.name, "no permission for the USB device; install Pololu's udev rule")
+        return Unreachable(self.name, f"USB: {what} failed ({error})")
+
+
+def _names(halting: int) -> str:
+    names = [name for bit, name in enumerate(_ERROR_NAMES) if halting >> bit & 1]
+    return ", ".join(names) or "its target was changed by someone else"

@@ -1,0 +1,162 @@
+"""Temperature regulator: a register map with the points pv, sp, mv_heat, mv_cool and the commands run and stop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+
+from drivers.wires.bus import Bus
+from drivers.wires.modbus_unit import ModbusUnit, is_confirmed
+from drivers.wires.registers import RegisterMap, Sample, Snapshot
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import ConfigError, Occupied, Refused, Unreachable
+from foundation.readings import Reading, bad_reading
+
+PROBE_PERIOD_S = 30.0
+AUTOTUNE = "autotune"
+QUANTITIES = ("pv", "sp", "mv_heat", "mv_cool")
+
+
+class Regulator:
+    """A heat/cool regulator that does the PID by itself; we give it set points and watch it.
+
+    It is "ready" while every start-up command of the map is confirmed by its bit (E5CC: communications writing on, RAM
+    write mode, so that set points do not wear the EEPROM). When that is lost, or the unit was unreachable and may have
+    been power-cycled, the start-up sequence runs again and the set point is sent again; it never runs or stops
+    control by itself. `start_ups` counts completed sequences.
+    """
+
+    def __init__(self, name: str, bus: Bus, register_map: RegisterMap, clock: Clock) -> None:
+        missing = [point for point in ("pv", "sp") if point not in register_map.points]
+        missing += [command for command in ("run", "stop") if command not in register_map.commands]
+        if missing or not register_map.safe_state:
+            raise ConfigError(f"{name}: register map {register_map.model} lacks {', '.join(missing) or 'safe_state'}")
+        self.name = name
+        self.start_ups = 0
+        self._unit = ModbusUnit(name, bus, register_map)
+        self._map = register_map
+        self._clock = clock
+        self._lock = asyncio.Lock()
+        self._sp_degC: float | None = None  # the set point as the unit took it, to be sent again
+        self._start_up_due = True
+        self._probe_ns = 0
+        wanted = {AUTOTUNE, *(register_map.commands[name].confirm.bit for name in register_map.startup)}
+        self._status = [name for name, point in register_map.points.items() if wanted & set(point.bits.values())]
+
+    async def open(self) -> None:
+        """Probe identity and scaling, enable writing, RAM mode, each confirmed; neither runs nor stops control."""
+        async with self._exclusive():
+            await self._start_up()
+
+    async def close(self) -> None:
+        """Nothing to let go of: the bus belongs to the stand; control goes on in the unit."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """pv, sp (degC), mv_heat, mv_cool (%), running, fault (1 or 0); raises DeviceError.
+
+        The reason of `fault` names the bits that stand, and tells when somebody changed the set point at the unit.
+        """
+        async with self._exclusive():
+            await self._ensure_started()
+            if self._clock.now_ns() >= self._probe_ns:
+                await self._probe()
+            snapshot = await self._unit.snapshot(self._map.polled())
+            if not self._ready(snapshot):
+                await self._start_up()
+                snapshot = await self._unit.snapshot(self._map.polled())
+            return self._readings(snapshot)
+
+    async def set_temperature(self, degC: float) -> None:
+        """Send a set point and read it back.
+
+        Refused: outside the map's limits (nothing is sent), RAM mode not confirmed, not taken over. Occupied:
+        autotuning, started at the unit, is active.
+        """
+        async with self._exclusive():
+            await self._ensure_started()
+            status = await self._unit.snapshot(self._status)
+            if not self._ready(status):
+                await self._start_up()
+            if status.bits.get(AUTOTUNE):
+                raise Occupied(self.name, "autotuning is active; no set point was sent")
+            self._sp_degC = await self._unit.write("sp", degC)
+
+    async def run(self) -> None:
+        """Start control, confirmed."""
+        async with self._exclusive():
+            await self._ensure_started()
+            await self._unit.command("run")
+
+    async def stop(self) -> None:
+        """Stop control, confirmed; the outputs go to the unit's "MV at stop"."""
+        await self._force(("stop",))
+
+    async def make_safe(self) -> None:
+        """The map's safe state (stop), confirmed."""
+        await self._force(self._map.safe_state)
+
+    async def _force(self, commands: tuple[str, ...]) -> None:
+        """Send commands at once, also to a unit that has been power-cycled and refuses writing at first."""
+        async with self._exclusive():
+            try:
+                await self._commands(commands)
+            except Refused:
+                await self._commands(self._map.startup)
+                await self._commands(commands)
+
+    @asynccontextmanager
+    async def _exclusive(self) -> AsyncGenerator[None]:
+        """One sequence of requests at a time: a write and its read-back stay together."""
+        async with self._lock:
+            try:
+                yield
+            except Unreachable:
+                self._start_up_due = True  # it may come back power-cycled
+                raise
+
+    async def _ensure_started(self) -> None:
+        if self._start_up_due:
+            await self._start_up()
+
+    async def _start_up(self) -> None:
+        self._start_up_due = True
+        await self._probe()
+        await self._commands(self._map.startup)
+        if self._sp_degC is not None:
+            await self._unit.write("sp", self._sp_degC)
+        self._start_up_due = False
+        self.start_ups += 1
+
+    async def _probe(self) -> None:
+        """The decimal point above all: a constant that also exposes a reply that is not the unit's."""
+        await self._unit.probe()
+        self._probe_ns = self._clock.now_ns() + seconds_ns(PROBE_PERIOD_S)
+
+    async def _commands(self, names: tuple[str, ...]) -> None:
+        for name in names:
+            await self._unit.command(name)
+
+    def _ready(self, snapshot: Snapshot) -> bool:
+        return all(is_confirmed(self._map.commands[name], snapshot) for name in self._map.startup)
+
+    def _readings(self, snapshot: Snapshot) -> tuple[Reading, ...]:
+        now_ns = self._clock.now_ns()
+        faults = [bit for bit in self._map.fault_bits if snapshot.bits.get(bit)]
+        sp_degC = snapshot.samples["sp"].value
+        if self._sp_degC is not None and sp_degC != self._sp_degC:
+            faults.append("set point changed at the unit")
+        running = is_confirmed(self._map.commands["run"], snapshot)
+        quantities = [name for name in QUANTITIES if name in snapshot.samples]
+        return (
+            *(self._reading(name, snapshot.samples[name], now_ns) for name in quantities),
+            Reading(f"{self.name}.running", float(running), "1", now_ns),
+            Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason=", ".join(faults)),
+        )
+
+    def _reading(self, quantity: str, sample: Sample, now_ns: int) -> Reading:
+        channel = f"{self.name}.{quantity}"
+        unit = "%" if quantity.startswith("mv_") else "degC"
+        if sample.reason:
+            return bad_reading(channel, unit, now_ns, sample.reason)
+        return Reading(channel, sample.value, unit, now_ns)

@@ -1,0 +1,116 @@
+"""Relay board: on, off, and "on for a time", which is what a dead-man is made of."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Collection, Iterable, Mapping
+
+from drivers.wires.bus import Bus
+from drivers.wires.modbus_unit import ModbusUnit
+from drivers.wires.registers import Point, RegisterMap
+from foundation.errors import ConfigError, DeviceError, DeviceFault
+from foundation.readings import Reading
+
+COIL_ON = 0xFF00
+COIL_OFF = 0x0000
+MAX_PULSE_COUNTS = 0x7FFF
+CAMERA_POWER = "camera_power"  # stays on by default: a warm camera is hours of work, and harms nobody
+
+
+class Relays:
+    """Named relays of one board. `channels`: name -> relay number, 0 being the first (point relay_0 of the map).
+
+    safe_off: the relays that make_safe turns off; by default all but camera_power.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        bus: Bus,
+        register_map: RegisterMap,
+        channels: Mapping[str, int],
+        safe_off: Collection[str] | None = None,
+    ) -> None:
+        self.name = name
+        self._unit = ModbusUnit(name, bus, register_map)
+        self._points = {channel: f"relay_{number}" for channel, number in channels.items()}
+        self._safe_off = tuple(channels if safe_off is None else safe_off)
+        if safe_off is None:
+            self._safe_off = tuple(channel for channel in channels if channel != CAMERA_POWER)
+        self._clock = bus.clock
+        self._lock = asyncio.Lock()  # a write and its read-back stay together
+        self._check()
+
+    def _check(self) -> None:
+        for channel, point in self._points.items():
+            if point not in self._unit.map.points:
+                raise ConfigError(f"{self.name}.{channel}: register map {self._unit.map.model} has no {point}")
+        if len(set(self._points.values())) < len(self._points):
+            raise ConfigError(f"{self.name}: two channels on one relay")
+        if unknown := [channel for channel in self._safe_off if channel not in self._points]:
+            raise ConfigError(f"{self.name}: safe_off names {', '.join(unknown)}, which is no channel")
+
+    async def open(self) -> None:
+        """See that the board answers; no relay changes."""
+        await self._states()
+
+    async def close(self) -> None:
+        """Nothing to let go of; relays stay as they are (a timed one drops by itself)."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """Every named relay as the board reports it, 1 on, 0 off; raises DeviceError."""
+        states = await self._states()
+        now_ns = self._clock.now_ns()
+        return tuple(Reading(f"{self.name}.{channel}", float(on), "1", now_ns) for channel, on in states.items())
+
+    async def switch(self, channel: str, on: bool) -> None:
+        """Turn a relay on or off and read it back; Refused when the board reports otherwise."""
+        await self._write(channel, self._point(channel).address, COIL_ON if on else COIL_OFF, on)
+
+    async def hold_on(self, channel: str, duration_s: float) -> None:
+        """Turn a relay on for `duration_s` from now, after which the board itself drops it; read back."""
+        pulse = self._point(channel).pulse
+        if pulse is None:
+            raise ConfigError(f"{self.name}.{channel}: register map {self._unit.map.model} knows no timed-on")
+        counts = round(duration_s / pulse.step_s)
+        if not 1 <= counts <= MAX_PULSE_COUNTS:
+            raise ValueError(f"{duration_s} s is not 1..{MAX_PULSE_COUNTS} x {pulse.step_s} s")
+        await self._write(channel, pulse.address, counts, True)
+
+    async def make_safe(self) -> None:
+        """Turn off every relay of safe_off, confirmed; all are tried, those not confirmed once more, then DeviceFault
+        names those that still are not."""
+        failures = await self._turn_off(self._safe_off)
+        if failures:
+            failures = await self._turn_off(failures)
+        if failures:
+            raise DeviceFault(self.name, f"not confirmed off: {'; '.join(failures.values())}")
+
+    async def _turn_off(self, channels: Iterable[str]) -> dict[str, str]:
+        """Channel -> why it is not confirmed off."""
+        failures: dict[str, str] = {}
+        for channel in channels:
+            try:
+                await self.switch(channel, False)
+            except DeviceError as error:
+                failures[channel] = f"{channel} ({error})"
+        return failures
+
+    async def _write(self, channel: str, address: int, raw_value: int, on: bool) -> None:
+        async def send() -> None:
+            await self._unit.write_coil(address, raw_value)
+
+        async def holds() -> bool:
+            return (await self._states())[channel] == on
+
+        async with self._lock:
+            await self._unit.checked(send, holds, f"{channel} {'on' if on else 'off'}")
+
+    async def _states(self) -> dict[str, bool]:
+        snapshot = await self._unit.snapshot(self._points.values())
+        return {channel: snapshot.bits[point] for channel, point in self._points.items()}
+
+    def _point(self, channel: str) -> Point:
+        if channel not in self._points:
+            raise ValueError(f"{self.name} has no relay {channel}")
+        return self._unit.map.points[self._points[channel]]

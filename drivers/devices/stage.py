@@ -1,0 +1,370 @@
+"""One axis of the positioning table: a Standa stage behind an XIMC controller, in mm or degrees.
+
+Positions on the wire are whole steps and 1/256 steps and stay integers up to one conversion in double. Moves always
+end upwards, so that the spindle's play lies on the same side at every capture (stage facts from the vendor's profiles).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.devices.motion import Motion, Turn
+from drivers.wires.link import SerialSettings, open_link
+from drivers.wires.ximc_client import XimcClient
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
+from foundation.lane import Lane, Result
+from foundation.readings import Quality, Reading
+
+_LINE = SerialSettings(baud=115200, stopbits=2)
+_MICROSTEPS = 256
+_MICROSTEP_MODE_256 = 9
+_POLL_S = 0.1
+_STOP_LIMIT_S = 2.0
+_HOME_LIMIT_S = 900.0  # the slowest profile crosses its whole travel at 100 steps/s
+_ARRIVED_MICROSTEPS = 256
+
+# GETS: MoveSts, MvCmdSts, PWRSts, EncSts, WindSts, CurPosition, uCurPosition, EncPosition, CurSpeed, uCurSpeed, Ipwr,
+# Upwr, Iusb, Uusb, CurT, Flags, GPIOFlags, CmdBufFree
+_STATUS = struct.Struct("<BBBBBihqih5hIIB4x")
+_ENGINE = struct.Struct("<HHIBHhBH12x")  # NomVoltage, NomCurrent, NomSpeed, uNomSpeed, flags, Antiplay, mode, steps
+_MOVE = struct.Struct("<IBHHIBB9x")  # Speed, uSpeed, Accel, Decel, AntiplaySpeed, uAntiplaySpeed, MoveFlags
+_TARGET = struct.Struct("<ih6x")
+_SERIAL = struct.Struct("<I")
+
+_RUNNING = 0x80  # of MvCmdSts; wait on this, never on MoveSts (vendor source)
+_FAILED = 0x40
+_COMMAND = 0x3F
+_COMMAND_MOVE, _COMMAND_HOME = 0x01, 0x06
+_POWER_OFF = 1  # PWRSts
+_HOMED = 0x20  # of Flags
+_DANGER = 0x01B3FFC0
+_EDGES = 0x3  # of GPIOFlags
+_NOT_HOMED = "not homed"
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """unit per full step, the way (in units) that every move ends upwards at least.
+
+    `home_from`: from where the homing procedure, which seeks its switch downwards, has a short way to it; None: from
+    anywhere. The rotary table's switch is 12.5 deg above its zero (HomeDelta -1250): from below it would go all the way
+    round, and its cables with it.
+    """
+
+    unit: Literal["mm", "deg"]
+    unit_per_step: float
+    overshoot: float
+    home_from: float | None = None
+
+
+PROFILES: dict[str, Profile] = {
+    "8MT160-300": Profile("mm", 0.0025, 0.5),
+    "8MR151": Profile("deg", 0.01, 1.0, home_from=16.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSettings:
+    """`address`: serial:PATH or tcp:HOST:PORT. `profile`: a key of PROFILES.
+
+    `limits`: lowest and highest target. To reach a target from below, the stage passes the lowest by up to the
+    profile's overshoot, which must be free.
+    """
+
+    address: str
+    serial_number: int
+    profile: str
+    limits: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Status:
+    """What of GETS is used; `position` in microsteps."""
+
+    command: int
+    power: int
+    position: int
+    flags: int
+    gpio: int
+
+    @property
+    def running(self) -> bool:
+        return bool(self.command & _RUNNING)
+
+    @property
+    def homed(self) -> bool:
+        return bool(self.flags & _HOMED)
+
+    @property
+    def alarm(self) -> str:
+        return f"controller alarm, flags 0x{self.flags & _DANGER:08X}" if self.flags & _DANGER else ""
+
+    @property
+    def doubt(self) -> str:
+        """Why the position must not be relied upon, "" when it may."""
+        if self.alarm or not self.homed:
+            return self.alarm or _NOT_HOMED
+        return "motor off, the rotor may have moved by up to a step" if self.power == _POWER_OFF else ""
+
+    def answers(self, command: int) -> bool:
+        """The last motion is of this kind and has not failed."""
+        return self.command & (_COMMAND | _FAILED) == command
+
+
+class Axis:
+    """One axis. Identity and microstep division are checked on every new link before anything else, and at homing.
+
+    A lost link is opened again by the next call. There is one mover: the newest motion wins, and one that was under way
+    ends with Superseded.
+    """
+
+    def __init__(self, name: str, settings: AxisSettings, clock: Clock) -> None:
+        if settings.profile not in PROFILES:
+            raise ValueError(f"{name}: no stage profile {settings.profile!r}, only {', '.join(PROFILES)}")
+        self.name = name
+        self._settings = settings
+        self.profile = PROFILES[settings.profile]
+        self._clock = clock
+        self._lane: Lane | None = None
+        self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
+        self._speed_steps_s = 1000.0
+        self._motion = Motion(name)
+        self._zero_due = False  # homing has begun, and its end was not made the zero of the scale yet
+
+    async def open(self) -> None:
+        """Connect and compare serial number and microstep division; Refused when another controller answers."""
+        if self._lane is None:
+            self._lane = Lane(self.name, self._clock)
+        await self._call(self._check_identity)
+
+    async def close(self) -> None:
+        """Let go of the port; may be called twice."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._client.close)
+            lane.close()
+
+    async def read(self) -> tuple[Reading, ...]:
+        """(position in mm or deg, moving 0/1, homed 0/1); the position is STALE, with the reason, while the controller
+        has an alarm, is not homed, or leaves the motor without current."""
+        status = await self._call(self._status)
+        now_ns = self._clock.now_ns()
+        homed = self._is_homed(status)
+        doubt = status.doubt or ("" if homed else _NOT_HOMED)
+        position = Reading(
+            f"{self.name}.position",
+            self._units(status.position),
+            self.profile.unit,
+            now_ns,
+            Quality.STALE if doubt else Quality.GOOD,
+            doubt,
+        )
+        return (
+            position,
+            Reading(f"{self.name}.moving", float(status.running), "1", now_ns),
+            Reading(f"{self.name}.homed", float(homed), "1", now_ns),
+        )
+
+    async def homed(self) -> bool:
+        """Whether the position scale is calibrated."""
+        return self._is_homed(await self._call(self._status))
+
+    async def home(self) -> float:
+        """Run the controller's homing procedure and make its end the zero of the scale.
+
+        Returns the residual: where the scale had this point before, mm or deg (after a power cycle without meaning).
+        DeviceFault in an alarm, or when the procedure does not end homed; Superseded as in move_to.
+        """
+        turn = self._motion.take()
+        await self._call(self._check_identity)  # a power cycle may have brought other settings
+        self._refuse_alarm(await self._call(self._status))
+        await self._call(self._begin_homing, turn)
+        status = await self._wait(_HOME_LIMIT_S, turn)
+        if not (status.homed and status.answers(_COMMAND_HOME)):
+            turn.check()
+            raise DeviceFault(self.name, "the homing procedure ended without a home position")
+        await self._call(self._zero)
+        return self._units(status.position)
+
+    async def move_to(self, position: float) -> None:
+        """Move to `position` (mm or deg), the last stretch upwards, from where the play has been taken up.
+
+        Refused outside the limits or when not homed; DeviceFault in an alarm or when the move fails; Superseded when it
+        was made safe or told to go elsewhere after this was called, or made safe before and not allowed to move since.
+        """
+        low, high = self._settings.limits
+        unit = self.profile.unit
+        if not low <= position <= high:
+            raise Refused(self.name, f"{position} {unit} is outside the limits {low}..{high} {unit}")
+        turn = self._motion.take()
+        status = await self._call(self._status)
+        self._refuse_alarm(status)
+        if not self._is_homed(status):
+            raise Refused(self.name, "not homed; its positions mean nothing until it is")
+        target, below = self._microsteps(position), self._microsteps(position - self.profile.overshoot)
+        for stop in (below, target) if status.position > below else (target,):
+            status = await self._approach(status.position, stop, turn)
+
+    def allow(self) -> None:
+        """It may move again after it was made safe."""
+        self._motion.allow()
+
+    async def make_safe(self) -> None:
+        """Soft stop, confirmed; a hard stop when that does not help within 2 s, DeviceFault when nothing does. It stays
+        where it is until `allow`."""
+        self._motion.bar()
+        await self._stop()
+
+    async def _stop(self) -> None:
+        for letters in ("sstp", "stop"):
+            with contextlib.suppress(DeviceError):  # what counts is whether it stands still
+                await self._call(self._send, letters, b"", _at_rest)
+            if await self._at_rest_within(_STOP_LIMIT_S):
+                return
+        raise DeviceFault(self.name, "still moving after a soft and a hard stop")
+
+    async def _at_rest_within(self, limit_s: float) -> bool:
+        deadline_ns = self._clock.now_ns() + seconds_ns(limit_s)
+        while (await self._call(self._status)).running:
+            if self._clock.now_ns() >= deadline_ns:
+                return False
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+        return True
+
+    async def _approach(self, start: int, target: int, turn: Turn) -> _Status:
+        """One straight move between positions in microsteps; DeviceFault when it ends elsewhere."""
+
+        def carried_out(status: _Status) -> bool:
+            return status.position == target or (status.running and status.answers(_COMMAND_MOVE))
+
+        await self._call(self._send, "move", _TARGET.pack(*divmod(target, _MICROSTEPS)), carried_out, turn)
+        status = await self._wait(abs(target - start) / _MICROSTEPS / self._speed_steps_s * 1.5 + 2.0, turn)
+        if status.command & _FAILED or abs(status.position - target) > _ARRIVED_MICROSTEPS:
+            turn.check()
+            edge = " at a limit switch" if status.gpio & _EDGES else ""
+            stopped, wanted = status.position / _MICROSTEPS, target / _MICROSTEPS
+            raise DeviceFault(self.name, f"stopped{edge} at step {stopped:.2f} instead of {wanted:.2f}")
+        return status
+
+    async def _wait(self, limit_s: float, turn: Turn) -> _Status:
+        """Poll until the controller has finished; stop it in an alarm or after `limit_s` of stand time, and say so."""
+        deadline_ns = self._clock.now_ns() + seconds_ns(limit_s)
+        while True:
+            status = await self._call(self._status)
+            if status.running:
+                turn.check()
+            if status.alarm or (status.running and self._clock.now_ns() >= deadline_ns):
+                if status.running:  # not every alarm stops the motor by itself, and a STOP at rest would clear it
+                    await self._stop()
+                raise DeviceFault(self.name, status.alarm or f"still moving after {limit_s:.0f} s; stopped")
+            if not status.running:
+                return status
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+
+    def _is_homed(self, status: _Status) -> bool:
+        return status.homed and not self._zero_due
+
+    def _refuse_alarm(self, status: _Status) -> None:
+        """STOP would clear an alarm, but only an operator may decide that."""
+        if status.alarm:
+            raise DeviceFault(self.name, f"{status.alarm}; it must be looked into before anything moves")
+
+    def _units(self, position: int) -> float:
+        return position / _MICROSTEPS * self.profile.unit_per_step
+
+    def _microsteps(self, position: float) -> int:
+        return round(position / self.profile.unit_per_step * _MICROSTEPS)
+
+    async def _call(self, function: Callable[..., Result], *args: object) -> Result:
+        if self._lane is None:
+            raise Unreachable(self.name, "not open")
+        return await self._lane.call(function, *args)
+
+    # Below: in the lane's thread.
+
+    def _check_identity(self) -> None:
+        """Leave the link open only when it leads to our controller with our settings."""
+        try:
+            self._compare_settings()
+        except DeviceError:
+            self._client.close()
+            raise
+
+    def _compare_settings(self) -> None:
+        (serial_number,) = _SERIAL.unpack(self._client.query("gser", _SERIAL.size))
+        if serial_number != self._settings.serial_number:
+            raise Refused(
+                self.name,
+                f"controller {serial_number} answers at {self._settings.address}, "
+                f"expected {self._settings.serial_number}",
+            )
+        mode = _ENGINE.unpack(self._client.query("geng", _ENGINE.size))[6]
+        if mode != _MICROSTEP_MODE_256:
+            raise Refused(self.name, f"microstep mode {mode}, expected {_MICROSTEP_MODE_256} (1/256)")
+        self._speed_steps_s = float(max(1, _MOVE.unpack(self._client.query("gmov", _MOVE.size))[0]))
+
+    def _identified(self) -> XimcClient:
+        """The client, on a link whose other end has been checked."""
+        if not self._client.connected:
+            self._check_identity()
+        return self._client
+
+    def _status(self) -> _Status:
+        values = _STATUS.unpack(self._identified().query("gets", _STATUS.size))
+        return _Status(values[1], values[2], values[5] * _MICROSTEPS + values[6], values[15], values[16])
+
+    def _send(
+        self, letters: str, payload: bytes, carried_out: Callable[[_Status], bool], turn: Turn | None = None
+    ) -> None:
+        """Send a command, while it is its turn. When its acknowledgement is lost the controller's state tells whether
+        it was carried out; only if it was not is it sent a second and last time."""
+        client = self._identified()
+        _check(turn)
+        try:
+            client.command(letters, payload)
+        except (Unreachable, GarbledReply):
+            if not carried_out(self._status()):
+                _check(turn)
+                self._identified().command(letters, payload)
+
+    def _begin_homing(self, turn: Turn) -> None:
+        """From here on the scale means nothing until its zero is set, whatever the controller says."""
+        self._identified()
+        turn.check()
+        self._zero_due = True
+        self._send("home", b"", _homing, turn)
+
+    def _zero(self) -> None:
+        """HOME leaves the step counter alone (libximc, command_homezero): zero it, and look whether that came."""
+        self._send("zero", b"", _at_zero)
+        if (position := self._status().position) != 0:
+            raise DeviceFault(
+                self.name, f"the step counter could not be set to zero, it is {position / _MICROSTEPS:.2f}"
+            )
+        self._zero_due = False
+
+
+def _check(turn: Turn | None) -> None:
+    """A stop needs no turn."""
+    if turn is not None:
+        turn.check()
+
+
+# What shows that a command whose acknowledgement was lost has been carried out:
+
+
+def _homing(status: _Status) -> bool:
+    return status.running and status.answers(_COMMAND_HOME)
+
+
+def _at_zero(status: _Status) -> bool:
+    return status.position == 0
+
+
+def _at_rest(status: _Status) -> bool:
+    return not status.running

@@ -1,0 +1,118 @@
+"""Contact thermometers: Pt100 sensors on one multi-channel module, each with its own calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from drivers.wires.bus import Bus
+from drivers.wires.modbus_unit import ModbusUnit
+from drivers.wires.registers import RegisterMap, Sample
+from foundation.clock import Clock
+from foundation.errors import ConfigError, DeviceError, Unreachable
+from foundation.readings import Quality, Reading, bad_reading
+
+
+@dataclass(frozen=True, slots=True)
+class ThermometerChannel:
+    """One sensor: `channel` 0.. of the module and its calibration against a certificate.
+
+    T = t + offset_K + sum_k polynomial[k] * t**k, where t is what the module says, in degC. A calibrated value outside
+    plausible_degC is no measurement.
+    """
+
+    channel: int
+    offset_K: float = 0.0
+    polynomial: tuple[float, ...] = ()
+    certificate: str = ""
+    plausible_degC: tuple[float, float] = (-50.0, 100.0)
+
+    def calibrated_degC(self, indicated_degC: float) -> float:
+        """The temperature for an indication."""
+        correction_K = 0.0
+        for coefficient in reversed(self.polynomial):  # Horner
+            correction_K = correction_K * indicated_degC + coefficient
+        return indicated_degC + self.offset_K + correction_K
+
+
+class Thermometers:
+    """Named sensors on one module, points value_<n> of the map; a broken one never spoils the others.
+
+    Identity and type codes are probed before first use and after every loss. Each sensor gives two readings: `air` in
+    degC, calibrated, and `air_raw`, the module's word, from which the value before calibration follows.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        bus: Bus,
+        register_map: RegisterMap,
+        channels: Mapping[str, ThermometerChannel],
+        clock: Clock,
+    ) -> None:
+        self.name = name
+        self._unit = ModbusUnit(name, bus, register_map)
+        self._channels = dict(channels)
+        self._points = {sensor: f"value_{channel.channel}" for sensor, channel in channels.items()}
+        for sensor, point in self._points.items():
+            if point not in register_map.points:
+                raise ConfigError(f"{name}.{sensor}: register map {register_map.model} has no {point}")
+        self._fault_bits = [bit for point in self._points.values() for bit in register_map.points[point].bad_if]
+        self._clock = clock
+        self._probe_due = True
+
+    async def open(self) -> None:
+        """Check identity, data format and type codes; DeviceFault when they are not the map's."""
+        await self._probe()
+
+    async def close(self) -> None:
+        """Nothing to let go of."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """Calibrated and raw readings of every sensor; raises DeviceError when the values could not be read.
+
+        Open or out of range: that sensor BAD. Fault bits unreadable: STALE, for the values may be of broken sensors.
+        """
+        try:
+            if self._probe_due:
+                await self._probe()
+            values = await self._unit.snapshot(self._points.values())
+        except Unreachable:
+            self._probe_due = True  # another module may stand there when something answers again
+            raise
+        now_ns = self._clock.now_ns()
+        unconfirmed, bits = "", dict[str, bool]()
+        try:
+            bits.update((await self._unit.snapshot(self._fault_bits)).bits)
+        except DeviceError as error:
+            self._probe_due = isinstance(error, Unreachable)
+            unconfirmed = f"fault bits unreadable ({error})"
+        return tuple(
+            reading
+            for sensor, point in self._points.items()
+            for reading in self._readings(sensor, values.samples[point], self._alarms(point, bits), unconfirmed, now_ns)
+        )
+
+    async def _probe(self) -> None:
+        await self._unit.probe()
+        self._probe_due = False
+
+    def _alarms(self, point: str, bits: Mapping[str, bool]) -> str:
+        return ", ".join(bit for bit in self._unit.map.points[point].bad_if if bits.get(bit))
+
+    def _readings(self, sensor: str, sample: Sample, alarms: str, unconfirmed: str, now_ns: int) -> Iterator[Reading]:
+        channel = f"{self.name}.{sensor}"
+        yield self._calibrated(channel, self._channels[sensor], sample, alarms, unconfirmed, now_ns)
+        yield Reading(f"{channel}_raw", float(sample.raw), "1", now_ns)
+
+    def _calibrated(
+        self, channel: str, sensor: ThermometerChannel, sample: Sample, alarms: str, unconfirmed: str, now_ns: int
+    ) -> Reading:
+        if reason := sample.reason or alarms:
+            return bad_reading(channel, "degC", now_ns, reason)
+        T_degC = sensor.calibrated_degC(sample.value)
+        low_degC, high_degC = sensor.plausible_degC
+        if not low_degC <= T_degC <= high_degC:
+            return bad_reading(channel, "degC", now_ns, f"{T_degC:g} degC is outside {low_degC:g}..{high_degC:g} degC")
+        quality = Quality.STALE if unconfirmed else Quality.GOOD
+        return Reading(channel, T_degC, "degC", now_ns, quality, unconfirmed)

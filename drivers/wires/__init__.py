@@ -1,0 +1,1 @@
+"""Wires and their codecs: Modbus, XIMC, GigE Vision; bytes and messages, nothing of what they mean to a stand."""

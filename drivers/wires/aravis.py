@@ -1,0 +1,317 @@
+"""A GigE Vision camera and its stream over libaravis: what the camera driver calls, nothing else.
+
+A `GigeDevice` owns one ArvCamera, a `GigeStream` one ArvStream. Everything blocks; a feature call up to 2.5 s when
+the camera is silent (Aravis: five tries of 500 ms). Not thread-safe: one thread per device.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.wires.aravis_library import Library, library
+
+PACKET_SOCKET_DISABLED = 1  # ArvGvStreamOption: else root would get AF_PACKET and everyone else a UDP socket
+PACKET_SIZE_ADJUSTMENT_NEVER = 0  # ArvGvPacketSizeAdjustment
+ACQUISITION_MODE_CONTINUOUS = 0  # ArvAcquisitionMode
+BUFFER_SUCCESS = 0
+BUFFER_STATUS = {
+    -1: "unknown",
+    BUFFER_SUCCESS: "success",
+    1: "cleared",
+    2: "timeout",
+    3: "missing_packets",
+    4: "wrong_packet_id",
+    5: "size_mismatch",
+    6: "filling",
+    7: "aborted",
+}
+
+# The fundamental GTypes (gtype.h: number << 2) that properties are set with.
+G_TYPE_INT, G_TYPE_UINT, G_TYPE_DOUBLE = 6 << 2, 7 << 2, 15 << 2
+
+CONTROL_LOST_CALLBACK = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+
+
+@dataclass(frozen=True, slots=True)
+class BufferInfo:
+    """The head of a received buffer. `timestamp_ns`: the leader's ticks as ns, on the camera's clock."""
+
+    status: int
+    frame_id: int
+    timestamp_ns: int
+    width: int
+    height: int
+
+
+class _GValue(ctypes.Structure):
+    _fields_ = (("g_type", ctypes.c_size_t), ("data", ctypes.c_uint64 * 2))
+
+
+class GigeDevice:
+    """One camera, opened by IP address; StandError without libaravis, AravisError when nobody answers.
+
+    Opening succeeds while another client controls the camera, read-only: ask `is_controller`.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._library = library()
+        self._camera = self._library.call("arv_camera_new", address.encode())
+        self._device = self._library.call("arv_camera_get_device", self._camera)  # borrowed: never unref
+        self._library.call("arv_camera_gv_set_stream_options", self._camera, PACKET_SOCKET_DISABLED)
+        self._callback: Any = None
+        self._handler = 0
+
+    def _call(self, function: str, *arguments: object) -> Any:
+        if not self._camera:
+            raise ValueError("the device is closed")
+        return self._library.call(function, self._camera, *arguments)
+
+    def close(self) -> None:
+        """Let go of the camera; up to 7.5 s when it is dead. May be called twice. Close its stream first."""
+        if self._camera:
+            if self._handler:
+                self._library.call("g_signal_handler_disconnect", self._device, self._handler)
+            self._library.call("g_object_unref", self._camera)  # joins the heartbeat thread: no callback after this
+            self._camera = None
+
+    def on_control_lost(self, notify: Callable[[], object]) -> None:
+        """Call `notify` when control is lost, once, in Aravis' heartbeat thread: it may only set an event."""
+
+        def lost(_device: int, _data: int) -> None:
+            notify()
+
+        self._callback = CONTROL_LOST_CALLBACK(lost)  # kept, or the signal would call freed memory
+        pointer = ctypes.cast(self._callback, ctypes.c_void_p)
+        self._handler = self._library.call(
+            "g_signal_connect_data", self._device, b"control-lost", pointer, None, None, 0
+        )
+
+    def is_controller(self) -> bool:
+        """Whether we may write."""
+        return bool(self._library.call("arv_gv_device_is_controller", self._device))
+
+    def available(self, feature: str) -> bool:
+        """Whether the camera has the feature and offers it now."""
+        return bool(self._call("arv_camera_is_feature_available", feature.encode()))
+
+    def get_float(self, feature: str) -> float:
+        """A Float feature."""
+        return float(self._call("arv_camera_get_float", feature.encode()))
+
+    def set_float(self, feature: str, value: float) -> None:
+        """Write a Float feature."""
+        self._call("arv_camera_set_float", feature.encode(), value)
+
+    def set_integer(self, feature: str, value: int) -> None:
+        """Write an Integer feature."""
+        self._call("arv_camera_set_integer", feature.encode(), value)
+
+    def integer_bounds(self, feature: str) -> tuple[int, int]:
+        """Minimum and maximum of an Integer feature."""
+        low, high = ctypes.c_int64(), ctypes.c_int64()
+        self._call("arv_camera_get_integer_bounds", feature.encode(), ctypes.byref(low), ctypes.byref(high))
+        return low.value, high.value
+
+    def get_string(self, feature: str) -> str:
+        """A String or Enumeration feature."""
+        return (self._call("arv_camera_get_string", feature.encode()) or b"").decode(errors="replace")
+
+    def set_string(self, feature: str, value: str) -> None:
+        """Write a String or Enumeration feature."""
+        self._call("arv_camera_set_string", feature.encode(), value.encode())
+
+    def entries(self, feature: str) -> tuple[str, ...]:
+        """What an Enumeration feature offers now, in the camera's order."""
+        count = ctypes.c_uint()
+        names = self._call("arv_camera_dup_available_enumerations_as_strings", feature.encode(), ctypes.byref(count))
+        try:
+            found = ctypes.cast(names, ctypes.POINTER(ctypes.c_char_p))
+            return tuple((found[index] or b"").decode(errors="replace") for index in range(count.value))
+        finally:
+            self._library.call("g_free", names)  # the array; the names are the feature's own
+
+    def set_boolean(self, feature: str, value: bool) -> None:
+        """Write a Boolean feature."""
+        self._call("arv_camera_set_boolean", feature.encode(), value)
+
+    def sensor_size(self) -> tuple[int, int]:
+        """Width and height of the sensor, px."""
+        width, height = ctypes.c_int(), ctypes.c_int()
+        self._call("arv_camera_get_sensor_size", ctypes.byref(width), ctypes.byref(height))
+        return width.value, height.value
+
+    def set_region(self, x: int, y: int, width: int, height: int) -> None:
+        """Write the region of interest, px."""
+        self._call("arv_camera_set_region", x, y, width, height)
+
+    def region(self) -> tuple[int, int, int, int]:
+        """x, y, width, height of the region of interest, px."""
+        values = [ctypes.c_int() for _ in range(4)]
+        self._call("arv_camera_get_region", *(ctypes.byref(value) for value in values))
+        x, y, width, height = (value.value for value in values)
+        return x, y, width, height
+
+    def set_pixel_format(self, pixel_format: str) -> None:
+        """Write the pixel format by its GenICam name."""
+        self._call("arv_camera_set_pixel_format_from_string", pixel_format.encode())
+
+    def pixel_format(self) -> str:
+        """GenICam name of the pixel format."""
+        return (self._call("arv_camera_get_pixel_format_as_string") or b"").decode(errors="replace")
+
+    def payload_bytes(self) -> int:
+        """Bytes of one frame with the present settings."""
+        return int(self._call("arv_camera_get_payload"))
+
+    def set_continuous(self) -> None:
+        """Acquire until stopped."""
+        self._call("arv_camera_set_acquisition_mode", ACQUISITION_MODE_CONTINUOUS)
+
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """Write the rate; turns triggers off, and clamps silently to the camera's bounds."""
+        self._call("arv_camera_set_frame_rate", rate_hz)
+
+    def frame_rate_hz(self) -> float:
+        """The rate in force."""
+        return float(self._call("arv_camera_get_frame_rate"))
+
+    def set_trigger(self, source: str) -> None:
+        """Each trigger of `source` starts one frame."""
+        self._call("arv_camera_set_trigger", source.encode())
+
+    def clear_triggers(self) -> None:
+        """Frames follow the frame rate."""
+        self._call("arv_camera_clear_triggers")
+
+    def software_trigger(self) -> None:
+        """Start one frame now."""
+        self._call("arv_camera_software_trigger")
+
+    def set_packet_size(self, size: int) -> None:
+        """Bytes of an IP packet of the stream; Aravis will not change it afterwards."""
+        self._call("arv_camera_gv_set_packet_size_adjustment", PACKET_SIZE_ADJUSTMENT_NEVER)
+        self._call("arv_camera_gv_set_packet_size", size)
+
+    def find_packet_size(self) -> int:
+        """Let Aravis find the largest packet that arrives (test packets), or keep the camera's."""
+        return int(self._call("arv_camera_gv_auto_packet_size"))
+
+    def packet_size(self) -> int:
+        """Bytes of an IP packet of the stream."""
+        return int(self._call("arv_camera_gv_get_packet_size"))
+
+    def set_packet_delay(self, delay_ns: int) -> None:
+        """Pause between two packets."""
+        self._call("arv_camera_gv_set_packet_delay", delay_ns)
+
+    def packet_delay_ns(self) -> int:
+        """The pause in force."""
+        return int(self._call("arv_camera_gv_get_packet_delay"))
+
+    def start_acquisition(self) -> None:
+        """Frames flow from now on."""
+        self._call("arv_camera_start_acquisition")
+
+    def stop_acquisition(self) -> None:
+        """No more frames."""
+        self._call("arv_camera_stop_acquisition")
+
+    def create_stream(self) -> GigeStream:
+        """A new receiver; AravisError when another client controls the camera."""
+        return GigeStream(self._library, self._call("arv_camera_create_stream", None, None))
+
+    def read_register(self, address: int) -> int:
+        """A 32-bit register."""
+        value = ctypes.c_uint()
+        self._library.call("arv_device_read_register", self._device, address, ctypes.byref(value))
+        return value.value
+
+    def write_register(self, address: int, value: int) -> None:
+        """Write a 32-bit register."""
+        self._library.call("arv_device_write_register", self._device, address, value)
+
+    def read_text(self, address: int, size: int) -> str:
+        """A NUL-padded string of the bootstrap registers; `size` is a multiple of 4."""
+        memory = ctypes.create_string_buffer(size)
+        self._library.call("arv_device_read_memory", self._device, address, size, memory)
+        return memory.raw.split(b"\0")[0].decode(errors="replace")
+
+
+class GigeStream:
+    """One receiver. Never stop and start acquisition on the same one: frame numbers restart at 1 and it would throw
+    everything away until they pass the old last one."""
+
+    def __init__(self, library: Library, stream: int) -> None:
+        self._library = library
+        self._stream: int | None = stream
+
+    def close(self) -> None:
+        """End the receiving thread and free the buffers; may be called twice."""
+        if self._stream:
+            self._library.call("g_object_unref", self._stream)
+            self._stream = None
+
+    def _call(self, function: str, *arguments: object) -> Any:
+        if not self._stream:
+            raise ValueError("the stream is closed")
+        return self._library.call(function, self._stream, *arguments)
+
+    def set_property(self, name: str, value: int | float, g_type: int) -> None:
+        """Set a GObject property; an enumeration takes G_TYPE_INT.
+
+        Through a GValue: the variadic g_object_set has another calling convention on some machines (arm64 macOS).
+        """
+        setter = {G_TYPE_INT: "g_value_set_int", G_TYPE_UINT: "g_value_set_uint", G_TYPE_DOUBLE: "g_value_set_double"}
+        box = _GValue()
+        self._library.call("g_value_init", ctypes.byref(box), g_type)
+        self._library.call(setter[g_type], ctypes.byref(box), value)
+        self._call("g_object_set_property", name.encode(), ctypes.byref(box))
+
+    def add_buffer(self, size: int) -> None:
+        """Give it one more buffer of `size` bytes."""
+        self._call("arv_stream_push_buffer", self._library.call("arv_buffer_new_allocate", size))
+
+    def pop(self, timeout_s: float) -> int | None:
+        """The oldest finished buffer, complete or not, or None after `timeout_s`; must be pushed back."""
+        if timeout_s <= 0:
+            return self._call("arv_stream_try_pop_buffer")
+        return self._call("arv_stream_timeout_pop_buffer", round(timeout_s * 1e6))
+
+    def push(self, buffer: int) -> None:
+        """Give a popped buffer back; its pixels are gone with it."""
+        self._call("arv_stream_push_buffer", buffer)
+
+    def info(self, buffer: int) -> BufferInfo:
+        """What the buffer says of itself; sizes are 0 unless it is complete."""
+        get = self._library.call
+        status = int(get("arv_buffer_get_status", buffer))
+        complete = status == BUFFER_SUCCESS
+        return BufferInfo(
+            status=status,
+            frame_id=int(get("arv_buffer_get_frame_id", buffer)),
+            timestamp_ns=int(get("arv_buffer_get_timestamp", buffer)),
+            width=int(get("arv_buffer_get_image_width", buffer)) if complete else 0,
+            height=int(get("arv_buffer_get_image_height", buffer)) if complete else 0,
+        )
+
+    def copy_bytes(self, buffer: int, size: int) -> NDArray[np.uint8] | None:
+        """The first `size` bytes in an array of their own (chunk data may follow them), None when there are fewer."""
+        length = ctypes.c_size_t()
+        address = self._library.call("arv_buffer_get_data", buffer, ctypes.byref(length))
+        if not address or length.value < size:
+            return None
+        pointer = ctypes.cast(address, ctypes.POINTER(ctypes.c_uint8))
+        return np.ctypeslib.as_array(pointer, shape=(size,)).copy()
+
+    def counters(self) -> dict[str, int]:
+        """Aravis' own counters of this stream (n_completed_buffers, n_resend_requests, ...)."""
+        names: list[bytes] = [
+            self._call("arv_stream_get_info_name", i) for i in range(self._call("arv_stream_get_n_infos"))
+        ]
+        return {name.decode(): int(self._call("arv_stream_get_info_uint64_by_name", name)) for name in names}

@@ -1,0 +1,219 @@
+"""Modbus master: one bus, one lane, quarantine after any error, dead units kept from slowing the others.
+
+RTU has no transaction number: a reply that comes after its time-out would be taken for the answer to the next request.
+So after any error the line is left silent for longer than the slowest reply, then flushed, then used again
+(over TCP the connection is dropped as well). Time-outs, gaps and silences are real seconds; probing a dead unit and
+reopening a lost line are on the stand's clock.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from drivers.wires.modbus_client import Fault, LineSettings, ModbusClient, WireFault
+from drivers.wires.registers import Space
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
+from foundation.lane import Lane
+
+__all__ = ["Bus", "BusCounters", "LineSettings"]
+
+Result = TypeVar("Result")
+
+READ_RETRIES = 2
+DEAD_AFTER_FAILURES = 5  # transactions: one read with its repeats, and two more
+PROBE_PERIODS_S = (1.0, 2.0, 4.0, 8.0, 10.0)  # of a dead unit, the last for good
+REOPEN_PERIOD_S = 1.0
+QUARANTINE_MARGIN_S = 0.05
+
+ERRORS: dict[Fault, type[DeviceError]] = {
+    Fault.LINE_DOWN: Unreachable,
+    Fault.SILENCE: Unreachable,
+    Fault.GARBLED: GarbledReply,
+    Fault.REFUSED: Refused,
+}
+
+
+@dataclass
+class BusCounters:
+    """What happened on the wire since the bus was made. `skipped`: reads not sent because the unit was dead;
+    `stray`: bytes that came without a request; `lines_down`: failures of the port or connection itself."""
+
+    transactions: int = 0
+    retries: int = 0
+    silences: int = 0
+    garbled: int = 0
+    refused: int = 0
+    lines_down: int = 0
+    stray: int = 0
+    skipped: int = 0
+
+    def count(self, fault: Fault) -> None:
+        """One more transaction failed this way."""
+        match fault:
+            case Fault.LINE_DOWN:
+                self.lines_down += 1
+            case Fault.SILENCE:
+                self.silences += 1
+            case Fault.GARBLED:
+                self.garbled += 1
+            case Fault.REFUSED:
+                self.refused += 1
+
+
+@dataclass
+class _Health:
+    """Failures of one unit in a row, whether the last was silence, and when a dead one is next asked."""
+
+    failures: int = 0
+    silent: bool = False
+    probe_ns: int = 0
+
+    def failed(self, silent: bool, now_ns: int) -> _Health:
+        """After one more."""
+        failures = self.failures + 1
+        period_s = PROBE_PERIODS_S[min(max(0, failures - DEAD_AFTER_FAILURES), len(PROBE_PERIODS_S) - 1)]
+        return _Health(failures, silent, now_ns + seconds_ns(period_s))
+
+
+class Bus:
+    """A Modbus line that several devices share: `serial:PATH` (RTU) or `tcp:HOST:PORT` (a Modbus TCP gateway).
+
+    timeout_s must exceed the slowest normal reply of any unit; gap_s is the silence between frames on a serial line (a
+    gateway keeps its own). All calls raise Unreachable, GarbledReply or Refused naming `device`. Reads are tried up
+    to three times when the unit answered last time, be it garbled. Writes go out once, and to a dead unit or line too,
+    so that a make-safe is never withheld. `counters` are public.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        address: str,
+        clock: Clock,
+        line: LineSettings,
+        timeout_s: float = 0.3,
+        gap_s: float = 0.005,
+    ) -> None:
+        self.name = name
+        self.address = address
+        self.counters = BusCounters()
+        self.clock = clock
+        self._client = ModbusClient(address, line, timeout_s)
+        self._gap_s = gap_s if self._client.serial else 0.0
+        self._quarantine_s = timeout_s + QUARANTINE_MARGIN_S
+        self._lane: Lane | None = None
+        self._health: dict[int, _Health] = {}
+        self._line_fault = ""  # why the line is down, "" while it is up
+        self._reopen_ns = 0
+        self._free_s = 0.0  # time.monotonic() from which the line may be used again
+        self._suspect = False  # an error whose late bytes have not been flushed away yet
+
+    async def open(self) -> None:
+        """Open the port or connection; raises Unreachable with the reason. Later losses are reopened by themselves."""
+        if self._lane is None:
+            self._lane = Lane(self.name, self.clock)
+        try:
+            await self._lane.call(self._client.connect)
+        except WireFault as fault:
+            raise self._failure(self.name, 0, fault) from fault
+
+    async def close(self) -> None:
+        """Let go of the line; may be called twice."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._client.close)
+            lane.close()
+
+    async def read(self, device: str, unit: int, space: Space, address: int, count: int) -> list[int]:
+        """`count` registers (0..65535) or bits (0 or 1) from `address` (base 0) on."""
+        health = self._health.setdefault(unit, _Health())
+        if health.failures >= DEAD_AFTER_FAILURES and self.clock.now_ns() < health.probe_ns:
+            self.counters.skipped += 1
+            raise Unreachable(
+                device, f"unit {unit} on {self.name} is dead; asked again every {PROBE_PERIODS_S[-1]:g} s"
+            )
+        retries = 0 if health.silent else READ_RETRIES
+        while True:
+            if self._line_fault and self.clock.now_ns() < self._reopen_ns:
+                raise Unreachable(device, self._line_fault)
+            try:
+                return await self._call(device, unit, self._client.read, space, address, count)
+            except DeviceError as error:
+                if not error.retryable or retries == 0:
+                    raise
+            retries -= 1
+            self.counters.retries += 1
+
+    async def write_register(self, device: str, unit: int, address: int, value: int) -> None:
+        """FC 06; after an error it is unknown whether the write took: read back."""
+        await self._call(device, unit, self._client.write_register, address, value)
+
+    async def write_registers(self, device: str, unit: int, address: int, values: Sequence[int]) -> None:
+        """FC 16; after an error it is unknown whether the write took: read back."""
+        await self._call(device, unit, self._client.write_registers, address, values)
+
+    async def write_coil(self, device: str, unit: int, address: int, raw_value: int) -> None:
+        """FC 05 with any 16-bit value (0xFF00 on, 0x0000 off, or what the unit defines)."""
+        await self._call(device, unit, self._client.write_coil, address, raw_value)
+
+    async def _call(self, device: str, unit: int, function: Callable[..., Result], *args: object) -> Result:
+        """One transaction in the lane, its outcome entered in the unit's health and the counters."""
+        if self._lane is None:
+            raise Unreachable(device, f"{self.name} is not open")
+        self.counters.transactions += 1
+        try:
+            result = await self._lane.call(self._transact, function, unit, *args)
+        except WireFault as fault:
+            raise self._failure(device, unit, fault) from fault
+        self._health[unit] = _Health()
+        self._line_fault = ""
+        return result
+
+    def _failure(self, device: str, unit: int, fault: WireFault) -> DeviceError:
+        """Count `fault` against the unit or the line; the error to raise."""
+        self.counters.count(fault.fault)
+        now_ns = self.clock.now_ns()
+        match fault.fault:
+            case Fault.LINE_DOWN:
+                # The first loss is retried at once (a gateway hangs up when idle), a lasting one once a second.
+                self._reopen_ns = now_ns + seconds_ns(REOPEN_PERIOD_S) if self._line_fault else now_ns
+                self._line_fault = str(fault)
+            case Fault.SILENCE | Fault.GARBLED:
+                silent = fault.fault is Fault.SILENCE
+                self._health[unit] = self._health.get(unit, _Health()).failed(silent, now_ns)
+            case Fault.REFUSED:
+                self._health[unit] = _Health()
+        return ERRORS[fault.fault](device, f"unit {unit} on {self.name}: {fault}")
+
+    def _transact(self, function: Callable[..., Result], *args: object) -> Result:
+        """In the lane: wait until the line is free and clean, run one transaction, set when it is free again."""
+        self._settle()
+        try:
+            result = function(*args)
+        except WireFault as fault:
+            if fault.fault is not Fault.LINE_DOWN:  # a line opened anew has nothing late on it
+                self._suspect = True
+                self._free_s = time.monotonic() + self._quarantine_s
+            raise
+        self._free_s = time.monotonic() + self._gap_s
+        return result
+
+    def _settle(self) -> None:
+        """Keep the gap, or the quarantine and its flush; bytes that nobody asked for are an error too."""
+        _wait_until(self._free_s)
+        if not self._suspect and self._client.unread_bytes():
+            self.counters.stray += 1
+            self._suspect = True
+            _wait_until(time.monotonic() + self._quarantine_s)
+        if self._suspect:
+            self._client.discard_input()
+            self._suspect = False
+
+
+def _wait_until(deadline_s: float) -> None:
+    """Silence on the wire until time.monotonic() reaches `deadline_s`."""
+    if (left_s := deadline_s - time.monotonic()) > 0:
+        time.sleep(left_s)  # noqa: TID251 - silence on a wire is real seconds

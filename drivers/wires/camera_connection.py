@@ -1,0 +1,383 @@
+"""One opened camera and its stream, blocking; after any loss a new one is made.
+
+Acquisition recipe: UDP socket with a receive buffer for a frame, lost packets asked for again until the frame is nearly
+a period old, buffers given back right after the copy. Lives in one thread (the camera's lane).
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.wires.aravis import (
+    BUFFER_STATUS,
+    BUFFER_SUCCESS,
+    G_TYPE_DOUBLE,
+    G_TYPE_INT,
+    G_TYPE_UINT,
+    BufferInfo,
+    GigeDevice,
+    GigeStream,
+)
+from drivers.wires.aravis_library import AravisError
+from drivers.wires.camera_settings import (
+    BYTES_PER_PIXEL,
+    NO_CONTROL_HINT,
+    CameraSettings,
+    TemperatureFeature,
+    apply_settings,
+    find_temperature,
+    read_identity,
+    read_temperature,
+    set_exposure,
+    temperature_place,
+)
+from foundation.clock import NS_PER_S, Clock, block_until, seconds_ns
+from foundation.errors import Refused
+from foundation.readings import Cause
+
+# Aravis' stream: ask again for a missing packet after 1 ms, then every 40 ms, for as much of a frame as was lost.
+INITIAL_PACKET_TIMEOUT_US = 1_000
+PACKET_TIMEOUT_US = 40_000
+PACKET_REQUEST_RATIO = 1.0
+FRAME_RETENTION_PERIODS = 0.9
+SOCKET_BUFFER_FIXED = 0
+
+# Bootstrap registers (GigE Vision 1.2, section 28): tick frequency, timestamp control and latched value.
+TICK_FREQUENCY_HIGH, TICK_FREQUENCY_LOW = 0x093C, 0x0940
+TIMESTAMP_CONTROL, TIMESTAMP_LATCH = 0x0944, 2
+TIMESTAMP_HIGH, TIMESTAMP_LOW = 0x0948, 0x094C
+LATCH_TRIES = 3
+LATCH_GOOD_NS = 5_000_000
+LATCH_AGAIN_S = 60.0  # two quartzes 50 ppm apart: 3 ms
+
+# A time stamp may precede what it belongs to by the error of the latch, and never lies in the future.
+STAMP_SLACK_NS = 20_000_000
+FUTURE_NS = NS_PER_S
+
+TRANSFER_TIMEOUT_S = 2.0  # real seconds beyond the exposure: read-out, 5 MB on the wire, resends, a busy host
+CONTROL_RETRY_S = 1.0
+FRAME_ID_WRAP = 65535  # 16-bit frame ids count 1..65535 and skip 0
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+class FrameCount:
+    """Turns the camera's frame ids (from 1 at each start, mostly 16 bits) into one count that only rises."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._last_id = 0
+
+    def restart(self) -> None:
+        """Ids begin anew with the next frame."""
+        self._last_id = 0
+
+    def advance(self, frame_id: int) -> int:
+        """Count up to this frame, those missing before it included; returns the total."""
+        step = frame_id - self._last_id
+        if step <= 0:
+            step += FRAME_ID_WRAP
+        self._last_id = frame_id
+        self.total += step
+        return self.total
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """A complete frame as received. `start_ns`: begin of the exposure on the stand's clock."""
+
+    image: Pixels
+    start_ns: int
+    exposure_s: float
+    block_id: int
+    camera_ticks: int
+    dropped: int
+    camera_degC: float
+
+
+class Connection:
+    """Opens the camera, takes control, writes the settings. AravisError, Refused."""
+
+    def __init__(
+        self, name: str, settings: CameraSettings, clock: Clock, frames: FrameCount, counts: Counter[str]
+    ) -> None:
+        self.control_lost = threading.Event()
+        self._name = name
+        self._settings = settings
+        self._clock = clock
+        self._frames = frames
+        self._counts = counts
+        self._stream: GigeStream | None = None
+        self._stream_counts: dict[str, int] = {}
+        self._failed = 0  # attempts since the last good frame
+        self._give_one_away = False
+        self._free_run = settings.trigger == "free_run"
+        self._timeout_s = max(TRANSFER_TIMEOUT_S, 2 * settings.period_s)
+        self._offset_ns: int | None = None  # stand clock minus camera clock; None: no useful time stamps
+        self._latched_at_ns = 0
+        self._phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
+        self._device = _open_controlled(name, settings)
+        try:
+            self._device.on_control_lost(self.control_lost.set)
+            self.identity = read_identity(self._device)
+            serial_number = self.identity.serial_number
+            if settings.serial_number not in (None, serial_number):
+                raise Refused(name, f"serial number {settings.serial_number} is expected, {serial_number} answers")
+            self._stop_quietly()  # a client that died may have left it running, with its settings locked
+            self.effective = apply_settings(name, self._device, settings)
+            self._period_ns = seconds_ns(1 / self.effective.frame_rate_hz)
+            self._exposure_asked_s = settings.exposure_s
+            self._exposure_s = self.effective.exposure_s
+            self._temperature, self._no_temperature = self._find_temperature()
+            self._latch()
+        except BaseException:
+            self._device.close()
+            raise
+
+    @property
+    def clock_began_ns(self) -> int | None:
+        """When the camera's clock read zero, which is when it started, on the stand's clock; None when it has none."""
+        return self._offset_ns
+
+    @property
+    def running(self) -> bool:
+        """Whether acquisition was started."""
+        return self._stream is not None
+
+    def close(self) -> None:
+        """Stop and let go; never raises, takes up to 7.5 s when the camera is dead."""
+        self.stop()
+        self._device.close()
+
+    def start(self) -> None:
+        """Acquire with a new stream; ends a running one."""
+        self.stop()
+        stream = self._device.create_stream()
+        try:
+            self._configure(stream)
+            self._frames.restart()
+            self._latch()
+            self._device.start_acquisition()
+        except BaseException:
+            stream.close()
+            raise
+        self._phase_ns = self._clock.now_ns()
+        self._stream = stream
+
+    def _configure(self, stream: GigeStream) -> None:
+        retention_us = round(FRAME_RETENTION_PERIODS / self.effective.frame_rate_hz * 1e6)
+        stream.set_property("socket-buffer", SOCKET_BUFFER_FIXED, G_TYPE_INT)
+        stream.set_property("socket-buffer-size", self.effective.receive_buffer_bytes, G_TYPE_INT)
+        stream.set_property("packet-resend", int(self._settings.resend), G_TYPE_INT)
+        stream.set_property("packet-request-ratio", PACKET_REQUEST_RATIO, G_TYPE_DOUBLE)
+        stream.set_property("initial-packet-timeout", INITIAL_PACKET_TIMEOUT_US, G_TYPE_UINT)
+        stream.set_property("packet-timeout", PACKET_TIMEOUT_US, G_TYPE_UINT)
+        stream.set_property("frame-retention", retention_us, G_TYPE_UINT)
+        for _ in range(self._settings.buffers):
+            stream.add_buffer(self.effective.payload_bytes)
+
+    def stop(self) -> None:
+        """End acquisition and its stream; never raises."""
+        if self._stream is not None:
+            self._stop_quietly()
+            self._count_stream(self._stream)
+            self._stream.close()
+            self._stream = None
+            self._stream_counts = {}
+
+    def _stop_quietly(self) -> None:
+        try:
+            self._device.stop_acquisition()
+        except AravisError:
+            self._counts["stop_errors"] += 1
+
+    def prepare(self, exposure_s: float) -> None:
+        """Set the exposure, throw away what came before, keep the camera's clock tied to ours."""
+        self._set_exposure(exposure_s)
+        self._discard()
+        if self._offset_ns is None or self._clock.now_ns() - self._latched_at_ns > seconds_ns(LATCH_AGAIN_S):
+            self._latch()
+        self._give_one_away = self._free_run and self._offset_ns is None  # its exposure may have begun before the call
+
+    def trigger(self, exposure_s: float, due_ns: int = 0) -> Shot | None:
+        """One software trigger, not before `due_ns`, and its frame, or None when it did not come complete."""
+        self.prepare(exposure_s)
+        block_until(self._clock, due_ns)
+        trigger_ns = self._clock.now_ns()
+        self._device.software_trigger()
+        self._counts["triggers"] += 1
+        return self._take(trigger_ns, self._exposure_s + self._timeout_s)
+
+    def next_free(self, newer_than_ns: int) -> Shot | None:
+        """The next complete frame whose exposure began at or after an instant, or None when none came in time."""
+        shot = self._take(newer_than_ns, self._timeout_s)
+        if shot is not None and self._offset_ns is not None:
+            self._phase_ns = shot.start_ns
+        return shot
+
+    def next_frame_due_ns(self, time_ns: int) -> int:
+        """When the first free-run frame that begins at or after `time_ns` has been exposed."""
+        periods = -((self._phase_ns - time_ns) // self._period_ns)  # rounded up
+        begin_ns = self._phase_ns + periods * self._period_ns
+        return begin_ns + seconds_ns(self._exposure_s)
+
+    def temperature(self) -> tuple[float, str, Cause]:
+        """The camera's temperature in degC and "", or NaN, the reason and who says so. A place that was not found is
+        looked for again: a camera may refuse its selector for a while."""
+        try:
+            if self._temperature is None:
+                self._temperature, self._no_temperature = self._find_temperature()
+        except AravisError as error:
+            return math.nan, str(error), "wire"
+        if self._temperature is None:
+            return math.nan, self._no_temperature, "device"
+        return read_temperature(self._device, self._temperature)
+
+    def temperature_place(self) -> str:
+        """Where the temperature is read, and what else the camera offers, in words; "" when it was not found."""
+        return "" if self._temperature is None else temperature_place(self._device, self._temperature)
+
+    def _find_temperature(self) -> tuple[TemperatureFeature | None, str]:
+        if not self._settings.has_temperature:
+            return None, "the configuration says that this camera has no temperature"
+        return find_temperature(self._device, self._settings.temperature)
+
+    def _discard(self) -> None:
+        """Give back every finished frame unused."""
+        stream = self._streaming()
+        while (buffer := stream.pop(0)) is not None:
+            self._counts["stale"] += 1
+            self._frames.advance(stream.info(buffer).frame_id)
+            stream.push(buffer)
+
+    def _streaming(self) -> GigeStream:
+        if self._stream is None:
+            raise ValueError("acquisition is not running")
+        return self._stream
+
+    def _set_exposure(self, exposure_s: float) -> None:
+        if exposure_s != self._exposure_asked_s:
+            self._exposure_asked_s = math.nan  # unknown until the camera has taken it
+            self._exposure_s = set_exposure(self._name, self._device, exposure_s)
+            self._exposure_asked_s = exposure_s
+
+    def _take(self, newer_than_ns: int, timeout_s: float) -> Shot | None:
+        """The next frame that is not stale, or None when it is late or not whole."""
+        stream = self._streaming()
+        for _ in range(self._settings.buffers + 1):
+            buffer = stream.pop(timeout_s)
+            if buffer is None:
+                self._counts["missed"] += 1
+                break
+            try:
+                info = stream.info(buffer)
+                image = self._image(stream, buffer, info)
+            finally:
+                stream.push(buffer)
+            self._frames.advance(info.frame_id)
+            if image is None:
+                break
+            stamped_ns = self._stand_ns(info.timestamp_ns)
+            if stamped_ns is not None and stamped_ns < newer_than_ns - STAMP_SLACK_NS:
+                self._counts["stale"] += 1
+                continue
+            if stamped_ns is None and self._give_one_away:
+                self._give_one_away = False
+                self._counts["stale"] += 1
+                return None
+            return self._shot(stream, image, info.timestamp_ns, newer_than_ns, stamped_ns)
+        self._failed += 1
+        return None
+
+    def _image(self, stream: GigeStream, buffer: int, info: BufferInfo) -> Pixels | None:
+        """The pixels in an array of their own, or None when the frame is not whole."""
+        shape = self.effective.height_px, self.effective.width_px
+        bytes_per_pixel = BYTES_PER_PIXEL[self.effective.pixel_format]
+        if info.status != BUFFER_SUCCESS:
+            self._counts[f"incomplete_{BUFFER_STATUS.get(info.status, 'unknown')}"] += 1
+            return None
+        data = stream.copy_bytes(buffer, shape[0] * shape[1] * bytes_per_pixel)
+        if data is None or (info.height, info.width) != shape:
+            self._counts["wrong_size"] += 1
+            return None
+        image: Pixels = data.reshape(shape) if bytes_per_pixel == 1 else data.view(np.dtype("<u2")).reshape(shape)
+        image.setflags(write=False)
+        return image
+
+    def _shot(
+        self, stream: GigeStream, image: Pixels, camera_ticks: int, newer_than_ns: int, stamped_ns: int | None
+    ) -> Shot:
+        """The frame with its time, the losses before it, and the temperature right after it."""
+        start_ns, dropped = newer_than_ns, self._failed
+        if self._free_run:
+            start_ns = self._clock.now_ns() - seconds_ns(self._exposure_s) if stamped_ns is None else stamped_ns
+            if stamped_ns is not None:  # whole periods between the call and the frame were lost
+                dropped = max(0, (stamped_ns - newer_than_ns) // self._period_ns)
+        self._failed = 0
+        self._counts["frames"] += 1
+        self._count_stream(stream)
+        temperature_degC, *_ = self.temperature()
+        return Shot(image, start_ns, self._exposure_s, self._frames.total, camera_ticks, dropped, temperature_degC)
+
+    def _count_stream(self, stream: GigeStream) -> None:
+        """Add what Aravis counted since the last time."""
+        now = stream.counters()
+        for counter, value in now.items():
+            self._counts[counter] += value - self._stream_counts.get(counter, 0)
+        self._stream_counts = now
+
+    def _stand_ns(self, timestamp_ns: int) -> int | None:
+        """The camera's time stamp on the stand's clock, None when it is not to be believed."""
+        if self._offset_ns is None:
+            return None
+        time_ns = timestamp_ns + self._offset_ns
+        if time_ns > self._clock.now_ns() + seconds_ns(self._exposure_s) + FUTURE_NS:
+            self._counts["bad_time_stamps"] += 1
+            return None
+        return time_ns
+
+    def _latch(self) -> None:
+        """Measure what the stand's clock is ahead of the camera's; the tightest of a few tries."""
+        self._latched_at_ns = self._clock.now_ns()
+        best_ns = None
+        try:
+            frequency_Hz = self._read_64(TICK_FREQUENCY_HIGH, TICK_FREQUENCY_LOW)
+            for _ in range(LATCH_TRIES):
+                before_ns = self._clock.now_ns()
+                self._device.write_register(TIMESTAMP_CONTROL, TIMESTAMP_LATCH)
+                round_trip_ns = self._clock.now_ns() - before_ns
+                ticks = self._read_64(TIMESTAMP_HIGH, TIMESTAMP_LOW)
+                if not ticks or not frequency_Hz:
+                    self._offset_ns = None
+                    return
+                if best_ns is None or round_trip_ns < best_ns:
+                    best_ns = round_trip_ns
+                    self._offset_ns = before_ns + round_trip_ns // 2 - ticks * NS_PER_S // frequency_Hz
+                if round_trip_ns < LATCH_GOOD_NS:
+                    return
+        except AravisError:
+            self._counts["latch_errors"] += 1  # the offset known so far stays
+
+    def _read_64(self, high: int, low: int) -> int:
+        return self._device.read_register(high) << 32 | self._device.read_register(low)
+
+
+def _open_controlled(name: str, settings: CameraSettings) -> GigeDevice:
+    """The camera with us in control.
+
+    A client that died keeps the camera until its heartbeat runs out: try for that long and a little more.
+    """
+    pause = threading.Event()
+    for _ in range(math.ceil(settings.heartbeat_s + 2)):
+        device = GigeDevice(settings.address)
+        if device.is_controller():
+            return device
+        device.close()
+        pause.wait(CONTROL_RETRY_S)
+    raise Refused(name, f"no control: {NO_CONTROL_HINT}")

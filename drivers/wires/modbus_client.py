@@ -1,0 +1,295 @@
+"""The one place that touches pymodbus: a blocking master, one request and its checked reply, failures as WireFaults.
+
+pymodbus changes its interface in minor releases, and polls a serial port in steps of four characters (5 ms at 9600
+baud); the subclasses here wait for the first byte instead and say why a port does not open.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import struct
+import termios
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+import serial
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from pymodbus.exceptions import ConnectionException, ModbusException
+from pymodbus.pdu import ModbusPDU
+from pymodbus.pdu.bit_message import ReadCoilsRequest, ReadDiscreteInputsRequest
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadInputRegistersRequest,
+    WriteMultipleRegistersRequest,
+    WriteSingleRegisterRequest,
+)
+
+from drivers.wires.registers import Space
+from foundation.errors import ConfigError
+
+# Every fault is raised and counted here; pymodbus would print it a second time on stderr.
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+
+READS: dict[Space, type[ModbusPDU]] = {
+    "holding": ReadHoldingRegistersRequest,
+    "input": ReadInputRegistersRequest,
+    "coil": ReadCoilsRequest,
+    "discrete": ReadDiscreteInputsRequest,
+}
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal address",
+    3: "illegal value",
+    4: "device failure",
+    5: "acknowledge, still working",
+    6: "busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "no answer behind the gateway",
+}
+UNANSWERED_EXCEPTIONS = frozenset({6, 10, 11})  # somebody answered, but not the unit, or not now
+
+
+@dataclass(frozen=True, slots=True)
+class LineSettings:
+    """An RS-485 line: baud, parity N, E or O, stop bits; always 8 data bits. Every unit on it is set to the same."""
+
+    baud: int = 9600
+    parity: Literal["N", "E", "O"] = "N"
+    stopbits: Literal[1, 2] = 1
+
+
+class Fault(StrEnum):
+    """How a transaction failed."""
+
+    LINE_DOWN = "line down"  # the port or connection itself: no unit is to blame
+    SILENCE = "silence"
+    GARBLED = "garbled"
+    REFUSED = "refused"
+
+
+class WireFault(Exception):
+    """One transaction failed; `fault` says how, the text why."""
+
+    def __init__(self, fault: Fault, text: str) -> None:
+        super().__init__(text)
+        self.fault = fault
+
+
+class WriteCoilWord(ModbusPDU):
+    """FC 05 with any 16-bit value, as request and reply (pymodbus knows FF00 and 0000 only).
+
+    The Waveshare relay takes a time in the value (protocol V2, "flash on").
+    """
+
+    function_code = 5
+    rtu_frame_size = 8
+
+    def encode(self) -> bytes:
+        """Address and value, big endian."""
+        return struct.pack(">HH", self.address, self.registers[0])
+
+    def decode(self, data: bytes) -> None:
+        """The echo of address and value."""
+        self.address, value = struct.unpack(">HH", data[:4])
+        self.registers = [value]
+
+
+class _SerialClient(ModbusSerialClient):
+    """pymodbus over pyserial, without its polling."""
+
+    def connect(self) -> bool:
+        """Open the port exclusively; raises OSError with the reason."""
+        if self.socket is None:
+            line = self.comm_params
+            self.socket = serial.Serial(
+                line.host,
+                baudrate=line.baudrate or 9600,
+                parity=line.parity or "N",
+                stopbits=line.stopbits or 1,
+                timeout=line.timeout_connect,
+                write_timeout=line.timeout_connect,
+                exclusive=True,
+            )
+            self.socket.reset_input_buffer()  # whatever came before was not for us
+        return True
+
+    def recv(self, size: int | None) -> bytes:
+        """Wait for one byte, then take what has come; b"" after the time-out."""
+        if self.socket is None:
+            raise ConnectionException("port closed")
+        first = self.socket.read(1)
+        return first + self.socket.read(self.socket.in_waiting) if first else b""
+
+
+class _TcpClient(ModbusTcpClient):
+    """pymodbus over TCP."""
+
+    def connect(self) -> bool:
+        """Connect; raises OSError with the reason."""
+        if self.socket is None:
+            peer = self.comm_params
+            self.socket = socket.create_connection((peer.host, peer.port), timeout=peer.timeout_connect)
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return True
+
+
+class ModbusClient:
+    """A blocking Modbus master on one line, for one thread. Bounded: a transaction ends within twice the time-out."""
+
+    def __init__(self, address: str, line: LineSettings, timeout_s: float) -> None:
+        self.serial = address.startswith("serial:")
+        self._address = address
+        self._line = line
+        self._timeout_s = timeout_s
+        self._client: _SerialClient | _TcpClient | None = None
+        self._sent = b""
+        self._heard = b""
+        self._target = _parse(address)
+
+    def connect(self) -> None:
+        """Open the port or connection unless it is open; raises WireFault LINE_DOWN with the reason."""
+        if self._client is not None:
+            return
+        client = self._make()
+        client.register(WriteCoilWord)
+        try:
+            client.connect()
+        except (OSError, termios.error) as error:
+            client.close()
+            raise WireFault(Fault.LINE_DOWN, f"cannot open {self._address}: {error}") from error
+        self._client = client
+
+    def _make(self) -> _SerialClient | _TcpClient:
+        host, port = self._target
+        if port is None:
+            return _SerialClient(
+                host,
+                baudrate=self._line.baud,
+                parity=self._line.parity,
+                stopbits=self._line.stopbits,
+                timeout=self._timeout_s,
+                retries=0,
+                trace_packet=self._trace,
+            )
+        return _TcpClient(host, port=port, timeout=self._timeout_s, retries=0, trace_packet=self._trace)
+
+    def close(self) -> None:
+        """Let go of the port or connection; never raises, may be called twice."""
+        client, self._client = self._client, None
+        if client is not None:
+            client.close()
+
+    def unread_bytes(self) -> int:
+        """Bytes that came without a request; 0 over TCP, where transaction numbers expose them."""
+        port = self._client.socket if self._client is not None else None
+        try:
+            return port.in_waiting if isinstance(port, serial.Serial) else 0
+        except OSError:
+            return 0  # unplugged: the request that follows says so
+
+    def discard_input(self) -> None:
+        """Forget whatever has arrived: flush the port, or drop the connection (a late reply dies with it)."""
+        port = self._client.socket if self._client is not None else None
+        if not isinstance(port, serial.Serial):
+            self.close()
+            return
+        try:
+            port.reset_input_buffer()
+        except (OSError, termios.error):
+            self.close()
+
+    def read(self, unit: int, space: Space, address: int, count: int) -> list[int]:
+        """`count` registers or bits (0 or 1) from `address` on."""
+        reply = self._exchange(READS[space](dev_id=unit, address=address, count=count))
+        if self.serial and self._heard.startswith(self._sent):
+            raise WireFault(Fault.GARBLED, "the request came back (local echo of the adapter?)")
+        if space in ("holding", "input"):
+            return _exactly(list(reply.registers), count, count)
+        return _exactly([int(bit) for bit in reply.bits], -(-count // 8) * 8, count)
+
+    def write_register(self, unit: int, address: int, value: int) -> None:
+        """FC 06."""
+        self._echoed(WriteSingleRegisterRequest(dev_id=unit, address=address, registers=[value]))
+
+    def write_coil(self, unit: int, address: int, raw_value: int) -> None:
+        """FC 05 with any 16-bit value."""
+        self._echoed(WriteCoilWord(dev_id=unit, address=address, registers=[raw_value]))
+
+    def write_registers(self, unit: int, address: int, values: Sequence[int]) -> None:
+        """FC 16."""
+        reply = self._exchange(WriteMultipleRegistersRequest(dev_id=unit, address=address, registers=values))
+        if (reply.address, reply.count) != (address, len(values)):
+            raise WireFault(
+                Fault.GARBLED,
+                f"wrote {len(values)} words at {address:#06x}, the reply has {reply.count} at {reply.address:#06x}",
+            )
+
+    def _echoed(self, request: ModbusPDU) -> None:
+        """Send a single write, whose reply repeats address and value, and so is as long as the request."""
+        reply = self._exchange(request)
+        if len(self._heard) != len(self._sent):
+            raise WireFault(Fault.GARBLED, "more came back than a reply (local echo of the adapter?)")
+        sent, echoed = ((pdu.address, pdu.registers[0]) for pdu in (request, reply))
+        if sent != echoed:
+            raise WireFault(
+                Fault.GARBLED, "wrote {1:#06x} at {0:#06x}, the reply has {3:#06x} at {2:#06x}".format(*sent, *echoed)
+            )
+
+    def _exchange(self, request: ModbusPDU) -> ModbusPDU:
+        """Send `request`; its reply, of the same function and unit; raises WireFault."""
+        self.connect()
+        reply = self._execute(request)
+        if reply.function_code & 0x7F != request.function_code:
+            raise WireFault(Fault.GARBLED, f"asked function {request.function_code}, got {reply.function_code}")
+        if code := reply.exception_code:
+            fault = Fault.SILENCE if code in UNANSWERED_EXCEPTIONS else Fault.REFUSED
+            raise WireFault(fault, f"exception {code} ({EXCEPTIONS.get(code, 'not in the standard')})")
+        return reply
+
+    def _execute(self, request: ModbusPDU) -> ModbusPDU:
+        client = self._client
+        if client is None:
+            raise WireFault(Fault.LINE_DOWN, f"{self._address} is closed")
+        self._heard = b""
+        try:
+            return client.execute(False, request)
+        except ConnectionException as error:
+            self.close()
+            raise WireFault(Fault.LINE_DOWN, f"{self._address} is gone: {error.string}") from error
+        except ModbusException as error:
+            if self._heard:
+                raise WireFault(Fault.GARBLED, f"no valid reply in {self._heard.hex(' ')}") from error
+            raise WireFault(Fault.SILENCE, f"no reply within {self._timeout_s:g} s") from error
+        except (OSError, termios.error) as error:
+            self.close()
+            raise WireFault(Fault.LINE_DOWN, f"{self._address} is gone: {error}") from error
+
+    def _trace(self, sending: bool, data: bytes) -> bytes:
+        """pymodbus hands every packet here: what went out, and what has come and is not yet a frame."""
+        if sending:
+            self._sent = data
+        else:
+            self._heard = data
+        return data
+
+
+def _parse(address: str) -> tuple[str, int | None]:
+    """`serial:PATH` -> (path, None); `tcp:HOST:PORT` -> (host, port); raises ConfigError."""
+    kind, _, rest = address.partition(":")
+    if kind == "serial" and rest:
+        return rest, None
+    host, _, port = rest.rpartition(":")
+    if kind == "tcp" and host and port.isdecimal() and 0 < int(port) < 65536:
+        return host, int(port)
+    raise ConfigError(f"bus address {address!r} is neither serial:PATH nor tcp:HOST:PORT")
+
+
+def _exactly(values: list[int], expected: int, count: int) -> list[int]:
+    """The first `count` of `values`, of which there must be `expected`: another length answers another request."""
+    if len(values) != expected:
+        raise WireFault(Fault.GARBLED, f"asked for {count} values, got {len(values)}")
+    return values[:count]

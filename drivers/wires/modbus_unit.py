@@ -1,0 +1,111 @@
+"""One unit on a bus, spoken to in the names of its register map; every write is read back."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterable
+
+from drivers.wires.bus import Bus
+from drivers.wires.registers import Block, Command, RegisterMap, Snapshot, decode, decode_blocks, encode, plan_blocks
+from foundation.errors import DeviceError, DeviceFault, Refused
+
+WRITE_TRIES = 2
+CONFIRM_LOOKS = 3  # a status bit may lag its command by a scan of the unit
+
+
+class ModbusUnit:
+    """Points and commands of one unit. `name` is the device in every error."""
+
+    def __init__(self, name: str, bus: Bus, register_map: RegisterMap) -> None:
+        self.name = name
+        self.map = register_map
+        self._bus = bus
+        self._unit = register_map.transport.unit
+        self._plans: dict[tuple[str, ...], tuple[Block, ...]] = {}  # of the polls, which ask for the same every time
+
+    async def snapshot(self, names: Iterable[str]) -> Snapshot:
+        """Read the named points, in as few requests as possible."""
+        wanted = tuple(names)
+        if wanted not in self._plans:
+            self._plans[wanted] = plan_blocks(self.map, wanted)
+        replies = {
+            block: await self._bus.read(self.name, self._unit, block.space, block.address, block.count)
+            for block in self._plans[wanted]
+        }
+        return decode_blocks(self.map, replies)
+
+    async def probe(self) -> None:
+        """Read what proves the unit's identity and settings; DeviceFault when it is not what the map says."""
+        snapshot = await self.snapshot(probe.point for probe in self.map.probe)
+        for probe in self.map.probe:
+            found = snapshot.samples[probe.point].value
+            if found != probe.expect:
+                raise DeviceFault(
+                    self.name, f"{probe.point} is {found:g} where the register map expects {probe.expect:g}; not used"
+                )
+
+    async def write(self, point_name: str, value: float) -> float:
+        """Write a register point and read it back; the value as the unit took it, rounded to its scale.
+
+        Refused: outside the limits (nothing is sent), or not taken over.
+        """
+        point = self.map.points[point_name]
+        try:
+            words = encode(point, value)
+        except ValueError as error:
+            raise Refused(self.name, f"{point_name}: {error}; nothing was sent") from error
+
+        async def send() -> None:
+            if len(words) == 1 and self.map.transport.write_fc == 6:
+                await self._bus.write_register(self.name, self._unit, point.address, words[0])
+            else:
+                await self._bus.write_registers(self.name, self._unit, point.address, words)
+
+        async def holds() -> bool:
+            return await self._bus.read(self.name, self._unit, point.space, point.address, point.words) == words
+
+        await self.checked(send, holds, f"{point_name} = {value:g} {point.unit}")
+        return decode(point, words).value
+
+    async def write_coil(self, address: int, raw_value: int) -> None:
+        """FC 05 once, not read back: for `checked`."""
+        await self._bus.write_coil(self.name, self._unit, address, raw_value)
+
+    async def command(self, command_name: str) -> None:
+        """Send a command of the map and see its bit confirm it."""
+        command = self.map.commands[command_name]
+
+        async def send() -> None:
+            await self._bus.write_register(self.name, self._unit, command.address, command.value)
+
+        async def holds() -> bool:
+            for _ in range(CONFIRM_LOOKS):
+                if is_confirmed(command, await self.snapshot([command.confirm.point])):
+                    return True
+            return False
+
+        await self.checked(send, holds, f"command {command_name}")
+
+    async def checked(
+        self, send: Callable[[], Awaitable[None]], holds: Callable[[], Awaitable[bool]], what: str
+    ) -> None:
+        """Send, then see that it holds. Only when its reply was lost and it does not hold is it sent once more."""
+        lost: DeviceError | None = None
+        for _ in range(WRITE_TRIES):
+            lost = None
+            try:
+                await send()
+            except DeviceError as error:
+                if not error.retryable:
+                    raise
+                lost = error
+            if await holds():
+                return
+            if lost is None:
+                raise Refused(self.name, f"{what} was acknowledged but reads back otherwise")
+        if lost is not None:
+            raise lost
+
+
+def is_confirmed(command: Command, snapshot: Snapshot) -> bool:
+    """Whether the bit that confirms `command` stands in a snapshot that has read its point."""
+    return snapshot.bits[command.confirm.bit] == command.confirm.is_

@@ -1,0 +1,315 @@
+"""Register map: YAML -> checked points and commands, block reads, scaling, faults. No I/O.
+
+A point is one quantity at one address (base 0); a word may carry named bits, and a coil or discrete input is a bit
+named by its point. One map drives a unit and can be read beside its manual.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from foundation.documents import Document, load_document
+
+MAX_GAP_WORDS = 4  # reading four words too many costs less than another request
+
+Space = Literal["holding", "input", "coil", "discrete"]
+Word = Annotated[int, Field(ge=0, le=0xFFFF)]
+PointType = Literal["bit", "int16", "uint16", "int32", "uint32", "float32"]
+FORMATS: dict[PointType, str] = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+BIT_SPACES = ("coil", "discrete")
+
+
+class Transport(Document):
+    """How the unit is spoken to. Line settings and time-outs belong to the bus, which all units share."""
+
+    kind: Literal["modbus-rtu"]
+    unit: int = Field(ge=1, le=247)
+    write_fc: Literal[6, 16] = 6
+    max_read_words: int = Field(default=32, ge=1, le=125)
+
+
+class RawFault(Document):
+    """A raw word that is no measurement; `code` says why."""
+
+    raw: Word
+    code: str = Field(min_length=1)
+
+
+class Split(Document):
+    """One signed point as two: `positive` = max(value, 0), `negative` = max(-value, 0)."""
+
+    positive: str
+    negative: str
+
+
+class Pulse(Document):
+    """Where a coil takes "on for value x step_s" (FC 05)."""
+
+    address: Word
+    step_s: float = Field(gt=0)
+
+
+class Point(Document):
+    """One quantity: value = raw * scale + offset.
+
+    word_order: of 32-bit points, which half comes first. valid: values outside are no measurement. limits: values
+    outside are never written. bits: bit number -> name. bad_if: bits that make this point no measurement. eeprom: a
+    write wears the memory unless every start-up command is confirmed.
+    """
+
+    address: Word
+    space: Space = "holding"
+    type: PointType = "uint16"
+    word_order: Literal["high_first", "low_first"] = "high_first"
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str = "1"
+    access: Literal["r", "rw"] = "r"
+    poll: Literal["fast", "once"] = "once"
+    valid: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None
+    bits: dict[int, str] = Field(default_factory=dict)
+    faults: tuple[RawFault, ...] = ()
+    bad_if: tuple[str, ...] = ()
+    split: Split | None = None
+    pulse: Pulse | None = None
+    eeprom: bool = False
+
+    @property
+    def words(self) -> int:
+        """Addresses it takes."""
+        return 2 if self.type in ("int32", "uint32", "float32") else 1
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.type == "bit") != (self.space in BIT_SPACES):
+            raise ValueError(f"type {self.type} cannot live in space {self.space}")
+        if self.address + self.words > 0x10000:
+            raise ValueError("runs past address 0xFFFF")
+        if self.scale == 0:
+            raise ValueError("scale must not be 0")
+        for name, interval in (("valid", self.valid), ("limits", self.limits)):
+            if interval is not None and interval[0] >= interval[1]:
+                raise ValueError(f"{name} must be [low, high], not {list(interval)}")
+        if any(not 0 <= bit < 16 * self.words for bit in self.bits) or (self.bits and self.type in ("bit", "float32")):
+            raise ValueError(f"a {self.type} has no bits {sorted(self.bits)}")
+        if self.access == "rw" and self.space in ("input", "discrete"):
+            raise ValueError(f"space {self.space} cannot be written")
+        if self.access == "r" and (self.limits or self.pulse or self.eeprom):
+            raise ValueError("limits, pulse and eeprom need access: rw")
+        return self
+
+
+class Confirm(Document):
+    """The bit that shows a command took effect."""
+
+    point: str
+    bit: str
+    is_: bool = Field(alias="is")
+
+
+class Command(Document):
+    """One register write (FC 06) that makes the unit do something."""
+
+    address: Word
+    value: Word
+    confirm: Confirm
+
+
+class Probe(Document):
+    """A point whose value proves that the unit is the one this map describes."""
+
+    point: str
+    expect: float
+
+
+class RegisterMap(Document):
+    """All that is known about one kind of unit. `fault_bits`: bits that mean trouble, reported as they are."""
+
+    schema_: Literal["regmap/1"] = Field(alias="schema")
+    vendor: str
+    model: str
+    source: str
+    transport: Transport
+    probe: tuple[Probe, ...] = ()
+    points: dict[str, Point] = Field(min_length=1)
+    fault_bits: tuple[str, ...] = ()
+    commands: dict[str, Command] = Field(default_factory=dict)
+    startup: tuple[str, ...] = ()
+    safe_state: tuple[str, ...] = ()
+
+    def at_unit(self, unit: int) -> RegisterMap:
+        """The same map for a unit at another address of the bus, 1..247."""
+        transport = Transport.model_validate({**self.transport.model_dump(), "unit": unit})
+        return self.model_copy(update={"transport": transport})
+
+    def polled(self) -> tuple[str, ...]:
+        """Names of the points of every poll."""
+        return tuple(name for name, point in self.points.items() if point.poll == "fast")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        faults = [*self._overlaps(), *self._missing_names(), *self._double_names()]
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+    def _overlaps(self) -> Iterator[str]:
+        taken: dict[tuple[Space, int], str] = {}
+        for name, point in self.points.items():
+            for address in range(point.address, point.address + point.words):
+                other = taken.setdefault((point.space, address), name)
+                if other != name:
+                    yield f"points {other} and {name} overlap at {point.space} {address:#06x}"
+
+    def _missing_names(self) -> Iterator[str]:
+        bits = set(self._bit_names())
+        for name, point in self.points.items():
+            yield from (f"points.{name}.bad_if: no bit {bit}" for bit in point.bad_if if bit not in bits)
+        yield from (f"fault_bits: no bit {bit}" for bit in self.fault_bits if bit not in bits)
+        yield from (f"probe: no point {probe.point}" for probe in self.probe if probe.point not in self.points)
+        for name, command in self.commands.items():
+            point = self.points.get(command.confirm.point)
+            if point is None or command.confirm.bit not in point.bits.values():
+                yield f"commands.{name}.confirm: no bit {command.confirm.bit} in point {command.confirm.point}"
+        for name in (*self.startup, *self.safe_state):
+            if name not in self.commands:
+                yield f"startup, safe_state: no command {name}"
+
+    def _double_names(self) -> Iterator[str]:
+        bits = list(self._bit_names())
+        yield from (f"bit {bit} is named twice" for bit in sorted({bit for bit in bits if bits.count(bit) > 1}))
+        for point in self.points.values():
+            for name in (point.split.positive, point.split.negative) if point.split else ():
+                if name in self.points:
+                    yield f"split {name} is also a point"
+
+    def _bit_names(self) -> Iterator[str]:
+        for name, point in self.points.items():
+            yield from [name] if point.type == "bit" else point.bits.values()
+
+
+def load_register_map(path: Path) -> RegisterMap:
+    """The map in a YAML file; raises ConfigError naming file, path and fault."""
+    return load_document(path, RegisterMap)
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Addresses read in one request, and the points in it."""
+
+    space: Space
+    address: int
+    count: int
+    names: tuple[str, ...]
+
+
+def plan_blocks(register_map: RegisterMap, names: Iterable[str]) -> tuple[Block, ...]:
+    """The fewest reads that cover `names`: by address, gaps up to 4, at most max_read_words each."""
+    blocks: list[Block] = []
+    points = register_map.points
+    for name in sorted(set(names), key=lambda name: (points[name].space, points[name].address)):
+        point = points[name]
+        end = point.address + point.words
+        last = blocks[-1] if blocks else None
+        if (
+            last is not None
+            and last.space == point.space
+            and point.address - (last.address + last.count) <= MAX_GAP_WORDS
+            and end - last.address <= register_map.transport.max_read_words
+        ):
+            blocks[-1] = Block(last.space, last.address, end - last.address, (*last.names, name))
+        else:
+            blocks.append(Block(point.space, point.address, point.words, (name,)))
+    return tuple(blocks)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One decoded point: the raw word(s) as an unsigned number; `value` is NaN exactly when `reason` is not empty."""
+
+    raw: int
+    value: float
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """Decoded points (split ones under both names) and bits of one poll."""
+
+    samples: Mapping[str, Sample]
+    bits: Mapping[str, bool]
+
+
+def decode_blocks(register_map: RegisterMap, replies: Mapping[Block, list[int]]) -> Snapshot:
+    """Replies of planned blocks as samples and bits; `bad_if` bits that were not read spoil nothing."""
+    samples: dict[str, Sample] = {}
+    bits: dict[str, bool] = {}
+    for block, words in replies.items():
+        for name in block.names:
+            point = register_map.points[name]
+            start = point.address - block.address
+            samples[name] = decode(point, words[start : start + point.words])
+            bits.update(_bits(name, point, samples[name].raw))
+    for name, sample in list(samples.items()):
+        point = register_map.points[name]
+        alarms = [bit for bit in point.bad_if if bits.get(bit)]
+        if alarms:
+            samples[name] = Sample(sample.raw, math.nan, ", ".join(alarms))
+        if point.split is not None:
+            samples.update(_split(point.split, samples[name]))
+    return Snapshot(samples, bits)
+
+
+def decode(point: Point, words: list[int]) -> Sample:
+    """Raw words (0..65535, in order of address) as a value in the point's unit."""
+    raw = 0
+    for word in words if point.word_order == "high_first" else reversed(words):
+        raw = raw << 16 | word
+    for fault in point.faults:
+        if raw == fault.raw:
+            return Sample(raw, math.nan, fault.code)
+    number = raw if point.type == "bit" else struct.unpack(FORMATS[point.type], raw.to_bytes(2 * len(words), "big"))[0]
+    value = number * point.scale + point.offset
+    if not math.isfinite(value):
+        return Sample(raw, math.nan, "not a number")
+    if point.valid is not None and not point.valid[0] <= value <= point.valid[1]:
+        return Sample(raw, math.nan, f"{value:g} {point.unit} is outside {point.valid[0]:g}..{point.valid[1]:g}")
+    return Sample(raw, value)
+
+
+def encode(point: Point, value: float) -> list[int]:
+    """The words to write for `value`; ValueError when it is read-only, outside its limits or does not fit."""
+    if point.access != "rw" or point.type == "bit":
+        raise ValueError("not a writable register")
+    if point.limits is not None and not point.limits[0] <= value <= point.limits[1]:
+        raise ValueError(f"{value:g} {point.unit} is outside the limits {point.limits[0]:g}..{point.limits[1]:g}")
+    if not math.isfinite(value):
+        raise ValueError(f"{value} cannot be written")
+    number = (value - point.offset) / point.scale
+    try:
+        packed = struct.pack(FORMATS[point.type], number if point.type == "float32" else round(number))
+    except (struct.error, OverflowError) as error:
+        raise ValueError(f"{value:g} {point.unit} does not fit {point.type}") from error
+    words = [int.from_bytes(packed[i : i + 2], "big") for i in range(0, len(packed), 2)]
+    return words if point.word_order == "high_first" else words[::-1]
+
+
+def _bits(name: str, point: Point, raw: int) -> dict[str, bool]:
+    if point.type == "bit":
+        return {name: bool(raw)}
+    return {bit_name: bool(raw >> bit & 1) for bit, bit_name in point.bits.items()}
+
+
+def _split(split: Split, sample: Sample) -> dict[str, Sample]:
+    return {
+        split.positive: Sample(sample.raw, max(sample.value, 0.0) if not sample.reason else math.nan, sample.reason),
+        split.negative: Sample(sample.raw, max(-sample.value, 0.0) if not sample.reason else math.nan, sample.reason),
+    }

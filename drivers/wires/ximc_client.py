@@ -1,0 +1,124 @@
+"""One XIMC conversation, host side: request and reply in a thread, resynchronised after any error.
+
+A late or damaged reply is never credited to another request: after any error zeros are sent, and since the controller
+answers in order, the zeros that come back are behind everything that was still on its way (facts: libximc protocol.xi,
+8SMC5-USB manual chapter 6.2).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from drivers.wires.link import ByteLink
+from drivers.wires.ximc import ERROR_SIZES, Damage, Frame, decode, encode
+from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
+
+READ_RETRIES = 2
+_RESYNC_BURSTS = 4
+_RESYNC_ZEROS = bytes(64)
+# So many zeros in a row are an echo: no reply of ours holds more than 29 (GETS at rest, no supply), a break on the line
+# is one, and a request cut short swallows at most 14 of a burst. A flipped bit leaves such a run on one of its sides.
+_RESYNC_ECHO = bytes(32)
+_SETTLE_S = 0.01
+
+
+class XimcClient:
+    """Speaks to one controller over a link made by `connect`. Not thread-safe.
+
+    A broken link is closed, and opened again by the next request: while `connected` is False nobody knows who will
+    answer. `timeout_s`: real seconds for a whole reply. `errors` counts exchanges that went wrong.
+    """
+
+    def __init__(self, device: str, connect: Callable[[], ByteLink], timeout_s: float = 0.25) -> None:
+        self._device = device
+        self._connect = connect
+        self._timeout_s = timeout_s
+        self._link: ByteLink | None = None
+        self.errors = 0
+
+    @property
+    def connected(self) -> bool:
+        """The link of the last request still stands."""
+        return self._link is not None
+
+    def query(self, letters: str, payload_size: int) -> bytes:
+        """A read: the reply's payload. Repeated at most READ_RETRIES times after a damaged or missing reply, never
+        over a new link."""
+        for _ in range(READ_RETRIES):
+            try:
+                return self._exchange(letters, b"", payload_size)
+            except (Unreachable, GarbledReply):
+                if not self.connected:
+                    raise
+        return self._exchange(letters, b"", payload_size)
+
+    def command(self, letters: str, payload: bytes = b"") -> None:
+        """A write, sent once. After Unreachable or GarbledReply it may have been carried out: read the state."""
+        self._exchange(letters, payload, 0)
+
+    def close(self) -> None:
+        """Let go of the link; may be called twice."""
+        if self._link is not None:
+            self._link.close()
+        self._link = None
+
+    def _exchange(self, letters: str, payload: bytes, reply_size: int) -> bytes:
+        """One request and its reply; whatever else comes is an error, and the line is clean again when it is raised."""
+        link = self._link = self._link or self._connect()
+        try:
+            if link.read(0.0).strip(b"\0"):  # nobody asked for it, and more may follow
+                self.errors += 1
+                self._resync(link)
+            link.write(encode(letters, payload))
+            frame, rest = self._receive(link, letters, reply_size)
+            if frame is not None and (frame.letters, frame.damage) == (letters, Damage.NONE) and not rest.strip(b"\0"):
+                return frame.payload
+            self.errors += 1
+            self._resync(link)
+        except Unreachable:
+            self.close()
+            raise
+        raise self._complaint(letters, frame)
+
+    def _receive(self, link: ByteLink, letters: str, reply_size: int) -> tuple[Frame | None, bytes]:
+        """The first frame and what came with it; no frame when none was complete in time."""
+        deadline_s = time.monotonic() + self._timeout_s
+        frame, received = None, b""
+        while frame is None and (data := _read_before(link, deadline_s)):
+            frame, received = decode(received + data, {**ERROR_SIZES, letters: reply_size})
+        return frame, received
+
+    def _resync(self, link: ByteLink) -> None:
+        """Zeros until they come back, then drop what is left; Unreachable when they do not."""
+        for _ in range(_RESYNC_BURSTS):
+            link.write(_RESYNC_ZEROS)
+            deadline_s = time.monotonic() + self._timeout_s
+            received = b""
+            while data := _read_before(link, deadline_s):
+                received += data
+                if _RESYNC_ECHO in received:
+                    while time.monotonic() < deadline_s and link.read(_SETTLE_S):
+                        pass
+                    return
+        raise Unreachable(self._device, "the controller does not answer, nor does it echo zeros")
+
+    def _complaint(self, letters: str, frame: Frame | None) -> DeviceError:
+        """What was wrong with the answer to `letters`."""
+        if frame is None:
+            return Unreachable(self._device, f"no answer to {letters} within {self._timeout_s:g} s")
+        if frame.letters == "errc":
+            return Refused(self._device, f"the controller does not know {letters}; is its firmware the right one?")
+        if frame.letters == "errv":
+            return Refused(self._device, f"a value in {letters} was out of range and the controller changed it")
+        if frame.letters == "errd":
+            return GarbledReply(self._device, f"the controller received {letters} damaged")
+        if frame.damage is Damage.NONE:
+            return GarbledReply(self._device, f"more came than the answer to {letters}")
+        return GarbledReply(self._device, f"the answer to {letters} was {frame.letters!r} ({frame.damage.name})")
+
+
+def _read_before(link: ByteLink, deadline_s: float) -> bytes:
+    """What has arrived until time.monotonic() reaches `deadline_s`; b"" then."""
+    left_s = deadline_s - time.monotonic()
+    return link.read(left_s) if left_s > 0 else b""

@@ -1,0 +1,79 @@
+"""What is raised on purpose (who is to blame decides the class; `retryable` is a property of the class):
+
+    StandError
+    ├── ConfigError            the user's file is wrong; names the file and the path in it
+    ├── DeviceError            carries the device's name
+    │   ├── Unreachable        no answer within the deadline (retryable)
+    │   ├── GarbledReply       an answer that cannot be right: CRC, length, wrong unit (retryable)
+    │   ├── Refused            the device says no: exception code, errv, access denied
+    │   ├── InUse              another run of this machine has it; nothing was touched
+    │   ├── DeviceFault        the device works and reports trouble: sensor break, jam, alarm
+    │   ├── Occupied           somebody has it do something else at the unit; it takes no orders until that ends
+    │   └── Superseded         a newer command, or making safe, has overtaken this one: nobody is to blame
+    ├── StandTripped           the guard has made the stand safe; an operator must clear it
+    └── SessionError           a recorded session cannot be read
+
+Programming mistakes stay ValueError. Bad calls raise; bad measurements are values with a quality.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class StandError(Exception):
+    """Anything thermostand raises on purpose; its text is one sentence for the user."""
+
+    retryable: ClassVar[bool] = False
+
+
+class ConfigError(StandError):
+    """A configuration, recipe, register map or target file is wrong; the text names file and path."""
+
+
+class DeviceError(StandError):
+    """A device failed; `device` is its configured name."""
+
+    def __init__(self, device: str, text: str) -> None:
+        super().__init__(f"{device}: {text}")
+        self.device = device
+
+
+class Unreachable(DeviceError):
+    """No answer within the deadline, or the port, bus or address is gone."""
+
+    retryable = True
+
+
+class GarbledReply(DeviceError):
+    """An answer arrived that cannot belong to the request."""
+
+    retryable = True
+
+
+class Refused(DeviceError):
+    """The device understood and declined; repeating the request would not help."""
+
+
+class InUse(DeviceError):
+    """Another run on this machine has the device: it was neither opened nor made safe."""
+
+
+class DeviceFault(DeviceError):
+    """The device reports a fault of its own or of what it moves, heats or measures."""
+
+
+class Occupied(DeviceError):
+    """Somebody at the unit has it do something of its own, such as autotuning: it takes no orders until that ends."""
+
+
+class Superseded(DeviceError):
+    """A newer command, or making safe, has taken the actuator over; what was asked for before was not carried out."""
+
+
+class StandTripped(StandError):
+    """The guard has latched: actuators are safe and nothing may move until an operator clears it."""
+
+
+class SessionError(StandError):
+    """A recorded session is missing, damaged or not of our making."""

@@ -1,0 +1,35 @@
+"""How a command ends, each with one sentence: 0 as asked, 1 failed or damaged, 2 bad input, 3 a run that is complete
+and recorded but could not be reported, 130 interrupted."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+
+import typer
+
+from foundation.errors import ConfigError, StandError
+from foundation.usage import tell
+
+FAILED = 1
+BAD_INPUT = 2
+NOT_REPORTED = 3
+INTERRUPTED = 130
+
+
+@contextmanager
+def one_line_errors() -> Generator[None]:
+    """What is raised inside becomes its sentence on standard error and its exit status."""
+    try:
+        yield
+    except ConfigError as error:
+        tell(error)
+        raise typer.Exit(BAD_INPUT) from error
+    except BrokenPipeError:  # whoever reads our output has enough; typer ends quietly
+        raise
+    except (StandError, OSError) as error:
+        tell(error)
+        raise typer.Exit(FAILED) from error
+    except KeyboardInterrupt as error:
+        typer.echo("interrupted", err=True)
+        raise typer.Exit(INTERRUPTED) from error

@@ -1,0 +1,52 @@
+"""Where every reading, frame, event and step mark passes once: publish, latest, subscribe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from foundation.items import Batch, Item
+from foundation.readings import Quality, Reading
+
+Subscriber = Callable[[Item], None]
+
+
+class Hub:
+    """Keeps the latest reading of each channel and hands each item to every subscriber, in order of subscription.
+
+    Subscribers must return at once (enqueue, count, compare); whoever does slow work has a queue of its own.
+    """
+
+    def __init__(self) -> None:
+        self._latest: dict[str, Reading] = {}
+        self._known: dict[str, Reading] = {}
+        self._good_ns: dict[str, int] = {}
+        self._subscribers: list[Subscriber] = []
+
+    def subscribe(self, subscriber: Subscriber) -> None:
+        """Call `subscriber(item)` for every item published from now on."""
+        self._subscribers.append(subscriber)
+
+    def publish(self, item: Item) -> None:
+        """Remember the readings of a batch, then hand the item on."""
+        if isinstance(item, Batch):
+            for reading in item.readings:
+                self._latest[reading.channel] = reading
+                if reading.cause != "wire":
+                    self._known[reading.channel] = reading
+                if reading.quality is Quality.GOOD:
+                    self._good_ns[reading.channel] = reading.time_ns
+        for subscriber in self._subscribers:
+            subscriber(item)
+
+    def latest(self, channel: str) -> Reading | None:
+        """The last reading of `channel`, or None when there was none yet."""
+        return self._latest.get(channel)
+
+    def known(self, channel: str) -> Reading | None:
+        """The last reading but for those that are BAD by the wire, which say nothing of what is measured: a single lost
+        reply makes nobody forget. How old it may be is for the guard (trustworthy) to judge."""
+        return self._known.get(channel)
+
+    def last_good_ns(self, channel: str) -> int | None:
+        """When `channel` last gave a GOOD reading, or None when it never did."""
+        return self._good_ns.get(channel)

@@ -1,0 +1,126 @@
+"""Blocking calls of one wire, in order: in a thread of their own in real time, on the spot in virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, TypeVar
+
+from foundation.clock import Clock, VirtualClock
+
+Result = TypeVar("Result")
+
+# How long a lane's thread that computes (encoding, checksums) may keep the event loop from its turn; Python's own 5 ms
+# would make frames late by as much.
+_SWITCH_S = 0.0005
+
+
+class Lane:
+    """Runs blocking calls one at a time in its own thread; the thread is the lock of the wire.
+
+    Several devices on one bus share one lane. A cancelled caller waits for the call under way to end (it is bounded
+    by the wire's own time-out), so that no half transaction stays on the wire. Where nothing bounds a call (`patient`
+    false: a disk that hangs), a cancelled caller leaves at once and the call goes on. The thread never keeps the
+    process from ending.
+
+    In virtual time nothing may happen meanwhile, so there is no thread to hand over to: the call is made at once, and
+    the loop waits with it. A signal is then served when the call has ended, on a dead wire after its time-out.
+    """
+
+    def __init__(self, name: str, clock: Clock, *, patient: bool = True) -> None:
+        self._name = name
+        self._clock = clock
+        self._patient = patient
+        self._has_thread = not isinstance(clock, VirtualClock)
+        self._work: SimpleQueue[Callable[[], None] | None] | None = None  # with the thread, from the first call on
+        self._closed = self._abandoned = False
+        self._waiting: set[asyncio.Future[Any]] = set()
+        if self._has_thread:
+            sys.setswitchinterval(_SWITCH_S)
+
+    async def call(self, function: Callable[..., Result], *args: object) -> Result:
+        """`function(*args)` in its turn; what it raises is raised here. ValueError after `close`."""
+        if self._abandoned:
+            raise self._left()
+        if not self._has_thread:
+            return function(*args)
+        with self._clock.hold():
+            future = self._submitted(function, args)
+            try:
+                return await asyncio.shield(future)
+            except asyncio.CancelledError:
+                if self._patient:
+                    await asyncio.wait([future])
+                future.add_done_callback(_seen)
+                raise
+
+    def abandon(self) -> None:
+        """Wait no longer: the calls under way and all later ones raise TimeoutError; the thread is left to itself."""
+        self._abandoned = True
+        for future in tuple(self._waiting):
+            _failed(future, self._left())
+        self.close()
+
+    def _left(self) -> TimeoutError:
+        return TimeoutError(f"{self._name} has not answered and is waited for no longer")
+
+    def close(self) -> None:
+        """End the thread after the calls handed over; may be called twice."""
+        self._closed = True
+        if self._work is not None:
+            self._work.put(None)
+            self._work = None
+
+    def _submitted(self, function: Callable[..., Result], args: tuple[object, ...]) -> asyncio.Future[Result]:
+        """The future of a call that the thread makes in its turn."""
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[Result] = loop.create_future()
+
+        def work() -> None:
+            try:
+                settle = partial(_settled, future, function(*args))
+            except BaseException as error:  # noqa: BLE001 - whatever it is, the caller is waiting for it
+                settle = partial(_failed, future, error)
+            with suppress(RuntimeError):  # the loop has ended, and nobody waits any more
+                loop.call_soon_threadsafe(settle)
+
+        self._queue().put(work)
+        self._waiting.add(future)
+        future.add_done_callback(self._waiting.discard)
+        return future
+
+    def _queue(self) -> SimpleQueue[Callable[[], None] | None]:
+        if self._closed:
+            raise ValueError(f"the lane {self._name} is closed")
+        if self._work is None:
+            self._work = SimpleQueue()
+            # A daemon: an interpreter that ends waits for other threads, and this one may hang in the kernel.
+            Thread(target=_serve, args=(self._work,), name=self._name, daemon=True).start()
+        return self._work
+
+
+def _serve(queue: SimpleQueue[Callable[[], None] | None]) -> None:
+    """The thread: one call after the other, to the end."""
+    while (work := queue.get()) is not None:
+        work()
+
+
+def _settled(future: asyncio.Future[Result], result: Result) -> None:
+    if not future.done():
+        future.set_result(result)
+
+
+def _failed(future: asyncio.Future[Any], error: BaseException) -> None:
+    if not future.done():
+        future.set_exception(error)
+
+
+def _seen(future: asyncio.Future[Any]) -> None:
+    """Nobody asks any more; asyncio need not report the exception as never retrieved."""
+    if not future.cancelled():
+        future.exception()

@@ -1,0 +1,77 @@
+"""What devices give: readings and frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Quality(StrEnum):
+    """How far a reading may be trusted. STALE: not confirmed in this poll. BAD: no measurement at all."""
+
+    GOOD = "good"
+    STALE = "stale"
+    BAD = "bad"
+
+
+# Why a reading is BAD: "wire", the poll failed or its reply was garbled, and the device may be all right; "device", the
+# device itself says that it has no measurement (sensor break, converter error, out of range); "" when that is unknown.
+Cause = Literal["", "wire", "device"]
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One measured value. `value` is NaN exactly when `quality` is BAD; `reason` then says why, `cause` who says so.
+
+    `channel` is "device.quantity" (`thermometers.air`), `unit` as in the file formats (degC, %, mm, deg, mA,
+    1 for a flag or count), `time_ns` ns since the epoch on the stand's clock.
+    """
+
+    channel: str
+    value: float
+    unit: str
+    time_ns: int
+    quality: Quality = Quality.GOOD
+    reason: str = ""
+    cause: Cause = ""
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.value) != (self.quality is Quality.BAD):
+            raise ValueError(
+                f"{self.channel}: a reading is NaN exactly when it is BAD, not {self.value} {self.quality}"
+            )
+
+
+def bad_reading(channel: str, unit: str, time_ns: int, reason: str, cause: Cause = "device") -> Reading:
+    """A BAD reading: value NaN, with the reason."""
+    return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason, cause)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image and what belongs to it.
+
+    image: uint8 or uint16, shape (height, width), [row, column], not to be modified. time_ns: middle of the exposure
+    on the stand's clock. camera_degC: the camera's own temperature, NaN when it has none or could not be read.
+    block_id: own 64-bit count of frames of this device since it was opened, gaps included. camera_ticks: the
+    camera's own time stamp, ns. dropped: frames lost since the previous one. step_id: the plan's step that asked
+    for it, "" when none did. windows: x, y, width, height of the parts of the image that were recorded, px, shape
+    (n, 4), the rest is filled; None when the whole image is there.
+    """
+
+    channel: str
+    image: NDArray[np.uint8] | NDArray[np.uint16]
+    time_ns: int
+    exposure_s: float
+    gain_dB: float
+    camera_degC: float
+    block_id: int
+    camera_ticks: int
+    dropped: int = 0
+    step_id: str = ""
+    windows: NDArray[np.int32] | None = None

@@ -1,0 +1,302 @@
+"""Image -> identified marker centres with covariance and flags.
+
+    detection = detect(image, target)                         # first frame: search, identify, fit
+    detection = detect(image, target, previous=detection)     # next frames: fit from the frame before
+
+Pixels: integer coordinates are pixel centres, (0, 0) is the first one, x to the right, y down; arrays [row, column].
+The centre is that of the ellipse in the image. For a tilted target this is not the image of the disc's centre (about
+40 mpx for 8 mm discs at 1 m and 30 deg); the difference is constant while only the temperature changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from markers.bootstrap import Candidates, disc_sizes_px, find_candidates
+from markers.edge_fit import EdgeFit, Flag, fit_edges
+from markers.edge_model import B0, F0, M11, M12, M22, SIGMA, EdgeState
+from markers.expected import expected_edges, implied_edges
+from markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px
+from markers.light import under_common_light
+from markers.noise import Image, Noise
+from markers.refit import refit_edges
+from markers.target import Target
+
+__all__ = [
+    "Detection",
+    "DetectionError",
+    "Flag",
+    "Image",
+    "Noise",
+    "detect",
+    "grey_image",
+    "nothing_found",
+]
+
+Float = NDArray[np.float64]
+
+_POOR_CHI = 1.25
+_POOR_MISFIT = 1.6
+"""Of 36 sectors less the numbers of the ellipse, or of a plane: chance reaches it once in a million markers."""
+_LEAST_CONTRAST_SIGMA = 5.0
+_SIZE_TOLERANCE = 1.35
+_PLACE_TOLERANCE_PITCH = 0.2
+_TRACKED_PART = 0.9
+_TRACKED_STEP_PX = 5.0
+_GLANCE_BLURS = 3.0
+_GLANCE_CONTRAST = 0.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """The N markers of a target in one image, marker n at index n - 1.
+
+    centres_px: (N, 2) float64 (x, y), NaN without a centre. covariance_px2: (N, 2, 2), NaN likewise. flags: (N,) uint8
+    of Flag, 0 when nothing is wrong. chi: (N,), residual over expected noise; 1 is right, NaN without a centre.
+    homography: (3, 3), target mm -> px. state: the fitted edges, the start of the next frame.
+    """
+
+    centres_px: Float
+    covariance_px2: Float
+    flags: NDArray[np.uint8]
+    chi: Float
+    homography: Float
+    state: EdgeState
+
+    @property
+    def found(self) -> int:
+        """How many markers have a centre."""
+        return int(np.isfinite(self.centres_px[:, 0]).sum())
+
+
+def _unwatched(part: float) -> None:
+    """Nobody watches."""
+
+
+def detect(
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    target: Target,
+    previous: Detection | None = None,
+    noise: Noise | None = None,
+    watch: Callable[[float], None] = _unwatched,
+) -> Detection:
+    """The target's markers in a grey (height, width) or colour (height, width, 3; B G R) image, which is only read.
+
+    previous: the frame before, for speed and to keep the orientation; when the target has moved too far it is searched
+    for again. noise: the camera's; without it covariances come from the residuals, and chi is relative to this image's
+    median marker. watch: gets the part of a search that is done, 0 to 1. Raises DetectionError when the target cannot
+    be identified beyond doubt.
+    """
+    grey = grey_image(image)
+    if previous is not None:
+        if len(previous.flags) != target.count:
+            raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
+        if _still_there(grey, previous):
+            with suppress(DetectionError):
+                tracked = _fit(grey, target, previous.state, noise)
+                if tracked is not None and _has_followed(tracked, previous):
+                    return tracked
+    return _search(grey, target, None if previous is None else previous.homography, noise, watch)
+
+
+def nothing_found(target: Target) -> Detection:
+    """All markers missing: what an image without the target has instead of a detection."""
+    count = target.count
+    return Detection(
+        centres_px=np.full((count, 2), np.nan),
+        covariance_px2=np.full((count, 2, 2), np.nan),
+        flags=np.full(count, Flag.MISSING, np.uint8),
+        chi=np.full(count, np.nan),
+        homography=np.full((3, 3), np.nan),
+        state=EdgeState(np.full((count, 12), np.nan), np.full(count, np.nan)),
+    )
+
+
+def grey_image(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:
+    """The image itself when it is grey, else its luminance; raises ValueError for other shapes and types."""
+    if image.dtype.name not in ("uint8", "uint16") or image.size == 0:
+        raise ValueError(f"an image is uint8 or uint16 and not empty, not {image.dtype} {image.shape}")
+    if image.ndim == 2:
+        return image
+    if image.ndim == 3 and image.shape[2] == 1:
+        return image[:, :, 0]
+    if image.ndim == 3 and image.shape[2] in (3, 4):
+        code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+        return cv2.cvtColor(image, code)  # pyright: ignore[reportReturnType] - keeps the type of its input
+    raise ValueError(f"an image has the shape (height, width) or (height, width, 3), not {image.shape}")
+
+
+def _search(
+    grey: Image, target: Target, previous: Float | None, noise: Noise | None, watch: Callable[[float], None]
+) -> Detection:
+    """Look for the target at every scale it may have; the failure that came nearest is the one reported."""
+    nearest: DetectionError | None = None
+    sizes_px = list(disc_sizes_px(target, grey.shape))
+    for tried, size_px in enumerate(sizes_px):
+        watch(tried / len(sizes_px))
+        candidates = find_candidates(grey, target, size_px)
+        try:
+            identified = identify(candidates, target, previous)
+            return _first_fit(grey, target, candidates, identified, noise)
+        except DetectionError as error:
+            if nearest is None or error.found > nearest.found:
+                nearest = error
+    raise nearest or DetectionError(
+        f"an image of {grey.shape[1]} x {grey.shape[0]} pixels is too small for {target.columns}x{target.rows} markers"
+    )
+
+
+def _first_fit(
+    grey: Image, target: Target, candidates: Candidates, identified: Identified, noise: Noise | None
+) -> Detection:
+    """Fit from the homography's ellipses, put where the candidates are and scaled to the size they have."""
+    start = expected_edges(identified.homography, target)
+    seen = identified.candidate >= 0
+    areas = candidates.areas_px2[identified.candidate[seen]]
+    scale = float(np.median(np.sqrt(areas / np.pi) / start.radii_px()[seen]))
+    start.parameters[seen, :2] = candidates.centres_px[identified.candidate[seen]]
+    start = EdgeState(start.parameters, start.scale_px * scale)
+    detection = _fit(grey, target, start, noise)
+    if detection is None:
+        raise DetectionError(
+            f"found {seen.sum()} of {target.count} markers of {target.name}, but too few have a clean edge",
+            int(seen.sum()),
+        )
+    return detection
+
+
+def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> Detection | None:
+    """The fit from `start`, judged; None when fewer markers than the target demands have a credible centre."""
+    model = noise or Noise()
+    fit = fit_edges(grey, start, model, _reach(target))
+    good = np.isfinite(fit.chi) & _has_contrast(fit.state, target, model)
+    if good.sum() < target.least_markers:
+        return None
+    homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
+    good &= _in_its_place(fit.state, homography, target, good) & _within_image(fit.state, grey)
+    if good.sum() < target.least_markers:
+        return None
+    homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
+    detection = _judged(fit, good, homography, target, relative=noise is None)
+    return _refitted(detection, fit, grey, target, model)
+
+
+def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Target, relative: bool) -> Detection:
+    """The detection of a fit whose markers are `good` or missing; missing ones are expected where the others say."""
+    chi, misfit = np.where(good, fit.chi, np.nan), np.where(good, fit.misfit, np.nan)
+    usual = max(float(np.nanmedian(chi)), 1e-9)
+    # A print or a lens that the model does not know makes all markers worse; a bad one is worse than the others.
+    poor = (chi > _POOR_CHI * (usual if relative else max(usual, 1.0))) | (
+        misfit > _POOR_MISFIT * max(float(np.nanmedian(misfit)), usual if relative else 1.0)
+    )
+    if relative:
+        chi = chi / usual
+    flags = np.where(good, fit.flags, fit.flags | Flag.MISSING) | np.where(poor, Flag.POOR_FIT, 0)
+    expected = expected_edges(homography, target)
+    scale = np.median(fit.state.radii_px()[good] / expected.radii_px()[good])
+    parameters = expected.parameters
+    parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
+    centres, covariance = under_common_light(fit, good & ~poor)
+    return Detection(
+        centres_px=np.where(good[:, None], centres, np.nan),
+        covariance_px2=np.where(good[:, None, None], covariance, np.nan),
+        flags=flags.astype(np.uint8),
+        chi=chi,
+        homography=homography,
+        state=EdgeState(
+            np.where(good[:, None], fit.state.parameters, parameters),
+            np.where(good, fit.state.scale_px, expected.scale_px * scale),
+        ),
+    )
+
+
+def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, noise: Noise) -> Detection:
+    """The detection with its poor markers measured again from what looks clean of them, where that is enough."""
+    clean = detection.flags == 0
+    poor = np.flatnonzero((detection.flags & (Flag.POOR_FIT | Flag.BORDER | Flag.MISSING)) == Flag.POOR_FIT)
+    implied = implied_edges(detection.state, detection.homography, target, clean, poor)
+    if implied is None:
+        return detection
+    usual = float(np.median(fit.chi[clean]))
+    scaled = Noise(noise.floor_DN2 * usual**2, noise.slope_DN * usual**2)
+    patience = float(np.median(fit.misfit[clean])) / usual
+    again = refit_edges(grey, implied.state, implied.spread, scaled, _reach(target)[poor], patience)
+    credible = (again.chi < _POOR_CHI) & _has_contrast(again.state, target, scaled)
+    which = poor[credible]
+    for whole, part in (
+        (detection.centres_px, again.state.centres_px()),
+        (detection.covariance_px2, again.covariance_px2),
+        (detection.chi, again.chi),
+        (detection.state.parameters, again.state.parameters),
+        (detection.state.scale_px, again.state.scale_px),
+    ):
+        whole[which] = part[credible]
+    detection.flags[which] ^= np.uint8(Flag.POOR_FIT | Flag.REFITTED)
+    return detection
+
+
+def _reach(target: Target) -> Float:
+    """How many radii from its centre a marker's surroundings end: half way to the nearest outline."""
+    centres, radii = target.coordinates_mm(), target.diameters_mm() / 2
+    gap = np.linalg.norm(centres[:, None] - centres[None], axis=2) - radii[:, None] - radii[None]
+    np.fill_diagonal(gap, np.inf)
+    return 1 + gap.min(axis=1) / (2 * radii)
+
+
+def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.bool_]:
+    """Whether the discs stand out of the ground, in the right direction."""
+    sign = 1 if target.polarity == "dark" else -1
+    level = np.maximum(state.parameters[:, B0], state.parameters[:, F0])
+    return sign * state.contrast_DN() > _LEAST_CONTRAST_SIGMA * np.sqrt(noise.variance_DN2(level))
+
+
+def _in_its_place(state: EdgeState, homography: Float, target: Target, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether each ellipse has about the place and the size that the other markers imply."""
+    expected = expected_edges(homography, target)
+    known = np.where(good[:, None], state.centres_px(), np.nan)
+    off = np.linalg.norm(state.centres_px() - expected_px(target.coordinates_mm(), known, homography), axis=1)
+    ratio = state.radii_px() / expected.radii_px()
+    ratio = ratio / np.median(ratio[good])
+    near = off < _PLACE_TOLERANCE_PITCH * pitch_px(homography, target)
+    return near & (ratio < _SIZE_TOLERANCE) & (ratio > 1 / _SIZE_TOLERANCE)
+
+
+def _within_image(state: EdgeState, grey: Image) -> NDArray[np.bool_]:
+    """Whether the whole outline is in the image, give or take its blur."""
+    height, width = grey.shape
+    margin = state.half_extents_px() - state.parameters[:, SIGMA, None]
+    centres = state.centres_px()
+    return np.all((centres - margin >= -0.5) & (centres + margin <= [width - 0.5, height - 0.5]), axis=1)
+
+
+def _still_there(grey: Image, before: Detection) -> bool:
+    """Whether the markers still look as they did: a glance at 16 pixels on either side of each outline. Much cheaper
+    than a fit that ends nowhere because the target has moved.
+    """
+    state, p = before.state, before.state.parameters
+    angle = np.arange(16) * (2 * np.pi / 16)
+    towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    bend = p[:, M11, None] * towards[:, 0] ** 2 + p[:, M22, None] * towards[:, 1] ** 2
+    radius = state.scale_px[:, None] / np.sqrt(bend + 2 * p[:, M12, None] * towards[:, 0] * towards[:, 1])
+    margin = np.minimum(_GLANCE_BLURS * p[:, SIGMA, None], 0.6 * radius)
+    limits = np.array(grey.shape[::-1]) - 1
+    levels: list[Float] = []
+    for along in (radius + margin, radius - margin):
+        place = np.rint(p[:, None, :2] + along[:, :, None] * towards).astype(int)
+        column, row = np.moveaxis(np.clip(place, 0, limits), 2, 0)
+        levels.append(grey[row, column].mean(axis=1))
+    unchanged = (levels[0] - levels[1]) / state.contrast_DN() > _GLANCE_CONTRAST
+    seen = np.isfinite(before.chi)
+    return bool(unchanged[seen].mean() >= _TRACKED_PART)
+
+
+def _has_followed(now: Detection, before: Detection) -> bool:
+    """Whether tracking stayed on the same markers: about as many, and none far from where it was."""
+    moved = np.linalg.norm(now.centres_px - before.centres_px, axis=1)
+    return bool(now.found >= _TRACKED_PART * before.found and np.nanmax(moved) < _TRACKED_STEP_PX)

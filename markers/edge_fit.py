@@ -1,0 +1,136 @@
+"""Sub-pixel centres of round markers: the edge model is fitted to the pixels along each outline.
+
+Gauss-Newton with the weights of the noise model, one marker after the other, in machine code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+from markers import edge_model, newton, pixels, sectors
+from markers.compiled import digest, entry
+from markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, Variance
+from markers.newton import (
+    BAND_SIGMA,
+    DIVERGED,
+    LEAST_BAND_PX,
+    SETTLED,
+    TOO_FEW,
+    Work,
+    inverse,
+    no_belief,
+    settle,
+)
+from markers.noise import Image, Noise, full_scale_DN
+from markers.pixels import Pixels, empty_pixels
+from markers.sectors import misfit
+
+_SATURATED_PART = 0.1
+
+
+class Flag(IntFlag):
+    """What is wrong with a marker; 0 is nothing. MISSING: it has no centre; other flags may say why."""
+
+    OK = 0
+    POOR_FIT = 1
+    """The residuals are larger than the noise explains."""
+    SATURATED = 2
+    """More than a tenth of the band was saturated and left out."""
+    BORDER = 4
+    """The surroundings, or the disc itself, reach beyond the image."""
+    TOO_FEW = 8
+    """Fewer than 5 usable pixels per parameter."""
+    DIVERGED = 16
+    """No ellipse explains the pixels."""
+    MISSING = 32
+    """No centre: nothing like the marker was seen in its place, or not enough of it."""
+    REFITTED = 64
+    """A part of it does not look like the others; the centre and its covariance come from the rest (refit.py)."""
+
+
+_BORDER, _SATURATED, _TOO_FEW, _DIVERGED = map(int, (Flag.BORDER, Flag.SATURATED, Flag.TOO_FEW, Flag.DIVERGED))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeFit:
+    """state: what was fitted. covariance: of its parameters (N, 12, 12), noise times chi^2. chi: (N,), 1 when the noise
+    model explains the residuals; misfit: (N,), the same sector by sector (sectors.py). flags: (N,) uint8 of Flag.
+    Markers that failed keep their start values, with NaN covariance, chi and misfit.
+    """
+
+    state: EdgeState
+    covariance: Float
+    chi: Float
+    misfit: Float
+    flags: NDArray[np.uint8]
+
+    @property
+    def covariance_px2(self) -> Float:
+        """Of the centres (N, 2, 2)."""
+        return self.covariance[:, :2, :2]
+
+
+def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float) -> EdgeFit:
+    """Fit every marker of `start`. `reach` (N,): how many radii from the centre a marker's pixels may lie, so that its
+    band ends half way to the neighbours. The image is only read. Raises ValueError for images that are not contiguous.
+    """
+    count = len(start.scale_px)
+    parameters = np.ascontiguousarray(start.parameters).copy()
+    covariance, quality, flags = (
+        np.empty((count, PARAMETERS, PARAMETERS)),
+        np.empty((count, 2)),
+        np.empty(count, np.uint8),
+    )
+    _fit_all(
+        np.ascontiguousarray(image), parameters, start.scale_px, np.asarray(reach, np.float64),
+        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
+        covariance, quality, flags,
+    )  # fmt: skip
+    return EdgeFit(EdgeState(parameters, start.scale_px), covariance, quality[:, 0], quality[:, 1], flags)
+
+
+def room(image: Image, start: EdgeState) -> int:
+    """Pixels of the largest marker with its band, when it turns out half as large again and six times as blurred."""
+    side = 3 * start.half_extents_px() + 12 * np.maximum(BAND_SIGMA * start.parameters[:, SIGMA, None], LEAST_BAND_PX)
+    return int(min(np.nanmax(np.prod(side + 3, axis=1), initial=1), image.size))
+
+
+def _compiled_fit(sources: str) -> Callable[..., None]:
+    @entry
+    def fit_all(
+        image: Image,
+        parameters: Float,
+        scale: Float,
+        reach: Float,
+        noise: Variance,
+        ceiling: int,
+        pixels: Pixels,
+        covariance: Float,
+        quality: Float,
+        flags: NDArray[np.uint8],
+    ) -> None:
+        """Fit each row of `parameters` in place; chi and misfit into `quality` (N, 2)."""
+        _ = sources
+        work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
+        belief = no_belief()
+        for n in range(len(scale)):
+            p = parameters[n].copy()
+            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)
+            flags[n] = _BORDER * outcome.cut + _SATURATED * (outcome.burnt > _SATURATED_PART * outcome.seen)
+            if outcome.status == SETTLED:
+                parameters[n] = p
+                covariance[n] = inverse(work) * outcome.variance
+                quality[n] = np.sqrt(outcome.variance), misfit(pixels, p)
+            else:
+                covariance[n], quality[n] = np.nan, np.nan
+                flags[n] += _TOO_FEW * (outcome.status == TOO_FEW) + _DIVERGED * (outcome.status == DIVERGED)
+
+    return fit_all
+
+
+_fit_all = _compiled_fit(digest(pixels, edge_model, newton, sectors))

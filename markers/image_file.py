@@ -1,0 +1,51 @@
+"""An image file as a grey array; its size is looked at before its pixels are."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.Image
+
+from foundation.image_limit import size_fault
+from markers.detection import DetectionError, Image, grey_image
+
+_NO_IMAGE = (OSError, ValueError, SyntaxError, LookupError, EOFError, OverflowError, struct.error)
+
+
+def read_image(path: Path) -> Image:
+    """A grey image (height, width) from a file, 8 or 16 bits; DetectionError when it cannot be read or is too large."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DetectionError(f"{path}: cannot be read ({error.strerror})") from error
+    fault = _fault(data)
+    if fault:
+        raise DetectionError(f"{path}: {fault}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise DetectionError(f"{path}: not an image, or damaged")
+    try:
+        return grey_image(image)  # pyright: ignore[reportArgumentType] - checked there
+    except ValueError as error:
+        raise DetectionError(f"{path}: {error}") from error
+
+
+def _fault(data: bytes) -> str:
+    """What its header says against reading it, "" when nothing."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow warns of what is below our limit
+            with PIL.Image.open(io.BytesIO(data)) as image:  # which decodes nothing yet
+                return f"{fault} (--max-megapixels)" if (fault := size_fault(*image.size)) else ""
+    except PIL.Image.DecompressionBombError:
+        return "claims far more pixels than any camera has"
+    except _NO_IMAGE:
+        return "not an image, or damaged"

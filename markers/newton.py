@@ -1,0 +1,297 @@
+"""Gauss-Newton on one marker: from a start to the parameters that explain its pixels best."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from markers.compiled import compiled
+from markers.edge_model import (
+    B0,
+    BX,
+    BY,
+    CX,
+    CY,
+    F0,
+    FX,
+    FY,
+    M11,
+    M12,
+    M22,
+    PARAMETERS,
+    SIGMA,
+    Float,
+    Variance,
+    normal_equations,
+)
+from markers.noise import Image
+from markers.pixels import SHARE, VALUE, Gathered, Limits, Pixels, U, V, gather
+from markers.sectors import SECTORS, Bools, set_aside
+
+BAND_SIGMA = 9.0
+"""Half width of the fitted band in blurs."""
+LEAST_BAND_PX = 3.5
+CORE_SIGMA = 5.0
+"""The blurs from the outline within which a pixel tells where it is; the density is 1e-5 of its maximum beyond."""
+_BAND_TOLERANCE = 0.05
+_MOVE_TOLERANCE_SIGMA = 0.25
+_SLOPES_FROM_PX = 6.0
+"""Below this radius a plane and the edge cannot be told apart: ground and disc are then constant."""
+_PIXELS_PER_PARAMETER = 5
+_FAR_PX = 1.0
+_CONVERGED_PX = 2e-3
+_GREATEST_STEP_PX = 3.0
+_GREATEST_BEND = 0.3
+_LEAST_SIGMA_PX = 0.1
+_LEAST_CONTRAST_SIGMA = 2.0
+_STEPS = 24
+_GATHERINGS = 12
+
+SETTLED, TOO_FEW, DIVERGED = range(3)
+
+
+class Outcome(NamedTuple):
+    """status: SETTLED or why not. variance: chi^2, the residuals' variance over the expected one. seen, burnt, cut: of
+    the last gathering."""
+
+    status: int
+    variance: float
+    seen: int
+    burnt: int
+    cut: bool
+
+
+class Work(NamedTuple):
+    """Room for one marker's J'WJ (12, 12) and J'We (12,)."""
+
+    normal: Float
+    right: Float
+
+
+class Belief(NamedTuple):
+    """What is known before looking: sectors `kept` (36,), the others are not looked at; m11, m12, m22 and sigma (4,),
+    with weights (4,), 1 / variance, 0 where nothing is known."""
+
+    kept: Bools
+    mean: Float
+    weight: Float
+
+
+@compiled
+def no_belief() -> Belief:
+    """All sectors count, and any shape is as likely as any other."""
+    return Belief(np.ones(SECTORS, np.bool_), np.zeros(4), np.zeros(4))
+
+
+@compiled
+def settle(
+    image: Image,
+    p: Float,
+    scale: float,
+    reach: float,
+    noise: Variance,
+    ceiling: int,
+    pixels: Pixels,
+    work: Work,
+    belief: Belief,
+) -> Outcome:
+    """Fit `p` (12,) to the image in place. The pixels are gathered again when the outline has left them or turned out
+    more blurred than it was thought to be, which also makes the result independent of the start."""
+    start, gathered_at = p.copy(), p.copy()
+    far = bool(np.isnan(p[B0]))
+    gathered = look(image, p, scale, band(p, scale, reach, far), ceiling, pixels, belief)
+    gatherings = 1
+    variance = np.nan
+    if far:
+        set_start_levels(pixels, p, scale)
+    fixed = mean_radius(p, scale) < _SLOPES_FROM_PX
+    free = PARAMETERS - 4 * fixed
+    for _ in range(_STEPS):
+        squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right)
+        if weights < _PIXELS_PER_PARAMETER * free:
+            return Outcome(TOO_FEW, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+        add_belief(work, p, belief)
+        if fixed:
+            hold_slopes(work)
+        variance = squares / (weights - free)
+        step = limited(newton_step(work), p, scale)
+        p += step
+        if not possible(p, noise) or strayed(start, p, scale, 1.5):
+            return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+        far = math.hypot(step[CX], step[CY]) > _FAR_PX
+        if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale):
+            gathered = look(image, p, scale, band(p, scale, reach, far), ceiling, pixels, belief)
+            gathered_at[:] = p
+            gatherings += 1
+            if gathered.seen < 0:
+                return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+        # g'd is what the step gains: less than a pixel's share once all twelve have settled.
+        elif math.hypot(step[CX], step[CY]) < _CONVERGED_PX and np.sum(work.right * step) < variance:
+            break
+    if strayed(start, p, scale, 1.0):
+        return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+    return Outcome(SETTLED, variance, gathered.seen, gathered.burnt, gathered.cut)
+
+
+@compiled
+def look(
+    image: Image, p: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels, belief: Belief
+) -> Gathered:
+    """Gather the pixels round the outline of `p`, without those of sectors that are not kept."""
+    gathered = gather(image, p[:2], p[M11:SIGMA], scale, limits, ceiling, pixels)
+    if not belief.kept.all():
+        set_aside(pixels, p, belief.kept)
+    return gathered
+
+
+@compiled
+def add_belief(work: Work, p: Float, belief: Belief) -> None:
+    """Pull the shape and the blur to what they are believed to be."""
+    for i in range(4):
+        work.normal[M11 + i, M11 + i] += belief.weight[i]
+        work.right[M11 + i] += belief.weight[i] * (belief.mean[i] - p[M11 + i])
+
+
+@compiled
+def band(p: Float, scale: float, reach: float, far: bool) -> Limits:
+    """The limits of the pixels that are looked at, in F, along the shorter axis; the longer one has more. far: the
+    outline is not known well enough to say what is far from it, so that all belong to the core."""
+    least = mean_radius(p, scale) ** 2 / long_axis(p, scale)
+    width = max(BAND_SIGMA * p[SIGMA], LEAST_BAND_PX) / least
+    core = width if far else min(CORE_SIGMA * p[SIGMA] / least, width)
+    return Limits(max(1 - width, 0.0), max(1 - core, 0.0), 1 + core, min(1 + width, reach))
+
+
+@compiled
+def mean_radius(p: Float, scale: float) -> float:
+    """Geometric mean of the semi-axes, px."""
+    return scale / (p[M11] * p[M22] - p[M12] * p[M12]) ** 0.25
+
+
+@compiled
+def long_axis(p: Float, scale: float) -> float:
+    """The longer semi-axis, px."""
+    half = 0.5 * (p[M11] + p[M22])
+    return scale / math.sqrt(half - math.sqrt(max(half * half - p[M11] * p[M22] + p[M12] * p[M12], 0.0)))
+
+
+@compiled
+def set_start_levels(pixels: Pixels, p: Float, scale: float) -> None:
+    """Set the levels to the means on either side of the outline."""
+    sums, counts = np.zeros(2), np.full(2, 1e-12)
+    for region in range(3):
+        table = pixels.table[region]
+        for slot in range(pixels.counts[region]):
+            x, y = (table[U, slot] - p[CX]) / scale, (table[V, slot] - p[CY]) / scale
+            side = 1 if p[M11] * x * x + 2 * p[M12] * x * y + p[M22] * y * y > 1 else 0
+            sums[side] += table[SHARE, slot] * table[VALUE, slot]
+            counts[side] += table[SHARE, slot]
+    p[B0:] = 0
+    p[F0], p[B0] = sums / counts
+
+
+@compiled
+def hold_slopes(work: Work) -> None:
+    """Make the slopes of the levels stay as they are."""
+    for i in (BX, BY, FX, FY):
+        work.normal[i, :] = 0
+        work.normal[:, i] = 0
+        work.normal[i, i] = 1
+        work.right[i] = 0
+
+
+@compiled
+def newton_step(work: Work) -> Float:
+    """The step that solves J'WJ step = J'We, by the Cholesky decomposition of the matrix with a unit diagonal."""
+    factor, size = _cholesky(work.normal)
+    step = work.right.copy()
+    _solve(factor, size, step)
+    return step
+
+
+@compiled
+def inverse(work: Work) -> Float:
+    """The inverse of J'WJ (12, 12)."""
+    factor, size = _cholesky(work.normal)
+    columns = np.eye(PARAMETERS)
+    for i in range(PARAMETERS):
+        _solve(factor, size, columns[i])
+    return columns
+
+
+@compiled
+def _cholesky(normal: Float) -> tuple[Float, Float]:
+    """Lower factor of `normal` divided by `size` on both sides, and that size, the root of the diagonal. 1e-9 on the
+    diagonal keeps parameters that nothing is known about where they are."""
+    size, factor = np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
+    for i in range(PARAMETERS):
+        size[i] = math.sqrt(normal[i, i] + 1e-12)
+    for i in range(PARAMETERS):
+        for j in range(i + 1):
+            rest = normal[i, j] / (size[i] * size[j])
+            for k in range(j):
+                rest -= factor[i, k] * factor[j, k]
+            factor[i, j] = rest / factor[j, j] if j < i else math.sqrt(max(rest + 1e-9, 1e-12))
+    return factor, size
+
+
+@compiled
+def _solve(factor: Float, size: Float, right: Float) -> None:
+    """Replace `right` by the solution of the equations whose factor and size are given."""
+    for i in range(PARAMETERS):
+        right[i] /= size[i]
+        for k in range(i):
+            right[i] -= factor[i, k] * right[k]
+        right[i] /= factor[i, i]
+    for i in range(PARAMETERS - 1, -1, -1):
+        for k in range(i + 1, PARAMETERS):
+            right[i] -= factor[k, i] * right[k]
+        right[i] /= factor[i, i]
+    for i in range(PARAMETERS):
+        right[i] /= size[i]
+
+
+@compiled
+def limited(step: Float, p: Float, scale: float) -> Float:
+    """The step, shortened where it would throw the centre or the outline too far, or the blur."""
+    far = math.hypot(step[CX], step[CY]) / min(_GREATEST_STEP_PX, 0.5 * scale)
+    bent = np.abs(step[M11:SIGMA]).max() / (_GREATEST_BEND * 0.5 * (p[M11] + p[M22]))
+    step = step / max(1.0, far, bent)
+    step[SIGMA] = min(max(step[SIGMA], -0.4 * p[SIGMA]), 0.5 * p[SIGMA])
+    return step
+
+
+@compiled
+def possible(p: Float, noise: Variance) -> bool:
+    """Whether the parameters are those of an ellipse with an edge that stands out of the noise."""
+    edge = abs(p[B0] - p[F0]) > _LEAST_CONTRAST_SIGMA * math.sqrt(noise[0] + noise[1] * max(p[B0], 0.0))
+    ellipse = p[M11] > 0 and p[M11] * p[M22] > p[M12] * p[M12]
+    return bool(np.isfinite(p).all() and ellipse and edge and p[SIGMA] >= _LEAST_SIGMA_PX)
+
+
+@compiled
+def strayed(start: Float, p: Float, scale: float, radii: float) -> bool:
+    """Whether it is more than some radii from where it began, or more than twice or less than half the size."""
+    before, after = half_extents(start, scale), half_extents(p, scale)
+    ratio_x, ratio_y = after[0] / before[0], after[1] / before[1]
+    moved = math.hypot(p[CX] - start[CX], p[CY] - start[CY]) > radii * mean_radius(start, scale)
+    return moved or max(ratio_x, ratio_y) > 2 or min(ratio_x, ratio_y) < 0.5
+
+
+@compiled
+def moved_off(gathered_at: Float, p: Float, scale: float) -> bool:
+    """Whether the pixels gathered for one outline are not the right ones for another."""
+    before, after = half_extents(gathered_at, scale), half_extents(p, scale)
+    moved = math.hypot(p[CX] - gathered_at[CX], p[CY] - gathered_at[CY])
+    grown = max(abs(after[0] - before[0]), abs(after[1] - before[1]))
+    widths = max(BAND_SIGMA * gathered_at[SIGMA], LEAST_BAND_PX), max(BAND_SIGMA * p[SIGMA], LEAST_BAND_PX)
+    return abs(widths[1] - widths[0]) > _BAND_TOLERANCE * widths[0] or moved + grown > _MOVE_TOLERANCE_SIGMA * p[SIGMA]
+
+
+@compiled
+def half_extents(p: Float, scale: float) -> tuple[float, float]:
+    """Half width and half height of the ellipse's bounding box, px."""
+    determinant = p[M11] * p[M22] - p[M12] * p[M12]
+    return scale * math.sqrt(p[M22] / determinant), scale * math.sqrt(p[M11] / determinant)

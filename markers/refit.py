@@ -1,0 +1,134 @@
+"""Markers under glare or partly covered: fitted again from what is left of their outline.
+
+The disc is looked at in 36 sectors. Those that do not look like the model are dropped, worst first, until the rest
+agrees with it. What the other markers say about the place, the shape and the blur holds the fit together meanwhile:
+without it a covered part bends the ellipse to explain itself. Weights that doubt single pixels (Tukey) are not used:
+an occluder makes a clean contour of its own, which they follow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from markers import edge_model, newton, pixels, sectors
+from markers.compiled import compiled, digest, entry
+from markers.edge_fit import room
+from markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
+from markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
+from markers.noise import Image, Noise, full_scale_DN
+from markers.pixels import Pixels, empty_pixels
+from markers.sectors import SECTORS, Bools, sector_misfits
+
+_LEAST_SECTORS = 13
+"""35 %: with fewer the centre hangs on the shape that the other markers have."""
+_GREATEST_MISFIT = 4.0
+_STRANGE = 3.0
+_BEFORE_OTHERS = 0.5
+"""Sectors this much as bad as the worst go together with it; the others may only suffer from the worst."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refit:
+    """state: what was fitted. covariance_px2: (N, 2, 2), with what the last sectors that were dropped moved the
+    centre by. chi: (N,) of the sectors kept. NaN, and the start values, where too little is left.
+    """
+
+    state: EdgeState
+    covariance_px2: Float
+    chi: Float
+
+
+def refit_edges(image: Image, start: EdgeState, spread: Float, noise: Noise, reach: Float, patience: float) -> Refit:
+    """Fit markers from the ellipses `start` that the others imply. spread: (N, 4), standard deviations of their m11,
+    m12, m22 and sigma. noise: such that clean markers have chi 1. patience: how much more than noise clean markers'
+    outlines deviate from ellipses, 1 for perfect ones."""
+    count = len(start.scale_px)
+    parameters = np.ascontiguousarray(start.parameters).copy()
+    covariance, chi = np.empty((count, 2, 2)), np.empty(count)
+    _refit_all(
+        np.ascontiguousarray(image), parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
+        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
+        _GREATEST_MISFIT * max(patience, 1.0), covariance, chi,
+    )  # fmt: skip
+    return Refit(EdgeState(parameters, start.scale_px), covariance, chi)
+
+
+@compiled
+def drop_strangers(kept: Bools, misfits: Float, greatest: float) -> None:
+    """Drop what stands out before anything is fitted: a sheet over a third of the disc tilts both planes so much that
+    good sectors look as bad as covered ones. Levels that the other markers get wrong are wrong everywhere."""
+    kept &= misfits <= max(greatest, _STRANGE * np.median(misfits))
+
+
+@compiled
+def drop_worst(kept: Bools, misfits: Float, greatest: float) -> bool:
+    """Whether there were sectors to drop: the worst one above `greatest`, and those nearly as bad."""
+    worst = np.max(misfits * kept)
+    if worst <= greatest:
+        return False
+    for place in range(SECTORS):
+        if misfits[place] > max(greatest, _BEFORE_OTHERS * worst):
+            kept[place] = False
+    return True
+
+
+@compiled
+def drop_neighbours(kept: Bools) -> None:
+    """Drop the sectors beside dropped ones: glare has no edge, and what is left of it looks like a slope."""
+    before = kept.copy()
+    for place in range(SECTORS):
+        kept[place] = before[place - 1] and before[place] and before[(place + 1) % SECTORS]
+
+
+def _compiled_refit(sources: str) -> Callable[..., None]:
+    @entry
+    def refit_all(
+        image: Image,
+        parameters: Float,
+        scale: Float,
+        reach: Float,
+        weight: Float,
+        noise: Variance,
+        ceiling: int,
+        pixels: Pixels,
+        greatest: float,
+        covariance: Float,
+        chi: Float,
+    ) -> None:
+        """Fit each row of `parameters` in place."""
+        _ = sources
+        work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
+        for n in range(len(scale)):
+            p = parameters[n].copy()
+            covariance[n], chi[n] = np.nan, np.nan
+            belief = Belief(np.ones(SECTORS, np.bool_), p[M11 : SIGMA + 1].copy(), weight[n])
+            look(image, p, scale[n], band(p, scale[n], reach[n], False), ceiling, pixels, belief)
+            normal_equations(pixels, p, scale[n], noise, work.normal, work.right)
+            drop_strangers(belief.kept, sector_misfits(pixels, p), greatest)
+            searching = True
+            while searching and belief.kept.sum() >= _LEAST_SECTORS:
+                outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)
+                if outcome.status != SETTLED:
+                    break
+                searching = drop_worst(belief.kept, sector_misfits(pixels, p), greatest)
+            if searching:
+                continue
+            before = p[:2].copy()
+            drop_neighbours(belief.kept)
+            if belief.kept.sum() < _LEAST_SECTORS:
+                continue
+            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)
+            if outcome.status == SETTLED:
+                moved = p[:2] - before
+                parameters[n] = p
+                covariance[n] = inverse(work)[:2, :2] * max(outcome.variance, 1.0) + np.outer(moved, moved)
+                chi[n] = math.sqrt(outcome.variance)
+
+    return refit_all
+
+
+_refit_all = _compiled_refit(digest(pixels, edge_model, newton, sectors))

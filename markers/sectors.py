@@ -1,0 +1,88 @@
+"""The marker seen in angular sectors: where it does not look like the model fitted to it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from markers.compiled import compiled
+from markers.edge_model import CX, CY, Float
+from markers.pixels import CORE, RESIDUAL, RISE, SHARE, Pixels, U, V
+
+Bools = NDArray[np.bool_]
+
+SECTORS = 36
+_QUADRANT = SECTORS // 4
+
+
+@compiled
+def sector(p: Float, u: float, v: float) -> int:
+    """The sector (0..35) of a pixel. By |y| / (|x| + |y|) within a quadrant: no arc tangent, and nearly even."""
+    x, y = u - p[CX], v - p[CY]
+    part = min(int(_QUADRANT * abs(y) / (abs(x) + abs(y) + 1e-12)), _QUADRANT - 1)
+    if y >= 0:
+        return part if x >= 0 else 2 * _QUADRANT - 1 - part
+    return SECTORS - 1 - part if x >= 0 else 2 * _QUADRANT + part
+
+
+@compiled
+def set_aside(pixels: Pixels, p: Float, kept: Bools) -> None:
+    """Give the pixels of sectors that are not `kept` (36,) the share 0."""
+    for region in range(3):
+        table = pixels.table[region]
+        for k in range(pixels.counts[region]):
+            if not kept[sector(p, table[U, k], table[V, k])]:
+                table[SHARE, k] = 0.0
+
+
+@compiled
+def deviations(pixels: Pixels, p: Float) -> Float:
+    """What each sector deviates from the model, in standard deviations, (3, 36): its outline (CORE), its levels
+    further out and further in (GROUND, DISC). NaN where there are no pixels."""
+    moment, weight = np.zeros((3, SECTORS)), np.zeros((3, SECTORS))
+    for region in range(3):
+        table = pixels.table[region]
+        for k in range(pixels.counts[region]):
+            place = sector(p, table[U, k], table[V, k])
+            slope = table[RISE, k] if region == CORE else 1.0
+            moment[region, place] += table[SHARE, k] * slope * table[RESIDUAL, k]
+            weight[region, place] += table[SHARE, k] * slope * slope
+    return np.where(weight > 0, moment, np.nan) / np.sqrt(weight)
+
+
+@compiled
+def misfit(pixels: Pixels, p: Float) -> float:
+    """Root mean square over the sectors of the worse of their outlines and their two levels; 1 when the noise explains
+    them. Something that hides a part of the marker, or shines on it, shows here long before it shows in the residuals
+    of all pixels together."""
+    return math.sqrt(max([_mean(row * row) for row in deviations(pixels, p)]))
+
+
+@compiled
+def sector_misfits(pixels: Pixels, p: Float) -> Float:
+    """How unlike the model each sector (36,) is, in standard deviations: the largest of its deviations, and its
+    squared residuals altogether. 0 where no pixel counts."""
+    squares, count = np.zeros(SECTORS), np.zeros(SECTORS)
+    for region in range(3):
+        table = pixels.table[region]
+        for k in range(pixels.counts[region]):
+            place = sector(p, table[U, k], table[V, k])
+            squares[place] += table[SHARE, k] * table[RESIDUAL, k] * table[RESIDUAL, k]
+            count[place] += table[SHARE, k]
+    misfits = np.zeros(SECTORS)
+    for row in np.abs(deviations(pixels, p)):
+        misfits = np.fmax(misfits, row)
+    return np.fmax(misfits, (squares - count) / np.sqrt(2 * count))
+
+
+@compiled
+def _mean(values: Float) -> float:
+    """Of those that are not NaN, 1 when all are."""
+    total, count = 0.0, 0
+    for value in values:
+        if not np.isnan(value):
+            total += value
+            count += 1
+    return total / count if count > 0 else 1.0

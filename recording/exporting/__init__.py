@@ -1,0 +1,1 @@
+"""Sessions as other files, other times, or parts of themselves."""

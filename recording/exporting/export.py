@@ -1,0 +1,274 @@
+"""A session as files that any program opens: PNG, text, CSV or Parquet.
+
+    OUT/README.txt                   what is where, and how cells are to be read
+    OUT/session.json                 the metadata
+    OUT/attachments/config.yaml ...  the attached files
+    OUT/steps.csv, OUT/events.csv
+    OUT/telemetry/chamber_state.csv  one table per topic (or .parquet), and camera_meta: the descriptions of all frames
+    OUT/frames/000001.png, .txt      each frame in order of time, and its temperatures: "each captured frame also had
+                                     the temperature information (as a separate file saved with the frame)"
+                                     (Adamczyk et al., Sensors 2018, 18, 3685, section 2)
+    OUT/frames/index.csv             all those texts as one table
+
+An empty cell is what a device does not measure; nan is what it could not measure, and `remarks` then says why.
+
+Each instant is there twice: `time_ns` as it was recorded, on the stand's clock, which never steps and which durations
+are to be computed of; `time_utc` with the offset that the host's system clock had against it then (utc_offsets.py).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
+from operator import attrgetter
+from pathlib import Path
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from google.protobuf.message import DecodeError
+
+from foundation.errors import SessionError
+from foundation.folder import new_folder
+from foundation.items import Batch
+from foundation.readings import Reading
+from recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
+from recording.exporting.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format
+from recording.format import messages
+from recording.format.damage import naming
+from recording.format.images import decode_image
+from recording.format.png import SIGNATURE, encode_png
+from recording.format.records import Message, telemetry_messages
+from recording.format.utc_offsets import UtcOffsets
+from recording.reading.session import RecordedImage, Session
+
+TIME_COLUMNS = (Column("time_ns", "ns"), Column("time_utc", "utc"))
+META_COLUMNS = (
+    *TIME_COLUMNS,
+    Column("channel", "word"),
+    Column("step_id", "word"),
+    Column("block_id", "count"),
+    Column("camera_ticks_ns", "count"),
+    Column("exposure_s", "value"),
+    Column("gain_dB", "value"),
+    Column("camera_temperature_degC", "value"),
+    Column("dropped", "count"),
+)
+STEP_COLUMNS = (
+    *TIME_COLUMNS,
+    *(Column(name, "text") for name in ("step_id", "index", "kind", "state", "parameters_json")),
+)
+EVENT_COLUMNS = (*TIME_COLUMNS, *(Column(name, "text") for name in ("level", "kind", "text", "data_json")))
+
+
+README = """What is here was exported from a recorded session of a thermal test stand by `stand session export`.
+
+session.json              what the session is: recipe, camera, operator, version, start
+attachments/              configuration, recipe and target, as they were recorded
+steps.csv, events.csv     what was done, and what happened
+telemetry/                one table for each topic; camera_meta describes every frame
+frames/000001.png, .txt   each frame in order of time, and the temperatures at its time; index.csv has all of these
+
+Times    time_ns is the stand's clock, in ns since 1970: it never steps, so take differences of it. time_utc is UTC as
+         the computer had it at that moment.
+Values   An empty cell is what the device does not measure; nan is what it could not measure, and remarks says why.
+         Units are in the names of the columns. A number is the shortest text that reads back as the same number.
+Texts    Cells of the CSV tables are safe for spreadsheets, whoever has recorded the session. A text that a spreadsheet
+         would take for a formula (its first character, spaces aside, is one of = + - @) has an apostrophe (') before
+         it: take that away to have the text as it was recorded. Control characters and those that turn the direction
+         of writing are left out; tabs and line ends are spaces. Numbers are never changed. Parquet tables, session.json
+         and attachments have all texts as they were recorded.
+"""
+
+
+def export(
+    session: Session,
+    out: Path,
+    *,
+    frames: bool = True,
+    telemetry: TableFormat | None = "csv",
+    report: Callable[[float, str], None],
+) -> None:
+    """Write `session` as the folder `out`, which must not exist, laid out as above; memory stays flat.
+
+    `report` is told the share of the work that is done (0 to 1) and what is being done. SessionError when the session
+    cannot be read, `out` not be written, or the format needs a package that is missing; `out` then does not appear.
+    """
+    if telemetry is not None:
+        check_format(telemetry)
+    read = (*(session.telemetry_segments if telemetry is not None else ()), *(session.frame_segments if frames else ()))
+    work = _Work(read, report)
+    with new_folder(out) as folder:
+        _write_facts(session, folder)
+        if telemetry is not None:
+            _write_telemetry(session, folder / "telemetry", telemetry, work)
+        if frames:
+            _write_frames(session, folder / "frames", work)
+
+
+class _Work:
+    """How far the export is, by the bytes of the segments it reads."""
+
+    def __init__(self, segments: Sequence[Path], report: Callable[[float, str], None]) -> None:
+        self._total_bytes = max(1, sum(path.stat().st_size for path in segments))
+        self._done_bytes = 0
+        self._report = report
+
+    def done(self, size_bytes: int, text: str) -> None:
+        """So much more has been read."""
+        self._done_bytes += size_bytes
+        self._report(min(1.0, self._done_bytes / self._total_bytes), text)
+
+
+def _write_facts(session: Session, folder: Path) -> None:
+    """What is small: metadata, attachments, steps and events."""
+    utc = session.utc
+    (folder / "README.txt").write_text(README, encoding="utf-8")
+    text = json.dumps(session.metadata, indent=2, ensure_ascii=False)
+    (folder / "session.json").write_text(text + "\n", encoding="utf-8")
+    attachments = folder / "attachments"
+    attachments.mkdir()
+    for name, content in session.attachments.items():
+        if Path(name).name != name or name in ("", "..") or "\0" in name:
+            raise SessionError(f"{session.path}: the attachment {name!r} has no name that a file can have")
+        (attachments / name).write_text(content, encoding="utf-8", newline="")
+    _write_csv(
+        folder / "steps.csv",
+        STEP_COLUMNS,
+        (
+            (m.time_ns, utc.utc_ns(m.time_ns), m.step_id, m.index, m.kind, m.state.value, _json(m.parameters))
+            for m in session.steps()
+        ),
+    )
+    _write_csv(
+        folder / "events.csv",
+        EVENT_COLUMNS,
+        (
+            (e.time_ns, utc.utc_ns(e.time_ns), e.level, e.kind, e.text, _json(e.data) if e.data else "")
+            for e in session.events()
+        ),
+    )
+
+
+def _json(fields: Mapping[str, object]) -> str:
+    return json.dumps(dict(fields), sort_keys=True, ensure_ascii=False)
+
+
+def _write_csv(path: Path, columns: Sequence[Column], rows: Iterable[Sequence[Cell]]) -> None:
+    with closing(CsvTable(path, columns)) as table:
+        for row in rows:
+            table.add(row)
+
+
+def _write_telemetry(session: Session, folder: Path, table_format: TableFormat, work: _Work) -> None:
+    """One table per topic, in the order of the recording."""
+    folder.mkdir()
+    tables: dict[str, Table] = {}
+    with ExitStack() as stack:
+        for path in session.telemetry_segments:
+            for message in telemetry_messages(path, lambda channel: channel.topic in _COLUMNS):
+                if message.topic not in tables:
+                    name = message.topic.strip("/").replace("/", "_")
+                    table = TABLES[table_format](folder / f"{name}.{table_format}", _COLUMNS[message.topic])
+                    stack.callback(table.close)
+                    tables[message.topic] = table
+                for row in _rows(message, session.utc):
+                    tables[message.topic].add(row)
+            work.done(path.stat().st_size, f"telemetry {path.name}")
+
+
+def _batch_columns(kind: messages.Kind) -> tuple[Column, ...]:
+    """time_ns is the instant of the measurement; a value's unit is in its name."""
+    quantities = [
+        column
+        for quantity in kind.quantities
+        for column in (Column(quantity.field, "value"), Column(f"{quantity.field}_quality", "word"))
+    ]
+    return (*TIME_COLUMNS, Column("device", "word"), *quantities, Column("remarks", "text"))
+
+
+_COLUMNS = {
+    **{topic: _batch_columns(kind) for topic, kind in messages.KIND_OF_TOPIC.items()},
+    messages.CAMERA_META: META_COLUMNS,
+}
+
+
+def _rows(message: Message, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
+    if message.topic == messages.CAMERA_META:
+        meta = messages.decode_frame_meta(message.data)
+        yield (
+            message.time_ns,
+            utc.utc_ns(message.time_ns),
+            meta.channel,
+            meta.step_id,
+            meta.block_id,
+            meta.camera_ticks,
+            meta.exposure_s,
+            meta.gain_dB,
+            meta.camera_degC,
+            meta.dropped,
+        )
+    else:
+        batch = messages.decode_batch(message.topic, message.data, message.time_ns)
+        yield from _batch_rows(messages.KIND_OF_TOPIC[message.topic], batch, utc)
+
+
+def _batch_rows(kind: messages.Kind, batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
+    """A row for each instant at which something was measured, most often one."""
+    keys = [(f"{batch.device}.{quantity.name}", quantity.unit) for quantity in kind.quantities]
+    for time_ns, readings in _by_instant(batch):
+        cells: list[Cell] = []
+        for key in keys:
+            reading = readings.get(key)
+            cells += (None, None) if reading is None else (reading.value, reading.quality.value)
+        remarks = (_remark(reading, key in keys) for key, reading in readings.items())
+        yield (time_ns, utc.utc_ns(time_ns), batch.device, *cells, "; ".join(filter(None, remarks)))
+
+
+def _by_instant(batch: Batch) -> Iterator[tuple[int, dict[tuple[str, str], Reading]]]:
+    """(time_ns, (channel, unit) -> reading), ascending; a channel read twice at one instant gives two of them."""
+    readings: dict[tuple[str, str], Reading] = {}
+    time_ns = 0
+    for reading in sorted(batch.readings, key=attrgetter("time_ns")):
+        key = (reading.channel, reading.unit)
+        if readings and (reading.time_ns != time_ns or key in readings):
+            yield time_ns, readings
+            readings = {}
+        time_ns = reading.time_ns
+        readings[key] = reading
+    if readings:
+        yield time_ns, readings
+
+
+def _remark(reading: Reading, has_column: bool) -> str:
+    """The reason of a reading, and the reading itself when the table has no column for it; "" when there is neither."""
+    if not has_column:
+        value = f"{reading.channel} {reading.value!r} {reading.unit} {reading.quality.value}"
+        return f"{value} ({reading.reason})" if reading.reason else value
+    return f"{reading.channel}: {reading.reason}" if reading.reason else ""
+
+
+def _write_frames(session: Session, folder: Path, work: _Work) -> None:
+    folder.mkdir()
+    stand = StandTemperatures(session)
+    with closing(CsvTable(folder / "index.csv", (*SIDECAR_COLUMNS, *stand.columns))) as index:
+        for number, image in enumerate(session.images(), 1):
+            name = f"{number:06d}"
+            facts = (*frame_facts(f"{name}.png", image, session.utc), *stand.at(image.time_ns))
+            (folder / f"{name}.png").write_bytes(_png(image))
+            (folder / f"{name}.txt").write_text(sidecar_text(stand.columns, facts), encoding="utf-8")
+            index.add(facts)
+            work.done(len(image.data), f"frame {number} of {session.frame_count}")
+
+
+def _png(image: RecordedImage) -> bytes:
+    """The image as a PNG file: the recorded bytes when they are one."""
+    if image.schema == CompressedImage.DESCRIPTOR.full_name:
+        try:
+            data = CompressedImage.FromString(image.data).data
+        except DecodeError as error:
+            raise SessionError(f"{image.path}: an image message cannot be read ({error})") from error
+        if data.startswith(SIGNATURE):
+            return data
+    with naming(image.path):
+        decoded = decode_image(image.schema, image.data)
+    return encode_png(decoded.pixels, decoded.windows)

@@ -1,0 +1,175 @@
+"""Publishes a recorded session again: the same items in the same order, at their own instants of a clock.
+
+Subscribers cannot tell a replay from the run, except that there is no stand behind it. As fast as possible is a
+VirtualClock: whoever works in a lane holds it, so nothing is dropped. 1 x and N x is a ReplayClock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import shutil
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from foundation.clock import Clock, VirtualClock, WallClock
+from foundation.errors import SessionError
+from foundation.folder import new_folder
+from foundation.hub import Hub
+from foundation.items import Item
+from foundation.lane import Lane
+from foundation.readings import Frame
+from recording.exporting.topics import recorded_devices
+from recording.format.holes import holes_text
+from recording.format.images import IMAGE_CLASS, ImageEncoding
+from recording.format.items import Description
+from recording.format.layout import FORMAT
+from recording.format.records import frame_places
+from recording.reading.journal_lines import JOURNAL_NAME
+from recording.reading.session import Session
+from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from recording.writing.settings import VIRTUAL_COMMIT_S
+
+# Items read at once, at most one frame among them: few enough to keep memory flat, enough to make the hand-over to the
+# reading thread cheap.
+PORTION_ITEMS = 256
+
+
+class ReplayClock:
+    """A clock that stands at `start_ns` when it is made and runs `speed` times as fast as `wall`."""
+
+    def __init__(self, start_ns: int, speed: float, wall: Clock | None = None) -> None:
+        if not (math.isfinite(speed) and speed > 0):
+            raise ValueError(f"a speed is a positive number, not {speed}")
+        self._wall = wall if wall is not None else WallClock()
+        self._start_ns = start_ns
+        self._wall_start_ns = self._wall.now_ns()
+        self._speed = speed
+
+    @property
+    def lead_ns(self) -> int:
+        """That of the wall clock, in the session's time."""
+        return round(self._wall.lead_ns * self._speed)
+
+    def now_ns(self) -> int:
+        """The instant of the session, ns since the epoch."""
+        return self._start_ns + round((self._wall.now_ns() - self._wall_start_ns) * self._speed)
+
+    async def sleep_until(self, time_ns: int) -> None:
+        """Return at or after that instant of the session; at once when it has passed."""
+        await self._wall.sleep_until(self._wall_start_ns + math.ceil((time_ns - self._start_ns) / self._speed))
+
+    def hold(self) -> AbstractContextManager[None]:
+        """As far as the wall clock can be held."""
+        return self._wall.hold()
+
+
+def _nobody(_: Description) -> None:
+    """Descriptions whose image is missing are nothing that a stand publishes."""
+
+
+async def replay(session: Session, hub: Hub, clock: Clock, describe: Callable[[Description], None] = _nobody) -> None:
+    """Publish every item of the session on `hub`, each when `clock` has reached its time. `describe` gets the
+    descriptions whose images are missing, in their turn.
+
+    The order is that of the recording. A frame was published after the middle of its exposure, which is its time; such
+    an item comes at once, because the clock has passed it. Reading and decoding hold the clock, off the loop. Raises
+    SessionError at the first item that cannot be read.
+    """
+    items = session.items_and_descriptions()
+    lane = Lane("replay", clock)
+    try:
+        while portion := await lane.call(_portion, items):
+            for item in portion:
+                await clock.sleep_until(item.time_ns)
+                if isinstance(item, Description):
+                    describe(item)
+                else:
+                    hub.publish(item)
+    finally:
+        lane.close()
+
+
+def _portion(items: Iterator[Item | Description]) -> list[Item | Description]:
+    """The next items, up to and with a frame; none at the end."""
+    portion: list[Item | Description] = []
+    for item in items:
+        portion.append(item)
+        if isinstance(item, Frame) or len(portion) >= PORTION_ITEMS:
+            break
+    return portion
+
+
+async def replay_and_record(
+    session: Session, out: Path, speed: float | None, watch: Callable[[Hub], None] = lambda hub: None
+) -> Path:
+    """Replay `session` and record it again as the session `out`, which must not exist; returns `out`.
+
+    speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
+    has the same metadata (the session's id, too), attachments, devices, items and journal: nothing in it tells of
+    the replay, because it is the same session in other segments. What the original lacks, the copy's metadata tell
+    of, and an image or a description that lacks the other goes into the copy as it is. SessionError when it has no
+    items, or cannot be read or written whole, as on a disk that is slower than `speed`; `out` then does not appear.
+    """
+    first = next(session.items(), None)
+    if first is None:
+        raise SessionError(f"{session.path}: holds nothing that could be replayed")
+    clock = VirtualClock(first.time_ns) if speed is None else ReplayClock(first.time_ns, speed)
+    hub = Hub()
+    watch(hub)
+    settings = _settings(session, VIRTUAL_COMMIT_S if speed is None else speed)
+    info = SessionInfo.of(session.metadata)
+    if session.holes:
+        info = replace(info, format=str(FORMAT), holes=holes_text(session.holes))
+    with new_folder(out) as folder:
+        devices = recorded_devices(session)
+        recorder = Recorder(folder, info, session.attachments, devices, hub, clock, settings)
+        recorder.start()
+        background = [recorder.run()] + ([clock.run()] if isinstance(clock, VirtualClock) else [])
+        try:
+            await _beside(replay(session, hub, clock, recorder.keep_description), background)
+        finally:
+            await recorder.finish()
+        _copy_journal(session, folder)
+        if recorder.frames_lost:
+            raise SessionError(
+                f"{out}: {recorder.frames_lost} frames could not be written; is the disk full or too slow?"
+            )
+    return out
+
+
+async def _beside(work: Coroutine[Any, Any, None], background: Sequence[Coroutine[Any, Any, None]]) -> None:
+    """Await `work`, but raise at once what the background raises; nothing runs on when this returns."""
+    tasks = [asyncio.create_task(coroutine) for coroutine in (work, *background)]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _copy_journal(session: Session, folder: Path) -> None:
+    """The run's journal, where there is one; it is as good as it was."""
+    journal = session.path / JOURNAL_NAME
+    if journal.is_file():
+        shutil.copyfile(journal, folder / JOURNAL_NAME)
+
+
+def _settings(session: Session, commit_s: float) -> RecordingSettings:
+    """Without the rules of a stand for a nearly full disk: a copy may fill it, and says nothing of it."""
+    return RecordingSettings(
+        _encoding(session), telemetry_commit_s=commit_s, stop_frames_below_bytes=0, alert_below_fraction=0.0
+    )
+
+
+def _encoding(session: Session) -> ImageEncoding:
+    """Raw when all frames were; a PNG takes every other, also one of which only windows are real."""
+    raw = IMAGE_CLASS["raw"].DESCRIPTOR.full_name
+    schemas = {place.schema for path in session.frame_segments for place in frame_places(path)}
+    return "raw" if schemas == {raw} else "png"

@@ -1,0 +1,92 @@
+"""What belongs to an exported frame, as a text file beside it and as a row of the index: the same facts in both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from foundation.clock import NS_PER_S
+from foundation.instants import utc_text
+from recording.exporting.tables import Cell, Column
+from recording.exporting.topics import recorded_devices
+from recording.format import messages
+from recording.format.utc_offsets import UtcOffsets
+from recording.reading.session import RecordedImage, Session
+
+SIDECAR_COLUMNS = (
+    Column("file", "text"),
+    Column("time_utc", "utc"),
+    Column("time_ns", "ns"),
+    Column("camera_temperature_degC", "value"),
+    Column("exposure_s", "value"),
+    Column("gain_dB", "value"),
+    Column("channel", "word"),
+    Column("block_id", "count"),
+    Column("camera_ticks_ns", "count"),
+    Column("dropped", "count"),
+    Column("step_id", "word"),
+)
+
+
+def frame_facts(file: str, image: RecordedImage, utc: UtcOffsets) -> tuple[Cell, ...]:
+    """The cells of SIDECAR_COLUMNS. Of a frame whose description is lost, numbers that are not known are NaN and the
+    rest is empty; its block id is then the 32 bits that were recorded with the image."""
+    time_ns, utc_ns, meta = image.time_ns, utc.utc_ns(image.time_ns), image.meta
+    if meta is None:
+        return (file, utc_ns, time_ns, math.nan, math.nan, math.nan, None, image.sequence, None, None, None)
+    return (
+        file,
+        utc_ns,
+        time_ns,
+        meta.camera_degC,
+        meta.exposure_s,
+        meta.gain_dB,
+        meta.channel,
+        meta.block_id,
+        meta.camera_ticks,
+        meta.dropped,
+        meta.step_id,
+    )
+
+
+def sidecar_text(stand_columns: Sequence[Column], facts: Sequence[Cell]) -> str:
+    """A line `name: value` for each fact, the unit in the name; an unknown number is nan, an unknown text empty."""
+    lines: list[str] = []
+    for column, cell in zip((*SIDECAR_COLUMNS, *stand_columns), facts, strict=True):
+        text = utc_text(int(cell or 0)) if column.type == "utc" else "" if cell is None else str(cell)
+        lines.append(f"{column.name}: {text}".rstrip())
+    return "\n".join(lines) + "\n"
+
+
+class StandTemperatures:
+    """The temperatures of the stand as they were last read at an instant, each with its age.
+
+    `columns` are a value and an age for each channel in degC; NaN is a channel whose last reading was BAD, or that had
+    not been read yet, which has no age.
+    """
+
+    def __init__(self, session: Session) -> None:
+        recorded = set(session.channels())
+        names = [
+            f"{device}.{quantity.name}"
+            for device, kind in recorded_devices(session).items()
+            for quantity in messages.KINDS[kind].quantities
+            if quantity.unit == "degC" and f"{device}.{quantity.name}" in recorded
+        ]
+        self._readings = [session.readings(name) for name in names]
+        self.columns = tuple(
+            column for name in names for column in (Column(f"{name}_degC", "value"), Column(f"{name}_age_s", "value"))
+        )
+
+    def at(self, time_ns: int) -> tuple[float, ...]:
+        """The cells of `columns` at that instant."""
+        cells: list[float] = []
+        for times_ns, values in self._readings:
+            last = int(np.searchsorted(times_ns, time_ns, side="right")) - 1
+            if last < 0:
+                cells += (math.nan, math.nan)
+            else:
+                cells += (float(values[last]), (time_ns - int(times_ns[last])) / NS_PER_S)
+        return tuple(cells)

@@ -1,0 +1,189 @@
+"""A part of a recorded session as a session of its own.
+
+Messages are copied as they are, images undecoded, in the order of the recording. What is added at the start makes
+the part stand alone: an event that says where it was cut from, the mark of the step that was under way, and the offset
+of the stand's clock to UTC when there was one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import chain, groupby
+from operator import attrgetter
+from pathlib import Path
+
+from mcap.writer import CompressionType
+
+from foundation.clock import NS_PER_S, seconds_ns
+from foundation.errors import SessionError
+from foundation.folder import new_folder
+from foundation.items import Event, StepMark, StepState
+from recording.exporting.topics import recorded_topics
+from recording.format import messages
+from recording.format.holes import holes_text
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from recording.format.layout import FORMAT, FRAMES, TELEMETRY
+from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
+from recording.format.utc_offsets import offset_event
+from recording.reading.extent import Extent, extent_of
+from recording.reading.session import Session
+from recording.writing.recorder import RecordingSettings
+from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.series import Series
+
+TRIMMED = "session.trimmed"  # kind of the event that says where a session was cut from
+# Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
+BLOCK_NS = 60 * NS_PER_S
+BLOCK_BYTES = 1 << 20
+
+
+def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
+    """What was recorded in [begin_ns, end_ns) as the new session `out`, which must not exist; returns `out`.
+
+    Attachments, channels, sequence numbers, instants and order stay, and so do the metadata, which tell the extent of
+    the part and what is missing in it as it was in the session. The first messages are an event of kind
+    TRIMMED, when a step had started and not ended before `begin_ns` its mark again, and when UTC was not the stand's
+    time an event that says so, all at the instant of the first message kept: a frame's step can be looked up, and
+    nothing lies before the part. SessionError when nothing
+    was recorded in the range, or when reading or writing fails; `out` then does not appear.
+    """
+    places = [place for place in _places(session) if begin_ns <= place.time_ns < end_ns]
+    kept = _kept(session, begin_ns, end_ns)
+    first = next(kept, None)
+    if first is None and not places:
+        raise SessionError(
+            f"{session.path}: has nothing from {session.utc.utc_text(begin_ns)} to {session.utc.utc_text(end_ns)}; "
+            f"{_range(session)}"
+        )
+    first_ns = first.time_ns if first is not None else places[0].time_ns
+    telemetry = chain(_opening(session, first_ns, begin_ns, end_ns), [] if first is None else [first], kept)
+    metadata = _metadata(session, begin_ns, end_ns)
+    with new_folder(out) as folder:
+        _write_telemetry(session, metadata, folder / TELEMETRY, telemetry, first_ns)
+        _write_frames(session, metadata, folder / FRAMES, places)
+    return out
+
+
+def _metadata(session: Session, begin_ns: int, end_ns: int) -> dict[str, str]:
+    """The session's record, with the extent and the holes of the part."""
+    before = extent_of(session.metadata)
+    if before is not None:  # a part of a part is one of the whole
+        begin_ns, end_ns = max(begin_ns, before.begin_ns), min(end_ns, before.end_ns)
+    extent = Extent(session.metadata.get("session_id", session.path.name), begin_ns, end_ns, session.run)
+    holes = [part for hole in session.holes if (part := hole.within(begin_ns, end_ns)) is not None]
+    told = {"format": str(FORMAT), "extent": extent.record(), "holes": holes_text(holes)}
+    return {**session.metadata, **{name: text for name, text in told.items() if text}}
+
+
+def _places(session: Session) -> Iterator[FramePlace]:
+    """The frames in the order of the recording."""
+    for path in session.frame_segments:
+        yield from frame_places(path)
+
+
+def _telemetry(session: Session) -> Iterator[Record]:
+    for path in session.telemetry_segments:
+        for message in telemetry_messages(path, lambda channel: True):
+            yield Record(message.topic, message.time_ns, message.data, message.sequence)
+
+
+def _kept(session: Session, begin_ns: int, end_ns: int) -> Iterator[Record]:
+    return (record for record in _telemetry(session) if begin_ns <= record.time_ns < end_ns)
+
+
+def _range(session: Session) -> str:
+    times_ns = [record.time_ns for record in _telemetry(session)] + [place.time_ns for place in _places(session)]
+    if not times_ns:
+        return "it is empty"
+    return f"it goes from {session.utc.utc_text(min(times_ns))} to {session.utc.utc_text(max(times_ns))}"
+
+
+def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[Record]:
+    """Where the part comes from, and the mark of the step under way."""
+    name, utc = session.metadata.get("session_id", session.path.name), session.utc
+    text = f"trimmed from session {name}: {utc.utc_text(begin_ns)} up to {utc.utc_text(end_ns)}, the end not included"
+    mark = _step_under_way(session, begin_ns)
+    if mark is not None:
+        text += f"; the mark of step {mark.step_id}, started {utc.utc_text(mark.time_ns)}, is repeated at the start"
+    event = Event(first_ns, "info", TRIMMED, text)
+    yield Record(messages.EVENT, first_ns, messages.encode_event(event))
+    yield Record(messages.LOG, first_ns, messages.encode_log(event))
+    if mark is not None:
+        yield Record(messages.STEP, first_ns, messages.encode_step(mark))
+    if offset_ns := utc.at(first_ns):
+        yield Record(messages.EVENT, first_ns, messages.encode_event(offset_event(first_ns, offset_ns)))
+
+
+def _step_under_way(session: Session, begin_ns: int) -> StepMark | None:
+    """The last step that started before `begin_ns` and did not end before it."""
+    under_way: StepMark | None = None
+    for mark in session.steps():
+        if mark.time_ns >= begin_ns:
+            break
+        if mark.state is StepState.STARTED:
+            under_way = mark
+        elif under_way is not None and under_way.step_id == mark.step_id:
+            under_way = None
+    return under_way
+
+
+def _write_telemetry(
+    session: Session, metadata: Mapping[str, str], folder: Path, records: Iterator[Record], first_ns: int
+) -> None:
+    topics = {topic.name: topic for topic in recorded_topics(session)}
+    for name in (messages.EVENT, messages.LOG, messages.STEP):
+        topics.setdefault(name, Topic(name, messages.CLASSES[name]))
+    series = _series(session, metadata, folder, tuple(topics.values()), CompressionType.ZSTD)
+    now_ns = first_ns
+    for block in _blocks(records):
+        now_ns = max(now_ns, block[-1].time_ns)
+        _commit(series, block, now_ns)
+    _finish(series)
+
+
+def _blocks(records: Iterator[Record]) -> Iterator[list[Record]]:
+    block: list[Record] = []
+    size_bytes = 0
+    for record in records:
+        if block and (size_bytes >= BLOCK_BYTES or record.time_ns - block[0].time_ns >= BLOCK_NS):
+            yield block
+            block, size_bytes = [], 0
+        block.append(record)
+        size_bytes += len(record.data)
+    if block:
+        yield block
+
+
+def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, places: list[FramePlace]) -> None:
+    """One frame per commit, as a chunk holds one; a segment has one kind of image."""
+    folder.mkdir()
+    classes = {message.DESCRIPTOR.full_name: message for message in IMAGE_CLASS.values()}
+    for schema, alike in groupby(places, key=attrgetter("schema")):
+        series = _series(session, metadata, folder, (Topic(CAMERA_IMAGE, classes[schema]),), CompressionType.NONE)
+        for place in alike:
+            message = read_frame(place)
+            record = Record(CAMERA_IMAGE, message.time_ns, message.data, message.sequence)
+            _commit(series, [record], place.time_ns)
+        _finish(series)
+
+
+def _series(
+    session: Session, metadata: Mapping[str, str], folder: Path, topics: tuple[Topic, ...], compression: CompressionType
+) -> Series:
+    folder.mkdir(exist_ok=True)
+    usual = RecordingSettings()
+    segment_ns = seconds_ns(usual.segment_s)
+    form = SeriesForm(folder.name, topics, compression, metadata, session.attachments, usual.segment_bytes, segment_ns)
+    return Series(folder, form)
+
+
+def _commit(series: Series, records: list[Record], now_ns: int) -> None:
+    """Commit, or raise what a recorder would overcome: a copy that went half wrong is begun again, not mended."""
+    series.commit(records, now_ns)
+    if series.troubles:
+        raise OSError(series.troubles.popleft())
+
+
+def _finish(series: Series) -> None:
+    if not series.finish():
+        raise OSError(series.troubles.popleft())

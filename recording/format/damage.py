@@ -1,0 +1,48 @@
+"""What reading damaged bytes raises, and the sentences it becomes."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+import zstandard
+from mcap.exceptions import McapError
+
+from foundation.errors import SessionError
+
+# CRC and Unicode errors are ValueErrors.
+DAMAGE = (
+    McapError,
+    OSError,
+    struct.error,
+    zstandard.ZstdError,
+    ValueError,
+    LookupError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+)
+
+
+@contextmanager
+def reading(path: Path) -> Generator[None]:
+    """Whatever damage raises inside becomes a SessionError that names the file; one at once for a pipe or a device,
+    which nobody may ever write to."""
+    if path.exists() and not path.is_file():
+        raise SessionError(f"{path}: is no file; no session has a folder, a pipe or a device of that name")
+    try:
+        yield
+    except DAMAGE as error:
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        raise SessionError(f"{path}: damaged or not readable ({text})") from error
+
+
+@contextmanager
+def naming(path: Path) -> Generator[None]:
+    """A SessionError from inside gets the file's name in front."""
+    try:
+        yield
+    except SessionError as error:
+        raise SessionError(f"{path}: {error}") from error

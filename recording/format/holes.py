@@ -1,0 +1,97 @@
+"""What of a recorded session is not there, as stretches of its two series."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from typing import cast
+
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.utc_offsets import UtcOffsets
+
+_WHAT = {TELEMETRY: "without their descriptions", FRAMES: "that are described"}
+_NUMBERS = (int, type(None))
+
+
+@dataclass(frozen=True, slots=True)
+class Hole:
+    """A stretch of a series that is not there.
+
+    first, last: numbers of the segments that are missing; both None when only frames, or their descriptions, are, and
+    last alone when nobody can tell how many there were. begin_ns, end_ns: what there is ends and begins again at these
+    instants, None at the begin and the end of the session. frames: how many lack their image (series `frames`) or
+    description (`telemetry`). excused: frames that were never acknowledged, or that the recorder itself said it lost:
+    such a stretch makes no session incomplete.
+    """
+
+    series: str
+    first: int | None
+    last: int | None
+    begin_ns: int | None
+    end_ns: int | None
+    frames: int = 0
+    excused: bool = False
+
+    def covers(self, time_ns: int) -> bool:
+        """Whether something of that instant would have been in it."""
+        return (self.begin_ns is None or self.begin_ns < time_ns) and (self.end_ns is None or time_ns < self.end_ns)
+
+    def within(self, begin_ns: int, end_ns: int) -> Hole | None:
+        """What of it lies in [begin_ns, end_ns), None when nothing does; how many frames that are is known of all."""
+        first_ns = begin_ns - 1 if self.begin_ns is None else max(self.begin_ns, begin_ns - 1)
+        last_ns = end_ns if self.end_ns is None else min(self.end_ns, end_ns)
+        if last_ns - first_ns <= 1:
+            return None
+        is_whole = (first_ns, last_ns) == (self.begin_ns, self.end_ns)
+        return replace(self, begin_ns=first_ns, end_ns=last_ns, frames=self.frames if is_whole else 0)
+
+    def when(self, utc: UtcOffsets) -> str:
+        """`from 2026-01-01 18:00:00 to 2026-01-01 18:10:00 UTC`, "" when nothing is known of it."""
+        begin = "" if self.begin_ns is None else f"from {utc.date_time(self.begin_ns)}"
+        end = "" if self.end_ns is None else f"to {utc.date_time(self.end_ns)}"
+        return f"{begin} {end}".strip() + (" UTC" if begin or end else "")
+
+    def text(self, utc: UtcOffsets) -> str:
+        """Which segments, when, and how many frames, as a part of a sentence."""
+        frames = "" if not self.frames else f"{self.frames} frame{'' if self.frames == 1 else 's'} {_WHAT[self.series]}"
+        if self.first is None:
+            return f"{frames}, {self.when(utc)}"
+        behind = ", ".join(part for part in (self.when(utc), frames) if part)
+        return f"{segments_text(self.series, self.first, self.last)}{f' ({behind})' if behind else ''}"
+
+
+def segments_text(series: str, first: int, last: int | None) -> str:
+    """`telemetry/0003.mcap to 0012.mcap`."""
+    name = f"{series}/{first:04d}.mcap"
+    if last is None:
+        return f"{name} and what follows it"
+    return name if last == first else f"{name} to {last:04d}.mcap"
+
+
+def holes_text(holes: Iterable[Hole]) -> str:
+    """For the session record of a copy; "" when there is none."""
+    entries = [asdict(hole) for hole in holes]
+    return json.dumps(entries, separators=(",", ":")) if entries else ""
+
+
+def holes_in(text: str) -> tuple[Hole, ...]:
+    """The inverse; what is not understood of a text is left out."""
+    try:
+        found: object = json.loads(text) if text else []
+    except (ValueError, RecursionError):
+        return ()
+    entries = cast("list[object]", found) if isinstance(found, list) else []
+    return tuple(hole for entry in entries if (hole := _hole(entry)) is not None)
+
+
+def _hole(entry: object) -> Hole | None:
+    if not isinstance(entry, dict):
+        return None
+    fields = cast("dict[str, object]", entry)
+    numbers = [fields.get(name) for name in ("first", "last", "begin_ns", "end_ns", "frames")]
+    series, excused = fields.get("series"), fields.get("excused")
+    if series not in _WHAT or not isinstance(excused, bool) or not all(isinstance(n, _NUMBERS) for n in numbers):
+        return None
+    first, last, begin_ns, end_ns, frames = cast("list[int | None]", numbers)
+    return Hole(cast("str", series), first, last, begin_ns, end_ns, frames or 0, excused)

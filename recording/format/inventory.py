@@ -1,0 +1,86 @@
+"""The files a recorded session consists of, whatever state they are in; only names, sizes and locks are looked at."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+
+
+class State(StrEnum):
+    """finished: indexed, read by everything. unfinished: left by a recorder that is gone. recording: a recorder has it
+    open. damaged: the original of a salvaged segment, kept because not all of it could be recovered."""
+
+    FINISHED = "finished"
+    UNFINISHED = "unfinished"
+    RECORDING = "recording"
+    DAMAGED = "damaged"
+
+
+_STATE = {FINISHED: State.FINISHED, UNFINISHED: State.UNFINISHED, DAMAGED: State.DAMAGED}
+# A second damaged original of the same number is NNNN.2.mcap.damaged.
+_NAME = re.compile(rf"(\d{{4,}})(?:\.\d+)?({'|'.join(map(re.escape, _STATE))})")
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentFile:
+    """A segment's file. `name` is its path within the session, `telemetry/0003.mcap`."""
+
+    path: Path
+    series: str
+    number: int
+    state: State
+    size_bytes: int
+
+    @property
+    def name(self) -> str:
+        """Series and file name."""
+        return f"{self.series}/{self.path.name}"
+
+
+def inventory(directory: Path) -> tuple[SegmentFile, ...]:
+    """The segments in `directory`, telemetry first, in order of their numbers; none when it is no session."""
+    return tuple(file for series in (TELEMETRY, FRAMES) for file in _of_series(directory / series))
+
+
+def _of_series(folder: Path) -> list[SegmentFile]:
+    try:
+        paths = list(folder.iterdir())
+    except OSError:  # no such folder
+        return []
+    files = [file for path in paths if (file := _segment_file(path)) is not None]
+    return sorted(files, key=lambda file: (file.number, file.path.name))
+
+
+def _segment_file(path: Path) -> SegmentFile | None:
+    """The segment at `path`; None when it is none, or was given another name under our eyes."""
+    name = _NAME.fullmatch(path.name)
+    try:
+        if name is None or not path.is_file():
+            return None
+        state = _STATE[name[2]]
+        if state is State.UNFINISHED and _is_locked(path):
+            state = State.RECORDING
+        return SegmentFile(path, path.parent.name, int(name[1]), state, path.stat().st_size)
+    except FileNotFoundError:
+        return None
+
+
+def _is_locked(path: Path) -> bool:
+    """A living recorder holds its file locked. Our own lock is shared and gone at once: nobody waits for it."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except PermissionError:  # whoever recorded it was another user; a living one cannot be told from a dead one
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False

@@ -1,0 +1,396 @@
+"""What a session holds, message by message: items of the hub to protobuf and back.
+
+Own messages are in package `thermostand`, one file each, made here at run time (no protoc); where Foxglove has a
+schema its name is used. Every batch message has one double per quantity, its unit in the field's name, and a quality
+beside it; a quantity the device did not give is NaN and ABSENT, so that no viewer draws it as 0. `remarks` repeats
+in full each reading the fixed fields cannot carry: it has a reason, an instant of its own, or no field. Images are in
+recording/format/images.py.
+
+Field numbers follow the order of the tables below. They are the file format: append, never reorder.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf import descriptor_pool
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from foundation.errors import SessionError
+from foundation.items import Batch, Event, StepMark, StepState
+from foundation.readings import Cause, Frame, Quality, Reading
+
+CAMERA_META = "/camera/meta"
+TABLE_POSE = "/table/pose"
+STEP = "/experiment/step"
+EVENT = "/experiment/event"
+LOG = "/log"
+
+DOUBLE = FieldDescriptorProto.TYPE_DOUBLE
+STRING = FieldDescriptorProto.TYPE_STRING
+INT32 = FieldDescriptorProto.TYPE_INT32
+UINT64 = FieldDescriptorProto.TYPE_UINT64
+INSTANT = FieldDescriptorProto.TYPE_SFIXED64
+ENUM = FieldDescriptorProto.TYPE_ENUM
+MESSAGE = FieldDescriptorProto.TYPE_MESSAGE
+
+QUALITY_NUMBER = {Quality.GOOD: 1, Quality.STALE: 2, Quality.BAD: 3}
+QUALITY_OF_NUMBER = {number: quality for quality, number in QUALITY_NUMBER.items()}
+ABSENT = 0
+
+_pool = descriptor_pool.Default()
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """One quantity of a device ("device.name" in `unit`) and the field that carries it."""
+
+    name: str
+    unit: str
+    field: str
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a kind of device measures, and where that is recorded."""
+
+    topic: str
+    schema: str
+    quantities: tuple[Quantity, ...]
+
+
+THERMOMETERS = ("granite_inside", "granite_outside", "artifact", "air", "laboratory")
+KINDS: Mapping[str, Kind] = {
+    "thermometers": Kind(
+        "/sensors/temperature",
+        "Temperatures",
+        (
+            *(Quantity(place, "degC", f"{place}_degC") for place in THERMOMETERS),
+            *(Quantity(f"{place}_raw", "1", f"{place}_raw") for place in THERMOMETERS),
+        ),
+    ),
+    "regulator": Kind(
+        "/chamber/state",
+        "ChamberState",
+        (
+            Quantity("pv", "degC", "actual_degC"),
+            Quantity("sp", "degC", "set_point_degC"),
+            Quantity("mv_heat", "%", "heating_percent"),
+            Quantity("mv_cool", "%", "cooling_percent"),
+            Quantity("running", "1", "running"),
+            Quantity("fault", "1", "fault"),
+        ),
+    ),
+    "relays": Kind(
+        "/relays/state",
+        "RelayState",
+        tuple(Quantity(relay, "1", relay) for relay in ("heater_enable", "compressor", "camera_power")),
+    ),
+    "camera": Kind("/camera/temperature", "Temperature", (Quantity("temperature", "degC", "temperature_degC"),)),
+    "axis": Kind(
+        "/table/state",
+        "TableState",
+        (
+            Quantity("position", "mm", "position_mm"),
+            Quantity("position", "deg", "position_deg"),
+            Quantity("moving", "1", "moving"),
+            Quantity("homed", "1", "homed"),
+        ),
+    ),
+    "flap": Kind(
+        "/flap/state",
+        "FlapState",
+        (Quantity("position", "1", "position"), Quantity("current", "mA", "current_mA")),
+    ),
+}
+KIND_OF_TOPIC = {kind.topic: kind for kind in KINDS.values()}
+
+
+def _field(
+    name: str, number: int, kind: FieldDescriptorProto.Type.ValueType, type_name: str = ""
+) -> FieldDescriptorProto:
+    """One singular field; `type_name` for an enum or a message."""
+    label = FieldDescriptorProto.LABEL_OPTIONAL
+    return FieldDescriptorProto(name=name, number=number, type=kind, label=label, type_name=type_name or None)
+
+
+def _message_class(name: str, fields: list[FieldDescriptorProto], needs_reading: bool = False) -> type[Message]:
+    """The class of `thermostand.<name>` with these fields."""
+    file = FileDescriptorProto(name=f"thermostand/{name}.proto", package="thermostand", syntax="proto3")
+    file.message_type.add(name=name, field=fields)
+    if name == "Reading":
+        quality = file.enum_type.add(name="Quality")
+        for text, number in (("ABSENT", ABSENT), *((q.name, n) for q, n in QUALITY_NUMBER.items())):
+            quality.value.add(name=text, number=number)
+    if needs_reading:
+        file.dependency.append("thermostand/Reading.proto")
+    _pool.Add(file)
+    return GetMessageClass(_pool.FindMessageTypeByName(f"thermostand.{name}"))
+
+
+def _plain_class(name: str, fields: Mapping[str, FieldDescriptorProto.Type.ValueType]) -> type[Message]:
+    """A message of scalar fields, numbered from 1 in order."""
+    return _message_class(name, [_field(field, number, kind) for number, (field, kind) in enumerate(fields.items(), 1)])
+
+
+def _batch_class(kind: Kind) -> type[Message]:
+    """The message of a kind: device 1, remarks 2, time_ns 3 (of the readings; 0 when it is the log time), then value
+    and quality of each quantity."""
+    remarks = _field("remarks", 2, MESSAGE, ".thermostand.Reading")
+    remarks.label = FieldDescriptorProto.LABEL_REPEATED
+    fields = [_field("device", 1, STRING), remarks, _field("time_ns", 3, INSTANT)]
+    for index, quantity in enumerate(kind.quantities):
+        fields.append(_field(quantity.field, 4 + 2 * index, DOUBLE))
+        fields.append(_field(f"{quantity.field}_quality", 5 + 2 * index, ENUM, ".thermostand.Quality"))
+    return _message_class(kind.schema, fields, needs_reading=True)
+
+
+_Reading = _message_class(
+    "Reading",
+    [
+        _field("channel", 1, STRING),
+        _field("value", 2, DOUBLE),
+        _field("unit", 3, STRING),
+        _field("time_ns", 4, INSTANT),
+        _field("quality", 5, ENUM, ".thermostand.Quality"),
+        _field("reason", 6, STRING),
+        _field("cause", 7, STRING),
+    ],
+)
+_FrameMeta = _plain_class(
+    "FrameMeta",
+    {
+        "channel": STRING,
+        "step_id": STRING,
+        "block_id": UINT64,
+        "camera_ticks": UINT64,
+        "exposure_s": DOUBLE,
+        "gain_dB": DOUBLE,
+        "camera_degC": DOUBLE,
+        "dropped": UINT64,
+    },
+)
+_Step = _plain_class(
+    "Step", {"step_id": STRING, "index": INT32, "kind": STRING, "state": STRING, "parameters_json": STRING}
+)
+_Event = _plain_class("Event", {"level": STRING, "kind": STRING, "text": STRING, "data_json": STRING})
+
+# Topic of the telemetry series -> message class.
+CLASSES: Mapping[str, type[Message]] = {
+    **{kind.topic: _batch_class(kind) for kind in KINDS.values()},
+    CAMERA_META: _FrameMeta,
+    TABLE_POSE: PoseInFrame,
+    STEP: _Step,
+    EVENT: _Event,
+    LOG: Log,
+}
+
+CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device"}
+LOG_LEVEL = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
+
+
+class BatchEncoder:
+    """The batches of one device as messages of its kind; the look-ups are done once."""
+
+    def __init__(self, device: str, kind: Kind) -> None:
+        self.topic = kind.topic
+        self._class = CLASSES[kind.topic]
+        self._blank: dict[str, object] = {"device": device, **{q.field: math.nan for q in kind.quantities}}
+        self._fields = {(f"{device}.{q.name}", q.unit): (q.field, f"{q.field}_quality") for q in kind.quantities}
+
+    def encode(self, batch: Batch) -> bytes:
+        """The batch as one message; nothing of a reading is lost, whatever its channel, unit or time."""
+        fields = self._blank.copy()
+        readings = batch.readings
+        time_ns = (readings[0].time_ns if readings else 0) or batch.time_ns  # 0 in the message is the log time
+        if time_ns != batch.time_ns:
+            fields["time_ns"] = time_ns
+        is_repeated = len({(reading.channel, reading.unit) for reading in readings}) < len(readings)
+        remarks: list[Message] = []
+        for reading in readings:
+            names = self._fields.get((reading.channel, reading.unit))
+            if names is not None:
+                fields[names[0]] = _canonical(reading.value)
+                fields[names[1]] = QUALITY_NUMBER[reading.quality]
+            if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
+                remarks.append(_remark(reading))
+        if remarks:
+            fields["remarks"] = remarks
+        return self._class(**fields).SerializeToString()
+
+
+def _canonical(value: float) -> float:
+    """The same NaN whatever arithmetic made it: equal readings are equal bytes."""
+    return math.nan if value != value else value
+
+
+def _remark(reading: Reading) -> Message:
+    return _Reading(
+        channel=reading.channel,
+        value=_canonical(reading.value),
+        unit=reading.unit,
+        time_ns=reading.time_ns,
+        quality=QUALITY_NUMBER[reading.quality],
+        reason=reading.reason,
+        cause=reading.cause,
+    )
+
+
+def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Batch:
+    """The batch of a message; SessionError when it is not one.
+
+    Its readings are in order of the kind's quantities, behind them the remarks in the order they were published.
+    Encoding it again gives the same bytes: the order between the two sorts is all that a message does not keep.
+    """
+    message = _parse(topic, data)
+    device: str = _get(message, "device")
+    time_ns: int = _get(message, "time_ns") or log_time_ns
+    remarks = [_remarked(remark) for remark in _get(message, "remarks")]
+    remarked = {(reading.channel, reading.unit) for reading in remarks}
+    readings: list[Reading] = []
+    for quantity in KIND_OF_TOPIC[topic].quantities:
+        quality: int = _get(message, f"{quantity.field}_quality")
+        channel = f"{device}.{quantity.name}"
+        if quality != ABSENT and (channel, quantity.unit) not in remarked:
+            readings.append(_reading(channel, _get(message, quantity.field), quantity.unit, time_ns, quality, ""))
+    return Batch(device, log_time_ns, (*readings, *remarks))
+
+
+def _remarked(remark: Any) -> Reading:
+    cause = CAUSES.get(remark.cause, "")  # none in sessions of before 2026-11-22
+    return _reading(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason, cause)
+
+
+def _reading(
+    channel: str, value: float, unit: str, time_ns: int, quality: int, reason: str, cause: Cause = ""
+) -> Reading:
+    try:
+        return Reading(channel, value, unit, time_ns, QUALITY_OF_NUMBER[quality], reason, cause)
+    except (KeyError, ValueError) as error:
+        raise SessionError(f"{channel}: the recorded value {value} does not fit its quality {quality}") from error
+
+
+def encode_frame_meta(frame: Frame) -> bytes:
+    """What belongs to a frame, without its image."""
+    return _FrameMeta(
+        channel=frame.channel,
+        step_id=frame.step_id,
+        block_id=frame.block_id,
+        camera_ticks=frame.camera_ticks,
+        exposure_s=frame.exposure_s,
+        gain_dB=frame.gain_dB,
+        camera_degC=_canonical(frame.camera_degC),
+        dropped=frame.dropped,
+    ).SerializeToString()
+
+
+@dataclass(frozen=True, slots=True)
+class FrameMeta:
+    """A frame without its image; see foundation.readings.Frame."""
+
+    channel: str
+    step_id: str
+    block_id: int
+    camera_ticks: int
+    exposure_s: float
+    gain_dB: float
+    camera_degC: float
+    dropped: int
+
+
+def decode_frame_meta(data: bytes) -> FrameMeta:
+    """The inverse of encode_frame_meta; SessionError when it is not one."""
+    message = _parse(CAMERA_META, data)
+    return FrameMeta(**{name: _get(message, name) for name in FrameMeta.__dataclass_fields__})
+
+
+def encode_step(mark: StepMark) -> bytes:
+    """A step mark; parameters as JSON with sorted keys, what JSON does not know as its text."""
+    return _Step(
+        step_id=mark.step_id,
+        index=mark.index,
+        kind=mark.kind,
+        state=mark.state.value,
+        parameters_json=json.dumps(mark.parameters, sort_keys=True, ensure_ascii=False, default=str),
+    ).SerializeToString()
+
+
+def decode_step(data: bytes, time_ns: int) -> StepMark:
+    """The inverse of encode_step; SessionError when it is not one."""
+    m = _parse(STEP, data)
+    parameters = _json_object(_get(m, "parameters_json"), "step")
+    try:
+        state = StepState(_get(m, "state"))
+    except ValueError as error:
+        raise SessionError(f"a recorded step cannot be read ({error})") from error
+    return StepMark(time_ns, _get(m, "step_id"), _get(m, "index"), _get(m, "kind"), state, parameters)
+
+
+def _json_object(text: str, what: str) -> dict[str, object]:
+    """The keys and values of a JSON text; SessionError when it is none."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:  # JSON may be nested deeper than Python goes
+        raise SessionError(f"a recorded {what} cannot be read ({error})") from error
+    if not isinstance(found, dict):
+        raise SessionError(f"a recorded {what} has JSON that is not keys and values")
+    return cast("dict[str, object]", found)
+
+
+def encode_event(event: Event) -> bytes:
+    """An event of the stand; its data as JSON with sorted keys, "" when there is none."""
+    data_json = json.dumps(dict(event.data), sort_keys=True, ensure_ascii=False, default=str) if event.data else ""
+    return _Event(level=event.level, kind=event.kind, text=event.text, data_json=data_json).SerializeToString()
+
+
+def decode_event(data: bytes, time_ns: int) -> Event:
+    """The inverse of encode_event; SessionError when it is not one. Events recorded before there was data have none."""
+    message = _parse(EVENT, data)
+    fields = _json_object(_get(message, "data_json") or "{}", "event")
+    return Event(time_ns, _get(message, "level"), _get(message, "kind"), _get(message, "text"), fields)
+
+
+def encode_log(event: Event) -> bytes:
+    """The event as foxglove.Log, for the viewers' log panels."""
+    level = LOG_LEVEL.get(event.level, Log.UNKNOWN)
+    return Log(timestamp=timestamp(event.time_ns), level=level, name=event.kind, message=event.text).SerializeToString()
+
+
+def encode_table_pose(time_ns: int, linear_mm: float, rotary_deg: float) -> bytes:
+    """Where the table is, as foxglove.PoseInFrame in `stand`: x along the linear axis in m, rotation about z."""
+    half_rad = math.radians(rotary_deg) / 2
+    pose = Pose(
+        position=Vector3(x=linear_mm / 1000), orientation=Quaternion(z=math.sin(half_rad), w=math.cos(half_rad))
+    )
+    return PoseInFrame(timestamp=timestamp(time_ns), frame_id="stand", pose=pose).SerializeToString()
+
+
+def timestamp(time_ns: int) -> Timestamp:
+    """An instant in Foxglove's messages."""
+    stamp = Timestamp()
+    stamp.FromNanoseconds(time_ns)
+    return stamp
+
+
+def _get(message: Message, field: str) -> Any:
+    """A field of a class made at run time, which has no static type."""
+    return getattr(message, field)
+
+
+def _parse(topic: str, data: bytes) -> Message:
+    try:
+        return CLASSES[topic].FromString(data)
+    except DecodeError as error:
+        raise SessionError(f"a message on {topic} is not a {CLASSES[topic].DESCRIPTOR.full_name} ({error})") from error

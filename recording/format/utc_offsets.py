@@ -1,0 +1,92 @@
+"""From instants of the stand's clock, which never steps, to UTC as the host's system clock had it, and back.
+
+A recording has instants of the stand's clock only. When the system clock was stepped against it, or has drifted away,
+an event of kind `clock_step` says so:
+
+    offset_before_ns   UTC minus the stand's clock as it was recorded last, 0 at the start of a session
+    offset_after_ns    the same from now on
+    seen_ns            the last instant at which the former still held; the step is between it and stand_ns
+    stand_ns, utc_ns   now, on both clocks
+
+As long as the offset is not 0 the event is repeated every REPEATED_NS, so that a segment can be understood without the
+ones before it. What shows or exports an instant as UTC adds the offset that held then; durations are differences of
+instants of the stand's clock.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from foundation.clock import NS_PER_S
+from foundation.instants import date_time, utc_text
+from foundation.items import Event
+
+CLOCK_STEP = "clock_step"
+REPEATED_NS = 300 * NS_PER_S  # as long as the offset is not 0
+_INT64 = (-(1 << 63), (1 << 63) - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class UtcOffsets:
+    """UTC minus the stand's clock: `offsets_ns[k]` from `times_ns[k]` on, `first_ns` before all of them."""
+
+    first_ns: int = 0
+    times_ns: tuple[int, ...] = ()
+    offsets_ns: tuple[int, ...] = ()
+
+    def at(self, stand_ns: int) -> int:
+        """The offset that held at an instant of the stand's clock."""
+        index = bisect_right(self.times_ns, stand_ns)
+        return self.offsets_ns[index - 1] if index else self.first_ns
+
+    def utc_ns(self, stand_ns: int) -> int:
+        """That instant as UTC."""
+        return min(max(stand_ns + self.at(stand_ns), _INT64[0]), _INT64[1])
+
+    def stand_ns(self, utc_ns: int) -> int:
+        """The first instant of the stand's clock at which UTC was `utc_ns`, or later when it was stepped over."""
+        offset_ns, begin_ns = self.first_ns, _INT64[0]
+        for end_ns, next_ns in zip(self.times_ns, self.offsets_ns, strict=True):
+            if (found_ns := max(utc_ns - offset_ns, begin_ns)) < end_ns:
+                return found_ns
+            offset_ns, begin_ns = next_ns, end_ns
+        return max(utc_ns - offset_ns, begin_ns)
+
+    def date_time(self, stand_ns: int) -> str:
+        """`2026-01-01 18:00:04`, UTC to the second below."""
+        return date_time(self.utc_ns(stand_ns))
+
+    def utc_text(self, stand_ns: int) -> str:
+        """UTC in ISO 8601 to the ns."""
+        return utc_text(self.utc_ns(stand_ns))
+
+
+def offsets_of(events: Iterable[Event]) -> UtcOffsets:
+    """What the events of a session say; one whose data cannot be understood says nothing."""
+    steps = sorted(step for event in events if event.kind == CLOCK_STEP and (step := _step(event)) is not None)
+    if not steps:
+        return UtcOffsets()
+    return UtcOffsets(steps[0][1], tuple(step[0] for step in steps), tuple(step[2] for step in steps))
+
+
+def offset_event(time_ns: int, offset_ns: int) -> Event:
+    """That the offset is this one still, for a segment or a part that begins with it."""
+    data = {
+        "offset_before_ns": offset_ns,
+        "offset_after_ns": offset_ns,
+        "seen_ns": time_ns,
+        "stand_ns": time_ns,
+        "utc_ns": time_ns + offset_ns,
+    }
+    text = f"UTC is still {offset_ns / NS_PER_S:+.3f} s from recorded instants"
+    return Event(time_ns, "info", CLOCK_STEP, text, data)
+
+
+def _step(event: Event) -> tuple[int, int, int] | None:
+    """From when on, the offset before and after, ns."""
+    before, after = event.data.get("offset_before_ns"), event.data.get("offset_after_ns")
+    if isinstance(before, int) and isinstance(after, int):
+        return event.time_ns, before, after
+    return None

@@ -1,0 +1,1 @@
+"""Sessions back into readings, frames, steps and events."""

@@ -1,0 +1,36 @@
+"""Whether any frame has the camera's own temperature, without which no drift over it can be fitted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from foundation.errors import SessionError
+from recording.format.messages import CAMERA_META, FrameMeta, decode_frame_meta
+from recording.format.records import telemetry_messages
+
+NO_TEMPERATURE = "no frame has a good camera temperature"
+
+
+def has_temperature(metas: Iterable[FrameMeta]) -> bool | None:
+    """By the descriptions of the frames, as far as the first that has one; None without any description."""
+    found = None
+    for meta in metas:
+        if not math.isnan(meta.camera_degC):
+            return True
+        found = False
+    return found
+
+
+def has_recorded_temperature(segments: Iterable[Path]) -> bool | None:
+    """By these segments of the telemetry, as far as they can be read."""
+
+    def metas() -> Iterable[FrameMeta]:
+        for path in segments:
+            with suppress(SessionError):
+                for message in telemetry_messages(path, lambda channel: channel.topic == CAMERA_META):
+                    yield decode_frame_meta(message.data)
+
+    return has_temperature(metas())

@@ -1,0 +1,64 @@
+"""What the telemetry of a session says, gathered message by message, for those who look at all of it."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foundation.items import Event, StepMark
+from recording.format import messages
+from recording.format.messages import FrameMeta
+from recording.format.records import Message
+
+RUN_END = "run.end"  # kind of the event that tells how a run ended
+RUN_BEGINS = ("run.start", "run.resume")  # and of those that it began, or went on
+FrameKey = tuple[int, int]  # time_ns and sequence, which an image and its description share
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """The readings of one channel in the order they came."""
+
+    unit: str
+    times_ns: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+
+    @property
+    def is_degC(self) -> bool:
+        """It is a temperature."""
+        return self.unit == "degC"
+
+    def sorted_times_ns(self) -> NDArray[np.int64]:
+        """The instants, ascending, shape (n,)."""
+        return np.sort(np.array(self.times_ns, np.int64))
+
+
+@dataclass
+class Contents:
+    """Everything but the images; `channels` by their names."""
+
+    metas: list[tuple[FrameKey, FrameMeta]] = field(default_factory=list[tuple[FrameKey, FrameMeta]])
+    events: list[Event] = field(default_factory=list[Event])
+    marks: list[StepMark] = field(default_factory=list[StepMark])
+    channels: dict[str, Channel] = field(default_factory=dict[str, Channel])
+
+    def receive(self, message: Message) -> None:
+        """Keep what a message of the telemetry says; SessionError when it cannot be read."""
+        match message.topic:
+            case messages.CAMERA_META:
+                key = message.time_ns, message.sequence
+                self.metas.append((key, messages.decode_frame_meta(message.data)))
+            case messages.EVENT:
+                self.events.append(messages.decode_event(message.data, message.time_ns))
+            case messages.STEP:
+                self.marks.append(messages.decode_step(message.data, message.time_ns))
+            case topic if topic in messages.KIND_OF_TOPIC:
+                for reading in messages.decode_batch(topic, message.data, message.time_ns).readings:
+                    channel = self.channels.setdefault(reading.channel, Channel(reading.unit))
+                    channel.times_ns.append(reading.time_ns)
+                    channel.values.append(reading.value)
+            case _:
+                pass  # what viewers read: the same things in another form

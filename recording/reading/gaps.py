@@ -1,0 +1,125 @@
+"""Where a recording has holes.
+
+A channel is silent when two readings follow each other at more than max(3 x its median spacing, 5 s), or when it
+begins that much after the recording or ends that much before it; a failed read is a reading (BAD), not silence.
+Channels of a device that were silent together are one silence, and so are devices, within their own spacing.
+
+Frames are missing where the camera or its wire lost some (`dropped` of the frame after them), where the recorder lost
+some (its events `frames_dropped` say which), and where an image or its description is not there.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foundation.clock import NS_PER_S
+from foundation.instants import duration
+from foundation.items import Event
+from recording.format.utc_offsets import UtcOffsets
+
+FRAMES_DROPPED = "frames_dropped"  # kind of the recorder's events
+SHORTEST_NS = 5 * NS_PER_S
+MEDIANS = 3
+_RHYTHM = 3  # readings; with fewer there is no spacing to compare with
+# As recording/writing/losses.py says it: `block 3`, `blocks 12 to 14, 17`.
+_BLOCKS = re.compile(r"\bblocks? (\d+(?: to \d+)?(?:, \d+(?: to \d+)?)*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """No reading between two instants, ns; `names` are devices, or single channels of a device, or "everything"."""
+
+    names: tuple[str, ...]
+    begin_ns: int
+    end_ns: int
+
+    def text(self, utc: UtcOffsets) -> str:
+        """The silence as a sentence."""
+        verb = "was" if len(self.names) == 1 else "were"
+        span = f"from {utc.date_time(self.begin_ns)} to {utc.date_time(self.end_ns)} UTC"
+        return f"{', '.join(self.names)} {verb} silent {span} ({duration(self.end_ns - self.begin_ns)})"
+
+
+@dataclass(frozen=True, slots=True)
+class _Hole:
+    """A hole in one device; `limit_ns` is what its spacing allows."""
+
+    device: str
+    channels: frozenset[str]
+    begin_ns: int
+    end_ns: int
+    limit_ns: int
+
+
+def silences(times_ns: Mapping[str, NDArray[np.int64]]) -> list[Silence]:
+    """The silences in order of time; `times_ns` are the instants of each channel's readings, shape (n,), ascending."""
+    recorded = {channel: times for channel, times in times_ns.items() if len(times) >= _RHYTHM}
+    if not recorded:
+        return []
+    begin_ns = min(int(times[0]) for times in recorded.values())
+    end_ns = max(int(times[-1]) for times in recorded.values())
+    channels_of: dict[str, frozenset[str]] = {}
+    for channel in recorded:
+        channels_of[_device(channel)] = channels_of.get(_device(channel), frozenset()) | {channel}
+    together: list[list[_Hole]] = []
+    for hole in _holes(recorded, begin_ns, end_ns):
+        group = next((group for group in reversed(together) if _is_same(group[0], hole)), None)
+        if group is None:
+            together.append([hole])
+        else:
+            group.append(hole)
+    return [_silence(group, channels_of) for group in together]
+
+
+def _device(channel: str) -> str:
+    return channel.partition(".")[0]
+
+
+def _holes(recorded: Mapping[str, NDArray[np.int64]], begin_ns: int, end_ns: int) -> list[_Hole]:
+    """The holes of every channel, those of a device that are the same as one, in order of time."""
+    found: dict[tuple[str, int, int], _Hole] = {}
+    for channel, times_ns in recorded.items():
+        spacings_ns = np.diff(times_ns)
+        limit_ns = max(round(MEDIANS * float(np.median(spacings_ns))), SHORTEST_NS)
+        edges_ns = np.concatenate(([begin_ns], times_ns, [end_ns]))
+        for index in np.flatnonzero(np.diff(edges_ns) > limit_ns):
+            key = _device(channel), int(edges_ns[index]), int(edges_ns[index + 1])
+            known = found.get(key, _Hole(*key[:1], frozenset(), *key[1:], limit_ns))
+            found[key] = replace(known, channels=known.channels | {channel})
+    return sorted(found.values(), key=lambda hole: (hole.begin_ns, hole.end_ns, hole.device))
+
+
+def _is_same(one: _Hole, other: _Hole) -> bool:
+    """Two devices stopped and came back together, as far as their spacing can tell."""
+    tolerance_ns = max(one.limit_ns, other.limit_ns)
+    return (
+        one.device != other.device
+        and abs(one.begin_ns - other.begin_ns) <= tolerance_ns
+        and abs(one.end_ns - other.end_ns) <= tolerance_ns
+    )
+
+
+def _silence(group: Sequence[_Hole], channels_of: Mapping[str, frozenset[str]]) -> Silence:
+    """The time all of the group were silent."""
+    is_all = all(hole.channels == channels_of[hole.device] for hole in group)
+    if is_all and len(channels_of) > 1 and {hole.device for hole in group} == set(channels_of):
+        names: tuple[str, ...] = ("everything",)
+    else:
+        names = tuple(name for hole in group for name in _names(hole, channels_of[hole.device]))
+    return Silence(names, max(hole.begin_ns for hole in group), min(hole.end_ns for hole in group))
+
+
+def _names(hole: _Hole, channels: frozenset[str]) -> list[str]:
+    return [hole.device] if hole.channels == channels else sorted(hole.channels)
+
+
+def told_blocks(events: Iterable[Event]) -> list[range]:
+    """The block ids of frames that the recorder itself said it lost."""
+    texts = [event.text for event in events if event.kind == FRAMES_DROPPED]
+    runs = [run.split(" to ") for text in texts for found in _BLOCKS.findall(text) for run in found.split(", ")]
+    return [range(int(run[0]), int(run[-1]) + 1) for run in runs]

@@ -1,0 +1,272 @@
+"""What a recorded session is at a glance: what the ends of its files, the events near both ends of the run and its
+journal tell. Damage and unfinished segments are part of the answer, not a reason to give none.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+from foundation.items import Event, StepMark
+from recording.format import messages
+from recording.format.chain import Link, misplaced, missing_segments
+from recording.format.damage import DAMAGE, reading
+from recording.format.holes import holes_in, segments_text
+from recording.format.inventory import SegmentFile, State, inventory
+from recording.format.items import event_of, step_of
+from recording.format.layout import FINISHED, FRAMES, TELEMETRY
+from recording.format.records import Head, read_head, telemetry_messages
+from recording.format.summary import Summary, read_summary
+from recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
+from recording.format.wire import Source
+from recording.reading.camera_temperature import NO_TEMPERATURE, has_recorded_temperature
+from recording.reading.coverage import Coverage, coverage_of
+from recording.reading.ends import is_of_a_run, lost_end
+from recording.reading.extent import extent_of
+from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
+from recording.reading.kept import is_recovered
+from recording.reading.run_word import Files, Run, run_word
+from recording.reading.session import Session
+from recording.reading.walk import survey
+
+_NEAR = (messages.EVENT, messages.STEP)
+_LAST = 2  # segments of the telemetry: a run's end is told before its stand is safe, which may take ten minutes
+
+
+@dataclass(frozen=True, slots=True)
+class Glance:
+    """What names, sizes, heads and indexes tell. begin_ns and end_ns: log times of the first and the last message of
+    the finished segments, None when they hold none; `frames` are theirs, too. `troubles`: a sentence for each that is
+    damaged, `missing`: for each that is not there. utc: to UTC near both ends; the steps of the system clock between
+    them are not looked for. run: how the run ended. has_camera_degC: whether any frame has a good camera temperature,
+    None when no description of a frame can be read."""
+
+    path: Path
+    files: tuple[SegmentFile, ...]
+    metadata: dict[str, str]
+    attachments: dict[str, str]
+    frames: int
+    begin_ns: int | None
+    end_ns: int | None
+    troubles: tuple[str, ...]
+    missing: tuple[str, ...]
+    utc: UtcOffsets
+    run: Run
+    has_camera_degC: bool | None
+
+    @property
+    def size_bytes(self) -> int:
+        """All segments, also those that are not finished."""
+        return sum(file.size_bytes for file in self.files)
+
+    @property
+    def simulated(self) -> bool:
+        """The devices were fakes."""
+        return self.metadata.get("simulated") == "true"
+
+    def count(self, state: State) -> int:
+        """How many segments are in that state."""
+        return sum(file.state is state for file in self.files)
+
+    @property
+    def state(self) -> Files:
+        """Whether the files are sound, by what a glance can tell; `stand session verify` reads all of them."""
+        if self.troubles:
+            return Files.DAMAGED
+        return Files.INCOMPLETE if self.missing else Files.SOUND
+
+    @property
+    def lacks(self) -> str:
+        """What a fit would miss in these frames, in words; "" when there is nothing."""
+        return NO_TEMPERATURE if self.has_camera_degC is False else ""
+
+    @property
+    def state_text(self) -> str:
+        """The same with the first reason: `incomplete: telemetry/0003.mcap is missing`."""
+        reasons = self.troubles or self.missing
+        more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
+        return f"{self.state}: {reasons[0]}{more}" if reasons else str(self.state)
+
+
+class _Seen(NamedTuple):
+    """A finished segment that can be read."""
+
+    file: SegmentFile
+    head: Head
+    summary: Summary
+
+    @property
+    def link(self) -> Link:
+        """Its place in the chain."""
+        told = self.summary.statistics
+        times_ns = (told.message_start_time, told.message_end_time)
+        return Link(self.file.series, self.file.number, told.message_count, *times_ns, bool(self.head.salvaged))
+
+
+class _Near(NamedTuple):
+    """The events and step marks near both ends of the recording."""
+
+    events: list[Event]
+    marks: list[StepMark]
+
+
+def glance(path: Path) -> Glance:
+    """The session in `path` at a glance; SessionError when there is none. Costs a look at both ends of each segment."""
+    files = inventory(path)
+    if not files:
+        raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
+    troubles: list[str] = []
+    seen: list[_Seen] = []
+    for file in files:
+        if file.state is State.FINISHED:
+            try:
+                seen.append(_Seen(file, read_head(file.path), _summary(file.path)))
+            except SessionError as error:
+                troubles.append(within(path, error))
+    metadata, attachments = _opening(files, seen)
+    told = [each.summary.statistics for each in seen if each.summary.statistics.message_count]
+    near, journal = _near([each for each in seen if each.file.series == TELEMETRY]), journal_facts(path)
+    extent, utc = extent_of(metadata), offsets_of(near.events)
+    links = {each.file.name: each.link for each in seen}
+    coverage = coverage_of(files, links, near.events, holes_in(metadata.get("holes", "")), journal)
+    troubles += [*_misfits(seen, metadata), *_kept(files, seen)]
+    if journal is not None and journal.damage and extent is None:
+        troubles.append(f"{JOURNAL_NAME}: {journal.damage}")
+    missing = [*_missing(coverage), *(() if extent else _lost_end(coverage, near, journal, utc))]
+    if not troubles and not missing:
+        troubles, missing = _frames_held_against_descriptions(path, seen, coverage)
+    is_recording = any(file.state is State.RECORDING for file in files)
+    return Glance(
+        path,
+        files,
+        metadata,
+        attachments,
+        sum(each.summary.statistics.message_count for each in seen if each.file.series == FRAMES),
+        min((statistics.message_start_time for statistics in told), default=None),
+        max((statistics.message_end_time for statistics in told), default=None),
+        tuple(troubles),
+        tuple(missing),
+        utc,
+        extent.run if extent else run_word(near.events, journal, is_recording=is_recording),
+        has_recorded_temperature(each.file.path for each in seen if each.file.series == TELEMETRY),
+    )
+
+
+def _near(telemetry: Sequence[_Seen]) -> _Near:
+    """What the first segment of the telemetry, and those of the last minutes, say of the run and of UTC, as far as
+    they can be read."""
+    ends_ns = [each.summary.statistics.message_end_time for each in telemetry]
+    last_ns = max(ends_ns, default=0) - REPEATED_NS - NS_PER_S
+    near = _Near([], [])
+    for index, (each, end_ns) in enumerate(zip(telemetry, ends_ns, strict=True)):
+        if not index or end_ns >= last_ns or index >= len(telemetry) - _LAST:
+            with suppress(SessionError):
+                for message in telemetry_messages(each.file.path, lambda channel: channel.topic in _NEAR):
+                    if message.topic == messages.EVENT:
+                        near.events.append(event_of(message))
+                    else:
+                        near.marks.append(step_of(message))
+    return near
+
+
+def _misfits(seen: Sequence[_Seen], metadata: dict[str, str]) -> Iterator[str]:
+    """Segments of another session, or of another place in this one."""
+    for each in seen:
+        if each.head.session != metadata:
+            yield f"{each.file.name}: tells of another session than the other segments"
+        if misplaced(each.file.series, each.file.number, each.head.place, each.head.session):
+            yield f"{each.file.name}: tells of another place in the session than its name does"
+
+
+def _kept(files: Sequence[SegmentFile], seen: Sequence[_Seen]) -> Iterator[str]:
+    """Originals that a salvage kept because it could not recover all of them."""
+    by_name = {each.file.name: each for each in seen}
+    for file in files:
+        each = by_name.get(f"{file.series}/{file.number:04d}{FINISHED}")
+        if file.state is State.DAMAGED and (
+            each is None or not is_recovered(file, each.head.salvaged, each.link.count)
+        ):
+            yield f"{file.name}: is what a salvage could not recover all of"
+
+
+def _missing(coverage: Coverage) -> Iterator[str]:
+    files = coverage.files
+    if unfinished := sum(file.state is State.UNFINISHED for file in files):
+        yield f"{unfinished} segment{'' if unfinished == 1 else 's'} not finished"
+    if not any(file.series == TELEMETRY and file.state is not State.DAMAGED for file in files):
+        yield f"{TELEMETRY} is missing"
+    for series in (TELEMETRY, FRAMES):
+        for hole in missing_segments(series, (file.number for file in files if file.series == series), ()):
+            yield f"{segments_text(series, hole.first or 0, hole.last)} missing"
+    for hole in coverage.holes:
+        if not hole.excused:
+            yield "it is a copy of a session that was not whole"
+            return
+
+
+def _lost_end(coverage: Coverage, near: _Near, journal: JournalFacts | None, utc: UtcOffsets) -> Iterator[str]:
+    if journal is None and is_of_a_run(near.events, near.marks):
+        yield f"{JOURNAL_NAME} is missing"
+    lost = lost_end(coverage, near.events, (), journal, utc)
+    if lost is not None:
+        yield f"the end of the telemetry is missing: {lost.why}"
+
+
+def _frames_held_against_descriptions(
+    path: Path, seen: Sequence[_Seen], coverage: Coverage
+) -> tuple[list[str], list[str]]:
+    """Where the numbers of images and descriptions differ, the reasons are looked for in all of the telemetry:
+    troubles, and what is missing."""
+    frames = sum(each.link.count for each in seen if each.file.series == FRAMES)
+    if frames == sum(map(_descriptions, seen)) or any(file.state is State.RECORDING for file in coverage.files):
+        return [], []
+    try:
+        session = Session.open(path)
+        missing = [hole.text(session.utc) for hole in session.holes if not hole.excused]
+    except SessionError as error:
+        return [within(path, error)], []
+    return [], [f"{text} missing" for text in missing]
+
+
+def _descriptions(each: _Seen) -> int:
+    counts = each.summary.statistics.channel_message_counts
+    with suppress(*DAMAGE):
+        channels = each.summary.channels().items()
+        return sum(counts.get(number, 0) for number, (channel, _) in channels if channel.topic == messages.CAMERA_META)
+    return 0
+
+
+def within(directory: Path, error: SessionError) -> str:
+    """Its sentence, with the file's name as it is within the session."""
+    return str(error).removeprefix(f"{directory}/")
+
+
+def _summary(path: Path) -> Summary:
+    with reading(path), path.open("rb") as file:
+        return read_summary(file, path.stat().st_size)
+
+
+def _opening(files: Sequence[SegmentFile], seen: Sequence[_Seen]) -> tuple[dict[str, str], dict[str, str]]:
+    """Metadata `session` and the attachments: those that most finished segments have, else those of the first other
+    segment that can tell them; empty when none can."""
+    if seen:
+        sessions = Counter(tuple(each.head.session.items()) for each in seen)
+        most = dict(sessions.most_common(1)[0][0])
+        return most, next(each.head.attachments for each in seen if each.head.session == most)
+    for file in files:
+        try:
+            with file.path.open("rb") as opened:
+                found = survey(Source(opened.fileno()), to_first_chunk=True)
+        except OSError:
+            continue
+        if found.session is not None:
+            return found.session, {
+                name: entry.data.decode(errors="replace") for name, entry in found.attachments.items()
+            }
+    return {}, {}

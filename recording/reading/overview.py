@@ -1,0 +1,200 @@
+"""What a recorded session is, from all of its telemetry, as far as it can be read. Damage and unfinished segments are
+part of the answer, not a reason to give none.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from foundation.errors import SessionError
+from foundation.items import Event, StepMark, StepState
+from recording.format.images import decode_image
+from recording.format.inventory import SegmentFile, State
+from recording.format.layout import FRAMES
+from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
+from recording.format.utc_offsets import UtcOffsets, offsets_of
+from recording.reading.contents import RUN_BEGINS, RUN_END, Channel, Contents
+from recording.reading.gaps import Silence, silences, told_blocks
+from recording.reading.glance import Glance, glance, within
+from recording.reading.run_word import Files
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of the plan as it went; end_ns None and state STARTED: the recording has no end of it."""
+
+    index: int
+    step_id: str
+    kind: str
+    parameters: dict[str, object]
+    state: StepState
+    begin_ns: int
+    end_ns: int | None
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class Temperature:
+    """One channel in degC; min, mean and max are NaN when every reading was BAD."""
+
+    channel: str
+    count: int
+    bad: int
+    min_degC: float
+    mean_degC: float
+    max_degC: float
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """The images. `pixels`: those of the first, as in `2448 x 2048 px, 8 bit`; schema and pixels are "" without any.
+    described: descriptions in the telemetry. dropped: frames that the camera or its wire lost, as the descriptions say.
+    lost_by_recorder: frames of which its events say so."""
+
+    count: int
+    size_bytes: int
+    schema: str
+    pixels: str
+    first_ns: int | None
+    last_ns: int | None
+    described: int
+    dropped: int
+    lost_by_recorder: int
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """All that `stand session info` shows. `troubles` are the glance's and what reading the telemetry added."""
+
+    glance: Glance
+    troubles: tuple[str, ...]
+    steps: tuple[Step, ...]
+    frames: Frames
+    temperatures: tuple[Temperature, ...]
+    gaps: tuple[Silence, ...]
+    events: tuple[Event, ...]
+
+    @property
+    def state(self) -> Files:
+        """Whether the files are sound, by what was read."""
+        return Files.DAMAGED if self.troubles else self.glance.state
+
+    @property
+    def planned_steps(self) -> int | None:
+        """How many steps the plan of the run has, None when the recording does not tell; those of format 1 do not."""
+        begins = [event.data.get("steps") for event in self.events if event.kind in RUN_BEGINS]
+        told = begins[-1] if begins else None
+        return told if isinstance(told, int) else None
+
+    @property
+    def ending(self) -> Event | None:
+        """How the run ended, None when the recording does not tell."""
+        return next((event for event in reversed(self.events) if event.kind == RUN_END), None)
+
+    @property
+    def utc(self) -> UtcOffsets:
+        """From its instants to UTC as the host's system clock had it."""
+        return offsets_of(self.events)
+
+
+@dataclass
+class _Reading:
+    """What has been read of the segments so far."""
+
+    directory: Path
+    contents: Contents = field(default_factory=Contents)
+    places: list[FramePlace] = field(default_factory=list[FramePlace])
+    troubles: list[str] = field(default_factory=list[str])
+
+    def read(self, file: SegmentFile) -> None:
+        """A finished segment, as far as it goes."""
+        try:
+            if file.series == FRAMES:
+                self.places.extend(frame_places(file.path))
+                return
+            for message in telemetry_messages(file.path, lambda channel: True):
+                self.contents.receive(message)
+        except SessionError as error:
+            self.troubles.append(within(self.directory, error))
+
+
+def overview(path: Path) -> Overview:
+    """The session in `path`, all its telemetry read; SessionError when there is none."""
+    seen = glance(path)
+    read = _Reading(path)
+    for file in seen.files:
+        if file.state is State.FINISHED:
+            read.read(file)
+    contents = read.contents
+    frames = _frames(seen, read)  # before the troubles are told, which it may add to
+    times_ns = {name: channel.sorted_times_ns() for name, channel in contents.channels.items()}
+    return Overview(
+        seen,
+        tuple(dict.fromkeys((*seen.troubles, *read.troubles))),
+        tuple(_steps(contents)),
+        frames,
+        tuple(_temperature(name, channel) for name, channel in sorted(contents.channels.items()) if channel.is_degC),
+        tuple(silences(times_ns)),
+        tuple(sorted(contents.events, key=lambda event: event.time_ns)),
+    )
+
+
+def _steps(contents: Contents) -> Iterator[Step]:
+    """The steps in order of their index; of one that was begun again the last time counts."""
+    frames = Counter(meta.step_id for _, meta in contents.metas)
+    last: dict[str, list[StepMark]] = {}
+    for mark in sorted(contents.marks, key=lambda mark: mark.time_ns):
+        if mark.state is StepState.STARTED or mark.step_id not in last:
+            last[mark.step_id] = []
+        last[mark.step_id].append(mark)
+    for step_id, marks in sorted(last.items(), key=lambda item: item[1][0].index):
+        first, end = marks[0], marks[-1]
+        end_ns = None if end.state is StepState.STARTED else end.time_ns
+        yield Step(
+            first.index, step_id, first.kind, first.parameters, end.state, first.time_ns, end_ns, frames[step_id]
+        )
+
+
+def _frames(seen: Glance, read: _Reading) -> Frames:
+    size_bytes = sum(file.size_bytes for file in seen.files if file.series == FRAMES)
+    times_ns = [place.time_ns for place in read.places]
+    contents = read.contents
+    return Frames(
+        len(times_ns),
+        size_bytes,
+        read.places[0].schema if read.places else "",
+        _pixels(read),
+        min(times_ns, default=None),
+        max(times_ns, default=None),
+        len(contents.metas),
+        sum(meta.dropped for _, meta in contents.metas),
+        sum(map(len, told_blocks(contents.events))),
+    )
+
+
+def _pixels(read: _Reading) -> str:
+    """Of the first image; a damaged one is a trouble."""
+    if not read.places:
+        return ""
+    try:
+        place = read.places[0]
+        pixels = decode_image(place.schema, read_frame(place).data).pixels
+    except SessionError as error:
+        read.troubles.append(within(read.directory, error))
+        return ""
+    height, width = pixels.shape
+    return f"{width} x {height} px, {8 * pixels.itemsize} bit"
+
+
+def _temperature(name: str, channel: Channel) -> Temperature:
+    values = np.array(channel.values, np.float64)
+    good = values[~np.isnan(values)]
+    bad = len(values) - len(good)
+    if not len(good):
+        return Temperature(name, len(values), bad, np.nan, np.nan, np.nan)
+    return Temperature(name, len(values), bad, float(good.min()), float(good.mean()), float(good.max()))

@@ -1,0 +1,385 @@
+"""Reads a recorded session: metadata, readings, frames, steps, events. It needs no device and changes nothing.
+
+A topic of the telemetry is read only when asked for, and then kept; frames are decoded one at a time. Whatever is
+wrong with a session is a SessionError with a sentence.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import cached_property
+from itertools import accumulate, chain, pairwise
+from operator import attrgetter
+from pathlib import Path
+from types import MappingProxyType
+from typing import TypeVar
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from foundation.errors import SessionError
+from foundation.items import Event, Item, StepMark
+from foundation.readings import Frame
+from recording.format import messages
+from recording.format.chain import Link, misplaced
+from recording.format.damage import naming
+from recording.format.holes import Hole, holes_in
+from recording.format.inventory import State, inventory
+from recording.format.items import (
+    Description,
+    ImagesToCome,
+    RecordedImage,
+    describes_frame,
+    description_of,
+    event_of,
+    frame_of,
+    item_of,
+    stands_for_item,
+    step_of,
+)
+from recording.format.layout import DAMAGED, DEVICES, FINISHED, FORMAT, FRAMES, TELEMETRY, UNFINISHED
+from recording.format.records import (
+    FramePlace,
+    Message,
+    MessageSpan,
+    frame_places,
+    message_span,
+    read_frame,
+    read_head,
+    telemetry_messages,
+)
+from recording.format.utc_offsets import UtcOffsets, offsets_of
+from recording.reading.columns import Column, TopicColumns
+from recording.reading.contents import Contents
+from recording.reading.coverage import coverage_of
+from recording.reading.extent import extent_of
+from recording.reading.hole_finder import find_holes
+from recording.reading.journal_lines import journal_facts
+from recording.reading.run_word import Run, run_word
+
+T = TypeVar("T")
+_HOLES_TOLD_BY = (messages.CAMERA_META, messages.EVENT, messages.STEP)
+_FORMAT_DIGITS, _NUMBER_DIGITS = 4, 18
+
+
+class Session:
+    """A session directory. Of its segments those in `incomplete` were not finished, those in `damaged` were replaced
+    by what could be salvaged from them; both are not read."""
+
+    def __init__(self, path: Path, telemetry: list[Path], frames: list[Path]) -> None:
+        self.path = path
+        self.incomplete = _files_of(path, UNFINISHED)
+        self.damaged = _files_of(path, DAMAGED)
+        self._telemetry = telemetry
+        self._frames = frames
+        head = read_head(telemetry[0])
+        self.metadata = head.session
+        self._attachments = head.attachments
+        _check_format(path, self.metadata)
+        self._salvaged: dict[Path, bool] = {}  # of the segments known to belong here: whether a salvage has made them
+        for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others
+            with suppress(_Unreadable):  # it is told when it is read
+                self._check(segment)
+        self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
+        self._all_columns_read = False
+        self._places_of: dict[Path, list[FramePlace]] = {}
+        self._metas_of: dict[Path, dict[tuple[int, int], bytes]] = {}
+
+    @classmethod
+    def open(cls, path: Path) -> Session:
+        """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
+        telemetry, frames = (_segments(path / name, FINISHED) for name in (TELEMETRY, FRAMES))
+        if not telemetry:
+            count = len(_files_of(path, UNFINISHED))
+            unfinished = f", only {count} unfinished ones" if count else ""
+            raise SessionError(f"{path}: not a session: there is no finished segment in {path / TELEMETRY}{unfinished}")
+        return cls(path, telemetry, frames)
+
+    @property
+    def attachments(self) -> Mapping[str, str]:
+        """The attached files: name -> text."""
+        return MappingProxyType(self._attachments)
+
+    def attachment(self, name: str) -> str | None:
+        """The text of an attached file (`config.yaml`), None when there is none of that name."""
+        return self._attachments.get(name)
+
+    @property
+    def segments(self) -> tuple[Path, ...]:
+        """The finished segments, those of the telemetry first."""
+        return (*self._telemetry, *self._frames)
+
+    @property
+    def telemetry_segments(self) -> tuple[Path, ...]:
+        """The finished segments of the telemetry, in order."""
+        return tuple(self._telemetry)
+
+    @property
+    def frame_segments(self) -> tuple[Path, ...]:
+        """The finished segments with the images, in order."""
+        return tuple(self._frames)
+
+    def channels(self) -> list[str]:
+        """The channels that have readings, sorted."""
+        return sorted(self._all_columns())
+
+    def readings(self, channel: str) -> Column:
+        """(time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD. SessionError when the
+        session has no such channel."""
+        device = channel.partition(".")[0]
+        if device not in self._columns and not self._all_columns_read:
+            self._columns[device] = self._read_columns(device).get(device, {})
+        found = self._columns.get(device, {}).get(channel) or self._all_columns().get(channel)
+        if found is None:
+            raise SessionError(f"{self.path}: has no channel {channel}; there are {', '.join(self.channels())}")
+        return found
+
+    def _all_columns(self) -> dict[str, Column]:
+        if not self._all_columns_read:
+            self._columns = self._read_columns(None)
+            self._all_columns_read = True
+        return {channel: column for columns in self._columns.values() for channel, column in columns.items()}
+
+    def _read_columns(self, device: str | None) -> dict[str, dict[str, Column]]:
+        """Device -> channel -> column of the topics that `device` publishes on (None: of all); whoever shares them is
+        among the devices, but only where it shares them."""
+        topics: dict[str, TopicColumns] = {}
+
+        def is_wanted(channel: Channel) -> bool:
+            devices = channel.metadata.get(DEVICES, "").split(",")
+            return channel.topic in messages.KIND_OF_TOPIC and (device is None or device in devices)
+
+        def add(message: Message) -> None:
+            if message.topic not in topics:
+                topics[message.topic] = TopicColumns(message.topic)
+            topics[message.topic].add(message.data, message.time_ns)
+
+        for _ in self._decoded(is_wanted, add):
+            pass
+        columns: dict[str, dict[str, Column]] = {}
+        for topic in topics.values():
+            with naming(self.path / TELEMETRY):
+                for name, of_device in topic.columns().items():
+                    columns.setdefault(name, {}).update(of_device)
+        return columns
+
+    def steps(self) -> list[StepMark]:
+        """Every step mark, in order of time."""
+        found = self._decoded(lambda channel: channel.topic == messages.STEP, step_of)
+        return sorted(found, key=attrgetter("time_ns"))
+
+    def events(self) -> list[Event]:
+        """Every event, in order of time."""
+        found = self._decoded(lambda channel: channel.topic == messages.EVENT, event_of)
+        return sorted(found, key=attrgetter("time_ns"))
+
+    @cached_property
+    def utc(self) -> UtcOffsets:
+        """From its instants to UTC as the host's system clock had it."""
+        return offsets_of(self.events())
+
+    @property
+    def frame_count(self) -> int:
+        """How many frames were recorded."""
+        return sum(span.count for span in self._spans)
+
+    @property
+    def frame_times_ns(self) -> NDArray[np.int64]:
+        """Middle of the exposure of each frame, shape (frame_count,), ascending."""
+        return np.array([place.time_ns for place in self._places()], np.int64)
+
+    def frame(self, index: int) -> Frame:
+        """The frame of that index, counted from 0 in order of time; SessionError when there is none."""
+        if not 0 <= index < self.frame_count:
+            raise SessionError(f"{self.path}: has no frame {index}; it has {self.frame_count}, counted from 0")
+        if not self._is_in_order:
+            return frame_of(self._image(self._sorted_places[index]))
+        ends = list(accumulate(span.count for span in self._spans))
+        number = bisect_right(ends, index)
+        places = self._places_in(self._frames[number])
+        return frame_of(self._image(places[index - ends[number]]))  # counted from the segment's end
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames in order of time, each read and decoded when asked for. A frame whose description did not reach
+        the disk has NaN for exposure, gain and temperature."""
+        return map(frame_of, self.images())
+
+    def images(self) -> Iterator[RecordedImage]:
+        """The images in order of time as they were recorded, each read when asked for and not decoded."""
+        return map(self._image, self._places())
+
+    def items(self) -> Iterator[Item]:
+        """Every batch, frame, step mark and event in the order of their publication, each read when asked for.
+
+        A frame's place in that order is that of its description; a frame whose description is missing (an
+        UndescribedFrame) comes in order of time, and a description whose image is missing is none of these items.
+        Publishing the items to a recorder gives the same messages again.
+        """
+        return (item for item in self.items_and_descriptions() if not isinstance(item, Description))
+
+    def items_and_descriptions(self) -> Iterator[Item | Description]:
+        """As `items`, with the descriptions whose images are missing at their places."""
+        images = ImagesToCome(self._places(), (time_ns for time_ns, _ in self.frame_metas), self._image)
+        for message, item in self._decoded(stands_for_item, lambda message: (message, item_of(message))):
+            yield from map(frame_of, images.undescribed_before(message.time_ns))
+            if item is None:
+                yield from images.described_by(message)
+            else:
+                yield item
+        yield from map(frame_of, images.undescribed_before(None))
+
+    @property
+    def frame_metas(self) -> list[tuple[int, messages.FrameMeta]]:
+        """(time_ns, description) of every frame in order of publication, also of those whose image was lost."""
+        return list(self._decoded(describes_frame, description_of))
+
+    def _image(self, place: FramePlace) -> RecordedImage:
+        message = read_frame(place)
+        meta = self._meta(message.time_ns, message.sequence)
+        return RecordedImage(place.schema, message.data, message.sequence, message.time_ns, meta, place.path)
+
+    def _meta(self, time_ns: int, sequence: int) -> messages.FrameMeta | None:
+        """A frame's description, None when it is lost; only segments with messages before and after are read."""
+        for path, span in self._telemetry_spans:
+            if span.first_ns <= time_ns <= span.last_ns:
+                found = self._metas_in(path).get((time_ns, sequence))
+                if found is not None:
+                    with naming(path):
+                        return messages.decode_frame_meta(found)
+        return None
+
+    @cached_property
+    def _telemetry_spans(self) -> list[tuple[Path, MessageSpan]]:
+        return [(path, message_span(path)) for path in self._telemetry]
+
+    def _metas_in(self, segment: Path) -> dict[tuple[int, int], bytes]:
+        """(time, sequence) -> the description's message, not decoded."""
+        if segment not in self._metas_of:
+            self._check(segment)
+            found = telemetry_messages(segment, describes_frame)
+            self._metas_of[segment] = {(message.time_ns, message.sequence): message.data for message in found}
+        return self._metas_of[segment]
+
+    @cached_property
+    def _spans(self) -> list[MessageSpan]:
+        return [message_span(path) for path in self._frames]
+
+    @cached_property
+    def _is_in_order(self) -> bool:
+        """Whether each segment's frames are all later than those before: then one frame needs one segment's index."""
+        spans = [span for span in self._spans if span.count]
+        return all(earlier.last_ns <= later.first_ns for earlier, later in pairwise(spans))
+
+    def _places(self) -> Iterator[FramePlace]:
+        """The frames in order of time."""
+        if self._is_in_order:
+            return chain.from_iterable(map(self._places_in, self._frames))
+        return iter(self._sorted_places)
+
+    @cached_property
+    def _sorted_places(self) -> list[FramePlace]:
+        return sorted(chain.from_iterable(map(self._places_in, self._frames)), key=attrgetter("time_ns"))
+
+    def _places_in(self, segment: Path) -> list[FramePlace]:
+        """The frames of one segment in order of time."""
+        if segment not in self._places_of:
+            self._check(segment)
+            self._places_of[segment] = sorted(frame_places(segment), key=attrgetter("time_ns"))
+        return self._places_of[segment]
+
+    def _decoded(self, wanted: Callable[[Channel], bool], decode: Callable[[Message], T]) -> Iterator[T]:
+        """The telemetry of the wanted channels in the order of the files, each message decoded."""
+        for path in self._telemetry:
+            self._check(path)
+            for message in telemetry_messages(path, wanted):
+                try:
+                    item = decode(message)
+                except SessionError as error:
+                    raise SessionError(f"{path}: {error}") from error
+                yield item
+
+    @cached_property
+    def holes(self) -> tuple[Hole, ...]:
+        """What of the session is not there, of the telemetry first; those that are excused make it no less whole. Reads
+        the telemetry once."""
+        contents = Contents()
+        for message in self._decoded(lambda channel: channel.topic in _HOLES_TOLD_BY, lambda message: message):
+            contents.receive(message)
+        files, recorded = inventory(self.path), holes_in(self.metadata.get("holes", ""))
+        links = {f"{path.parent.name}/{path.name}": self._link(path) for path in self.segments}
+        journal = journal_facts(self.path)
+        coverage = coverage_of(files, links, contents.events, recorded, journal)
+        is_part = extent_of(self.metadata) is not None
+        return find_holes(coverage, contents, self.frame_times_ns.tolist(), journal, is_part=is_part)
+
+    def _link(self, segment: Path) -> Link:
+        span = message_span(segment)
+        return Link(
+            segment.parent.name,
+            _number(segment),
+            span.count,
+            span.first_ns,
+            span.last_ns,
+            self.is_salvaged(segment),
+        )
+
+    @cached_property
+    def run(self) -> Run:
+        """How its run ended, as far as the session tells."""
+        extent = extent_of(self.metadata)
+        if extent is not None:
+            return extent.run
+        is_recording = any(file.state is State.RECORDING for file in inventory(self.path))
+        return run_word(self.events(), journal_facts(self.path), is_recording=is_recording)
+
+    def is_salvaged(self, segment: Path) -> bool:
+        """Whether a salvage has made this segment of what a killed recorder left."""
+        self._check(segment)
+        return self._salvaged[segment]
+
+    def _check(self, segment: Path) -> None:
+        """SessionError when the segment is not of this session, or not of this place in it."""
+        if segment in self._salvaged:
+            return
+        try:
+            head = read_head(segment)
+        except SessionError as error:
+            raise _Unreadable(str(error)) from error
+        if head.session != self.metadata:
+            raise SessionError(f"{segment}: belongs to another session than {self._telemetry[0]}; move it away")
+        if head.place and misplaced(segment.parent.name, _number(segment), head.place, head.session):
+            where = f"{head.place.get('series')}/{head.place.get('number')}{FINISHED}"
+            raise SessionError(f"{segment}: was recorded as {where}; give it that name again, or move it away")
+        self._salvaged[segment] = bool(head.salvaged)
+
+
+class _Unreadable(SessionError):
+    """The head of a segment cannot be read."""
+
+
+def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
+    """SessionError for a session of a later version of thermostand."""
+    text = metadata.get("format", "1")
+    if not text.isdecimal() or len(text) > _FORMAT_DIGITS or int(text) > FORMAT:
+        raise SessionError(f"{path}: is of format {text[:20]!r}; this version of thermostand reads up to {FORMAT}")
+
+
+def _number(segment: Path) -> int:
+    digits = segment.name.partition(".")[0]
+    return int(digits) if digits.isdecimal() and len(digits) <= _NUMBER_DIGITS else -1
+
+
+def _files_of(path: Path, suffix: str) -> tuple[Path, ...]:
+    return (*_segments(path / TELEMETRY, suffix), *_segments(path / FRAMES, suffix))
+
+
+def _segments(folder: Path, suffix: str) -> list[Path]:
+    """The files in `folder` that end so, in order of their numbers; none when there is no such folder."""
+    try:
+        paths = [path for path in folder.iterdir() if path.name.endswith(suffix)]
+    except OSError:
+        return []
+    return sorted(paths, key=lambda path: (len(path.name), path.name))

@@ -1,0 +1,36 @@
+"""Opening a session to use all of it: one that is not whole is refused, or used with what is missing said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from foundation.errors import SessionError
+from recording.reading.ends import frames_of_plan
+from recording.reading.run_word import Run
+from recording.reading.session import Session
+
+_MOST = 6  # holes in a sentence before the rest is only counted
+Say = Callable[[str], None]
+
+
+def open_whole(path: Path, incomplete: Say | None = None) -> Session:
+    """The session in `path`; SessionError when something of it is missing, unless `incomplete` takes the sentence that
+    says what. Frames that were never acknowledged, or that the recorder itself said it lost, are not missing."""
+    session = Session.open(path)
+    check_whole(session, incomplete)
+    return session
+
+
+def check_whole(session: Session, incomplete: Say | None = None) -> None:
+    """As above, for a session that is open."""
+    missing = [hole for hole in session.holes if not hole.excused]
+    if not missing:
+        return
+    texts = [hole.text(session.utc) for hole in missing]
+    more = [f"{len(texts) - _MOST} more"] if len(texts) > _MOST else []
+    plan = frames_of_plan(session.events(), session.frame_count) if session.run is Run.COMPLETE else ""
+    sentence = f"{session.path}: is incomplete; missing: {'; '.join([*texts[:_MOST], *more])}{plan}"
+    if incomplete is None:
+        raise SessionError(f"{sentence}; with --incomplete what is there is used")
+    incomplete(f"{sentence}; only what is there is used")

@@ -1,0 +1,382 @@
+"""Unfinished and damaged segments become finished ones: nothing valid is lost, nothing invalid is delivered.
+
+What proves itself (recording/reading/walk.py) is copied message by message into a segment of the usual form, with a
+metadata record `salvage` that says from what. The copy is written as `NNNN.mcap.tmp`, synced and renamed; only then
+the original goes. It goes when the copy holds all of it but a block that was being written and never acknowledged;
+else it stays, as `NNNN.mcap.damaged`. A salvage that is killed is repeated, and one of a recording that is still
+under way (its recorder holds a lock on the segment) leaves that alone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from hashlib import blake2b
+from itertools import count
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.records import Channel
+from mcap.writer import CompressionType, Writer
+
+from foundation.errors import SessionError
+from foundation.sink import sync_folder
+from recording.format.layout import (
+    DAMAGED,
+    FINISHED,
+    FRAMES,
+    SALVAGE_METADATA,
+    SEGMENT_METADATA,
+    SESSION_METADATA,
+    TELEMETRY,
+    TEMPORARY,
+    UNFINISHED,
+    segment_metadata,
+)
+from recording.format.wire import Source
+from recording.reading.walk import StoredMessage, Survey, stored_messages, survey
+from recording.repair.opening import Opening, opening_of, segments_of
+from recording.repair.segment_check import check_segment
+from recording.repair.share_done import ReportShare, ShareDone, no_report
+from recording.writing.block import CHUNK_BYTES
+from recording.writing.locks import lock
+
+BEING_RECORDED = "is being recorded"
+COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}
+
+
+@dataclass(frozen=True, slots=True)
+class Salvaged:
+    """What became of one segment.
+
+    source: what was salvaged. path: the finished segment, None when nothing could be recovered. messages: how many of
+    `source` are in it. lost_bytes: in its damaged places; a block that was never acknowledged is not lost. reason:
+    what was wrong, BEING_RECORDED when it was left alone. kept: the original, when something of it is not in the copy.
+    """
+
+    source: Path
+    path: Path | None
+    messages: int
+    lost_bytes: int
+    reason: str
+    kept: Path | None
+
+
+def salvage_session(directory: Path, report: ReportShare = no_report) -> list[Salvaged]:
+    """Finish every unfinished segment and every finished one that is damaged. SessionError when there is no session,
+    or when the disk refuses: then the segment at hand is as it was and those before it are salvaged."""
+    folders = [directory / series for series in (TELEMETRY, FRAMES) if (directory / series).is_dir()]
+    if not folders:
+        raise SessionError(f"{directory}: not a session: it has neither {TELEMETRY} nor {FRAMES}")
+    return _salvage_folders(folders, True, report)
+
+
+def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salvaged]:
+    """Finish the unfinished segments of every session below `root`, without a look at the finished ones. SessionError
+    as above."""
+    left = {path.parent for pattern in (UNFINISHED, TEMPORARY) for path in root.glob(f"*/*/*{pattern}")}
+    folders = [folder for folder in sorted(left, reverse=True) if folder.name in COMPRESSION]  # telemetry is first
+    return _salvage_folders(folders, False, report)
+
+
+def _salvage_folders(folders: Iterable[Path], finished_too: bool, report: ReportShare) -> list[Salvaged]:
+    found = [(folder, segments_of(folder)) for folder in folders]
+    wanted = [path for _, paths in found for path in paths if finished_too or path.name.endswith(UNFINISHED)]
+    share = ShareDone(wanted, report)
+    return [done for folder, _ in found for done in _salvage_folder(folder, finished_too, share)]
+
+
+def _salvage_folder(folder: Path, finished_too: bool, share: ShareDone) -> Iterator[Salvaged]:
+    for copy in folder.glob(f"*{TEMPORARY}"):
+        _remove_left_over(copy)
+    for number in sorted({int(path.name.partition(".")[0]) for path in segments_of(folder)}):
+        yield from _salvage_number(folder / f"{number:04d}{FINISHED}", finished_too, share)
+
+
+def _remove_left_over(copy: Path) -> None:
+    """Remove what a killed salvage has left; not what one that lives is writing."""
+    with _refusing(copy), _locked(copy) as fd:
+        if fd is not None:
+            copy.unlink()
+
+
+def _salvage_number(finished: Path, finished_too: bool, share: ShareDone) -> Iterator[Salvaged]:
+    """The finished segment of a number first: the unfinished one beside it is compared with what it holds."""
+    part = finished.with_name(finished.name.replace(FINISHED, UNFINISHED))
+    has_part = part.is_file()
+    if finished.is_file() and (finished_too or has_part) and not _is_sound(finished, share):
+        yield _salvage_segment(finished, share)
+    share.finished(finished)
+    if has_part:
+        yield _salvage_segment(part, share)
+        share.finished(part)
+
+
+def _is_sound(path: Path, share: ShareDone) -> bool:
+    """Whether every byte of a finished segment is as it was written."""
+    return not check_segment(path, lambda message: None, share.within(path)).damages
+
+
+@contextmanager
+def _refusing(path: Path) -> Generator[None]:
+    """What the disk refuses inside becomes a SessionError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be salvaged and is left as it was ({error})") from error
+
+
+@contextmanager
+def _locked(path: Path) -> Generator[int | None]:
+    """The file, opened and locked; None when somebody else has it, or has just given it another name."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe of that name is never waited for
+    except FileNotFoundError:
+        yield None
+        return
+    try:
+        try:
+            lock(fd)
+            is_ours = os.path.samestat(os.fstat(fd), path.stat())
+        except (BlockingIOError, FileNotFoundError):
+            is_ours = False
+        yield fd if is_ours else None
+    finally:
+        os.close(fd)
+
+
+@dataclass(frozen=True, slots=True)
+class _Original:
+    """A segment under salvage: what proved itself of it, and the opening for its copy (None: not known)."""
+
+    path: Path
+    finished: Path
+    source: Source
+    found: Survey
+    opening: Opening | None
+
+    def messages(self) -> Iterator[tuple[Channel, StoredMessage]]:
+        """What can be delivered, in order."""
+        if self.opening is None:
+            return
+        for place in self.found.chunks:
+            for message in stored_messages(self.source, place):
+                if self.opening.knows(message.channel):
+                    yield self.opening.channels[message.channel], message
+
+    @property
+    def delivered(self) -> int:
+        """The number of `messages`."""
+        opening = self.opening
+        return sum(n for channel, n in self.found.messages.items() if opening is not None and opening.knows(channel))
+
+    @property
+    def unknown(self) -> int:
+        """Messages that cannot be delivered, because no segment tells of their channels."""
+        return self.found.messages.total() - self.delivered
+
+    @property
+    def is_all_there(self) -> bool:
+        """Whether a copy holds all that was ever acknowledged; of what was finished and is damaged nobody knows."""
+        return self.path != self.finished and not self.found.damages and not self.unknown
+
+
+def _salvage_segment(path: Path, share: ShareDone) -> Salvaged:
+    """One segment; SessionError when the disk refuses."""
+    finished = path.with_name(f"{path.name.partition('.')[0]}{FINISHED}")
+    with _refusing(path), _locked(path) as fd:
+        if fd is None:
+            return Salvaged(path, None, 0, 0, BEING_RECORDED, None)
+        source = Source(fd)
+        found = survey(source, report=share.within(path))
+        original = _Original(path, finished, source, found, opening_of(path, found))
+        if path != finished and finished.exists():
+            return _salvage_beside(original)
+        return _salvage_alone(original)
+
+
+def _salvage_alone(original: _Original) -> Salvaged:
+    if original.delivered or (original.opening is not None and _is_the_only_telemetry(original)):
+        with _copy_of(original) as copy:
+            return _settle(original, original.finished, copy)
+    return _settle(original, None)
+
+
+def _is_the_only_telemetry(original: _Original) -> bool:
+    """Without any telemetry, empty or not, the session's frames could not be opened."""
+    folder = original.path.parent
+    frames = segments_of(folder.parent / FRAMES)
+    return folder.name == TELEMETRY and bool(frames) and segments_of(folder) == [original.path]
+
+
+def _salvage_beside(part: _Original) -> Salvaged:
+    """An unfinished segment whose finished one is there, too, and sound: whichever holds all the messages of both."""
+    with part.finished.open("rb") as file:
+        source = Source(file.fileno())
+        found = survey(source)
+        finished = _Original(part.finished, part.finished, source, found, opening_of(part.finished, found))
+        ours, theirs = _digests(part), _digests(finished)
+    if ours <= theirs:
+        return _settle(part, part.finished)
+    if theirs < ours:
+        with _copy_of(part) as copy:
+            return _settle(part, part.finished, copy)
+    missing = (ours - theirs).total()
+    kept = _keep(part)
+    reason = f"holds {missing} messages that {part.finished.name} does not hold, and lacks some of that"
+    part.path.unlink()
+    sync_folder(kept.parent)
+    return Salvaged(part.path, part.finished, ours.total() - missing, part.found.lost_bytes, reason, kept)
+
+
+def _digests(original: _Original) -> Counter[bytes]:
+    """The messages, small and comparable."""
+    digests: Counter[bytes] = Counter()
+    for channel, message in original.messages():
+        key = f"{channel.topic} {message.sequence} {message.log_time_ns} {message.publish_time_ns}"
+        digests[blake2b(message.data, digest_size=16, key=blake2b(key.encode()).digest()).digest()] += 1
+    return digests
+
+
+@contextmanager
+def _copy_of(original: _Original) -> Generator[Path]:
+    """All that can be delivered, finished and on the disk as NNNN.mcap.tmp; it is locked until the block ends, and
+    removed again when the disk refuses."""
+    copy = original.finished.with_name(original.finished.name.replace(FINISHED, TEMPORARY))
+    with suppress(OSError):
+        os.truncate(original.path, original.source.size)  # gives back what a dead recorder had reserved behind its end
+    with _new_file(copy) as file:
+        try:
+            _write(file, original)
+            file.flush()
+            os.fsync(file.fileno())
+            yield copy
+        except BaseException:
+            with suppress(OSError):
+                copy.unlink()
+            raise
+
+
+def _new_file(path: Path) -> BinaryIO:
+    """A file that was not there, locked. Another salvage may take it for left over until it is: then there is another
+    one; FileExistsError when that is somebody else's."""
+    while True:
+        file = path.open("xb")
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if os.fstat(file.fileno()).st_nlink:
+            return file
+        file.close()
+
+
+def _write(file: BinaryIO, original: _Original) -> None:
+    """The copy, in the form of recording/writing/segment.py: the opening first, one frame per chunk."""
+    series = original.path.parent.name
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=COMPRESSION[series])
+    writer.start()
+    channels = _write_opening(writer, original)
+    for channel, message in original.messages():
+        writer.add_message(
+            channels[channel.id], message.log_time_ns, message.data, message.publish_time_ns, message.sequence
+        )
+        if series == FRAMES:
+            writer.flush()
+    writer.finish()
+
+
+def _write_opening(writer: Writer, original: _Original) -> Mapping[int, int]:
+    """Attachments, metadata, schemas and channels; channel numbers of the original -> of the copy."""
+    opening = original.opening
+    if opening is None:
+        raise ValueError("a copy needs an opening")
+    for attachment in opening.attachments.values():
+        writer.add_attachment(
+            attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+        )
+    number = int(original.finished.name.partition(".")[0])
+    writer.add_metadata(SESSION_METADATA, dict(opening.session))
+    place = segment_metadata(original.path.parent.name, number, opening.session)
+    writer.add_metadata(SEGMENT_METADATA, place)
+    writer.add_metadata(SALVAGE_METADATA, _salvage_metadata(original))
+    schemas = {
+        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
+        for _, schema in sorted(opening.schemas.items())
+    }
+    return {
+        channel.id: writer.register_channel(
+            channel.topic, channel.message_encoding, schemas[channel.schema_id], channel.metadata
+        )
+        for _, channel in sorted(opening.channels.items())
+        if opening.knows(channel.id)
+    }
+
+
+def _salvage_metadata(original: _Original) -> dict[str, str]:
+    return {
+        "source": original.path.name,
+        "reason": _reason(original),
+        "messages": str(original.delivered),
+        "lost_bytes": str(original.found.lost_bytes),
+        "damaged_places": str(len(original.found.damages)),
+    }
+
+
+def _reason(original: _Original) -> str:
+    found = original.found
+    reasons: list[str] = []
+    if found.damages:
+        places = "1 damaged place" if len(found.damages) == 1 else f"{len(found.damages)} damaged places"
+        reasons.append(f"{places} of {found.lost_bytes} bytes, the first at byte {found.damages[0].begin}")
+    if found.torn_bytes:
+        reasons.append(f"a block of {found.torn_bytes} bytes was being written at its end")
+    if found.is_session_wrong:
+        reasons.append("its metadata do not fit their CRC")
+    if original.opening is None:
+        reasons.append("no segment tells which session it belongs to")
+    elif original.unknown:
+        reasons.append(f"{original.unknown} messages are of channels no segment tells of")
+    if not reasons:
+        reasons.append("its index is damaged" if original.path == original.finished else "it was not finished")
+    return "; ".join(reasons)
+
+
+def _settle(original: _Original, path: Path | None, copy: Path | None = None) -> Salvaged:
+    """Put the copy, if there is one, in its place and the original out of the way. Each step leaves a state from
+    which a salvage goes on."""
+    folder = original.path.parent
+    kept = None if original.is_all_there else _keep(original)
+    if copy is not None:
+        os.replace(copy, original.finished)
+        sync_folder(folder)
+    if original.path != path:
+        original.path.unlink()
+        sync_folder(folder)
+    return Salvaged(original.path, path, original.delivered, original.found.lost_bytes, _reason(original), kept)
+
+
+def _keep(original: _Original) -> Path:
+    """A second name for the original, on the disk: NNNN.mcap.damaged, or NNNN.2.mcap.damaged when that is taken."""
+    number = original.finished.name.removesuffix(FINISHED)
+    names = (f"{number}{DAMAGED}" if n == 1 else f"{number}.{n}{DAMAGED}" for n in count(1))
+    for path in (original.path.with_name(name) for name in names):
+        if path.exists() and path.samefile(original.path):
+            return path
+        if not path.exists():
+            os.link(original.path, path)
+            sync_folder(path.parent)
+            return path
+    raise ValueError("counting ends")
+
+
+def salvage_line(salvaged: Salvaged) -> str:
+    """What became of a segment, which is named with its session."""
+    source = "/".join(salvaged.source.absolute().parts[-3:])
+    if salvaged.reason == BEING_RECORDED:
+        return f"{source}: left alone, it is being recorded"
+    outcome = f"{salvaged.messages} messages in {salvaged.path.name}" if salvaged.path else "nothing could be recovered"
+    lost = f", {salvaged.lost_bytes} bytes lost" if salvaged.lost_bytes else ""
+    kept = f", the original is kept as {salvaged.kept.name}" if salvaged.kept else ""
+    return f"{source}: {outcome}{lost}{kept} ({salvaged.reason})"

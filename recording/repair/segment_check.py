@@ -1,0 +1,317 @@
+"""One finished segment, every byte of it: what a CRC covers is checked by it, the rest by what is told twice.
+
+Only the index, the content of chunks and the attachments have CRCs. The rest stands in the file a second time: where
+each record is and how long, a chunk's own fields and each metadata's name in the index, the message indexes in the
+messages, the counts in the walk. Only text has no second telling: the name of the writer's library in the header,
+which nothing reads, and what metadata says but for the record `session`, which has a CRC in the record `segment`;
+recording/repair/verify.py compares them between segments.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, pairwise
+from math import inf
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Header,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from recording.format.damage import DAMAGE
+from recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
+from recording.format.records import Message
+from recording.format.summary import Summary, read_summary
+from recording.format.wire import (
+    CHUNK,
+    CRC,
+    LENGTH,
+    MESSAGE,
+    RECORD,
+    RECORD_LIMIT_BYTES,
+    ChunkHead,
+    bytes_of,
+    chunk_content,
+    records,
+    stream,
+)
+
+_DATA_END_BYTES = RECORD.size + CRC.size
+_PART_LIMIT_BYTES = RECORD_LIMIT_BYTES + (1 << 24)  # the indexes of its messages stand behind a chunk
+
+
+class Damage(NamedTuple):
+    """What is wrong, and the log times between which messages may be lost by it, ns; none are when begin > end."""
+
+    text: str
+    begin_ns: float = inf
+    end_ns: float = -inf
+
+
+@dataclass
+class SegmentCheck:
+    """What the walk through a segment found. `last_ns`: log time of its latest sound message."""
+
+    path: Path
+    damages: list[Damage] = field(default_factory=list[Damage])
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    messages: int = 0
+    first_ns: float = inf
+    last_ns: float = -inf
+
+
+def check_segment(path: Path, receive: Callable[[Message], None], report: Callable[[int], None]) -> SegmentCheck:
+    """Read the whole segment and hand each sound message to `receive`; `report` gets the number of bytes read so far.
+    Damage is not raised: it is listed, and the walk goes on at the next place the index tells of."""
+    check = SegmentCheck(path)
+    try:
+        with path.open("rb") as file:
+            walk = _Walk(check, file, _indexed(read_summary(file, path.stat().st_size)), receive)
+            walk.run(report)
+    except DAMAGE as error:
+        check.damages.append(Damage(_sentence(error), -inf, inf))
+    return check
+
+
+def _sentence(error: Exception) -> str:
+    """Our own sentences are ValueErrors; of the others the type says more than the text."""
+    return str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Index:
+    """The summary at `begin` near the end of the file: what stands before it, records by their place."""
+
+    begin: int
+    statistics: Statistics
+    chunks: Mapping[int, ChunkIndex]
+    attachments: Mapping[int, AttachmentIndex]
+    metadata: Mapping[int, MetadataIndex]
+    schemas: Mapping[int, Schema]
+    channels: Mapping[int, Channel]
+
+
+def _indexed(summary: Summary) -> _Index:
+    """The records of the index; raises one of DAMAGE."""
+    contents: dict[int, list[ReadDataStream]] = {}
+    for opcode, content in records(summary.content):
+        contents.setdefault(opcode, []).append(stream(content))
+    schemas = [Schema.read(data) for data in contents.get(Opcode.SCHEMA, ())]
+    channels = [Channel.read(data) for data in contents.get(Opcode.CHANNEL, ())]
+    chunks = [ChunkIndex.read(data) for data in contents.get(Opcode.CHUNK_INDEX, ())]
+    attachments = [AttachmentIndex.read(data) for data in contents.get(Opcode.ATTACHMENT_INDEX, ())]
+    metadata = [MetadataIndex.read(data) for data in contents.get(Opcode.METADATA_INDEX, ())]
+    (statistics,) = [Statistics.read(data) for data in contents.get(Opcode.STATISTICS, ())]
+    return _Index(
+        summary.begin,
+        statistics,
+        {chunk.chunk_start_offset: chunk for chunk in chunks},
+        {attachment.offset: attachment for attachment in attachments},
+        {entry.offset: entry for entry in metadata},
+        {schema.id: schema for schema in schemas},
+        {channel.id: channel for channel in channels},
+    )
+
+
+class _Walk:
+    """The walk from the header to the index, place by place."""
+
+    def __init__(self, check: SegmentCheck, file: BinaryIO, index: _Index, receive: Callable[[Message], None]) -> None:
+        self._check = check
+        self._file = file
+        self._index = index
+        self._receive = receive
+        self._counts: Counter[int] = Counter()  # of messages, by channel
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+
+    def run(self, report: Callable[[int], None]) -> None:
+        """Read everything; raises one of DAMAGE when the index does not tell of the whole file."""
+        places = self._places()
+        self._part(0, places[0], self._header)
+        for place, end in pairwise(places):
+            self._part(place, end, self._record)
+            report(end)
+        self._part(places[-1], self._index.begin, self._data_end)
+        metadata = self._check.metadata
+        if contradicts(metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})):
+            self._check.damages.append(Damage("the session's metadata do not fit their CRC"))
+        if not self._check.damages:
+            self._compare()
+
+    def _places(self) -> list[int]:
+        """Where each indexed record begins, in order, and where the last one ends."""
+        index = self._index
+        ends = {place: place + told.chunk_length + told.message_index_length for place, told in index.chunks.items()}
+        ends.update(
+            {place: place + told.length for place, told in chain(index.attachments.items(), index.metadata.items())}
+        )
+        places = sorted(ends)
+        last = index.begin - _DATA_END_BYTES
+        if [ends[place] for place in places] != [*places[1:], last]:
+            raise ValueError("the records its index tells of do not follow each other")
+        return [*places, last]
+
+    def _part(self, place: int, end: int, read: Callable[[int, bytes], None]) -> None:
+        """Read the bytes of one record; damage in it is noted."""
+        try:
+            if end - place > _PART_LIMIT_BYTES:
+                raise ValueError(f"a record claims {end - place} bytes")
+            self._file.seek(place)
+            read(place, self._file.read(end - place))
+        except DAMAGE as error:
+            told = self._index.chunks.get(place)
+            times_ns = (told.message_start_time, told.message_end_time) if told else (inf, -inf)
+            self._check.damages.append(Damage(f"{_sentence(error)} (at byte {place})", *times_ns))
+
+    def _header(self, place: int, data: bytes) -> None:
+        content = data[len(MCAP0_MAGIC) + RECORD.size :]
+        header = Header.read(stream(content))
+        if data != MCAP0_MAGIC + bytes_of(header) or header.profile:
+            raise ValueError("its first bytes are not the header of one of our files")
+
+    def _record(self, place: int, data: bytes) -> None:
+        index = self._index
+        content = data[RECORD.size :]
+        if place in index.chunks:
+            self._chunk(index.chunks[place], data)
+        elif place in index.attachments:
+            attachment = Attachment.read(stream(content))
+            _check_same(bytes_of(attachment), data, "an attachment")
+        else:
+            metadata = Metadata.read(stream(content))
+            _check_same(bytes_of(metadata), data, "a metadata record")
+            if metadata.name != index.metadata[place].name:
+                raise ValueError("a metadata record has another name than in the index")
+            self._check.metadata[metadata.name] = metadata.metadata
+
+    def _chunk(self, told: ChunkIndex, data: bytes) -> None:
+        """A chunk and the message indexes behind it."""
+        head, content = chunk_content(memoryview(data)[RECORD.size : told.chunk_length])
+        _check_same(_head_bytes(head, told), data[: RECORD.size + head.begin], "the head of a chunk")
+        messages = self._contents(content)
+        offsets, indexes = _message_indexes(messages, told.chunk_start_offset + told.chunk_length)
+        _check_same(indexes, data[told.chunk_length :], "the index of a chunk's messages")
+        times_ns = [message.time_ns for message in messages]
+        rebuilt = ChunkIndex(
+            chunk_length=told.chunk_length,
+            chunk_start_offset=told.chunk_start_offset,
+            compression=head.compression.decode(),
+            compressed_size=told.chunk_length - RECORD.size - head.begin,
+            message_end_time=max(times_ns),
+            message_index_length=len(indexes),
+            message_index_offsets=offsets,
+            message_start_time=min(times_ns),
+            uncompressed_size=head.size_bytes,
+        )
+        if rebuilt != told:
+            raise ValueError("a chunk's size or times are not those in the index")
+        for message in messages:
+            self._count(message)
+
+    def _contents(self, data: memoryview) -> list[_Placed]:
+        """The messages of a chunk; its schemas and channels are learnt."""
+        placed: list[_Placed] = []
+        offset = 0
+        for opcode, content in records(data):
+            if opcode == Opcode.MESSAGE:
+                channel, sequence, time_ns, _ = MESSAGE.unpack_from(content)
+                topic = self._index.channels[channel].topic  # the first chunk, which tells it too, may be damaged
+                message = Message(topic, sequence, time_ns, bytes(content[MESSAGE.size :]))
+                placed.append(_Placed(channel, offset, time_ns, message))
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream(content))
+                self._schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                known = Channel.read(stream(content))
+                self._channels[known.id] = known
+            else:
+                raise ValueError(f"a chunk holds a record of kind {opcode}")
+            offset += RECORD.size + len(content)
+        return placed
+
+    def _count(self, placed: _Placed) -> None:
+        check = self._check
+        check.messages += 1
+        check.first_ns = min(check.first_ns, placed.time_ns)
+        check.last_ns = max(check.last_ns, placed.time_ns)
+        self._counts[placed.channel] += 1
+        self._receive(placed.message)
+
+    def _data_end(self, place: int, data: bytes) -> None:
+        """Our writer makes no CRC of the whole data section (0): chunks and attachments have their own."""
+        _check_same(RECORD.pack(Opcode.DATA_END, CRC.size) + CRC.pack(0), data, "the end of the data")
+
+    def _compare(self) -> None:
+        """What the whole walk found against the index; ValueError when they differ."""
+        check, index = self._check, self._index
+        # Schemas and channels go into the first chunk; a segment without a message has none.
+        if index.chunks and (self._schemas, self._channels) != (index.schemas, index.channels):
+            raise ValueError("its schemas or channels are not those in its index")
+        found = Statistics(
+            attachment_count=len(index.attachments),
+            channel_count=len(index.channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(index.chunks),
+            message_count=check.messages,
+            message_end_time=int(check.last_ns) if check.messages else 0,
+            message_start_time=int(check.first_ns) if check.messages else 0,
+            metadata_count=len(index.metadata),
+            schema_count=len(index.schemas),
+        )
+        if found != index.statistics:
+            raise ValueError("it does not hold the messages its index tells of")
+
+
+class _Placed(NamedTuple):
+    """A message, its channel's number and where it begins in its chunk."""
+
+    channel: int
+    offset: int
+    time_ns: int
+    message: Message
+
+
+def _head_bytes(head: ChunkHead, told: ChunkIndex) -> bytes:
+    """What stands before the data of a chunk, by the index where that tells it."""
+    name = told.compression.encode()
+    times_ns = told.message_start_time, told.message_end_time
+    return (
+        RECORD.pack(Opcode.CHUNK, told.chunk_length - RECORD.size)
+        + CHUNK.pack(*times_ns, told.uncompressed_size, head.crc, len(name))
+        + name
+        + LENGTH.pack(told.compressed_size)
+    )
+
+
+def _message_indexes(messages: list[_Placed], place: int) -> tuple[dict[int, int], bytes]:
+    """The message indexes that belong behind a chunk, from `place` on: where each channel's is, and their bytes."""
+    entries: dict[int, list[tuple[int, int]]] = {}
+    for message in messages:
+        entries.setdefault(message.channel, []).append((message.time_ns, message.offset))
+    offsets: dict[int, int] = {}
+    data = b""
+    for channel, places in entries.items():
+        offsets[channel] = place + len(data)
+        data += bytes_of(MessageIndex(channel, places))
+    return offsets, data
+
+
+def _check_same(expected: bytes, found: bytes, what: str) -> None:
+    if expected != found:
+        raise ValueError(f"{what} is damaged")

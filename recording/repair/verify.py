@@ -1,0 +1,347 @@
+"""Is a recorded session whole? Reads every byte of it and says what is damaged or missing, a sentence each.
+
+An error is something that was recorded and cannot be trusted or is not there; a note is a hole in what was measured
+that the recording itself tells of: silence of a device, frames the camera or a slow disk lost, a salvaged segment.
+How the run ended is another matter: a stopped run has sound files.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+from foundation.errors import SessionError
+from recording.format.chain import MOST_MISSING, Link, foreign_numbers, misplaced, missing_segments
+from recording.format.holes import Hole, holes_in, segments_text
+from recording.format.images import CAMERA_IMAGE
+from recording.format.inventory import SegmentFile, State, inventory
+from recording.format.layout import (
+    FINISHED,
+    FRAMES,
+    SALVAGE_METADATA,
+    SEGMENT_METADATA,
+    SESSION_METADATA,
+    TELEMETRY,
+)
+from recording.format.records import Message
+from recording.format.utc_offsets import UtcOffsets, offsets_of
+from recording.reading.camera_temperature import NO_TEMPERATURE, has_temperature
+from recording.reading.contents import Contents, FrameKey
+from recording.reading.coverage import Coverage, coverage_of
+from recording.reading.ends import is_of_a_run, lost_end
+from recording.reading.extent import Extent, extent_of
+from recording.reading.frame_account import frame_account
+from recording.reading.gaps import FRAMES_DROPPED, silences, told_blocks
+from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
+from recording.reading.kept import is_recovered
+from recording.reading.run_word import Files, Run, run_word
+from recording.repair.segment_check import Damage, SegmentCheck, check_segment
+
+
+class Severity(StrEnum):
+    """error: damaged or missing. note: a hole in the data that is recorded as such."""
+
+    ERROR = "error"
+    NOTE = "note"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One sentence; `where` is the file it is about, as in `telemetry/0003.mcap`, or "" for the whole session. `files`:
+    what an error makes of the session's files, sound for a note."""
+
+    severity: Severity
+    where: str
+    text: str
+    files: Files = Files.SOUND
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.where}{': ' if self.where else ''}{self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What was read (finished segments), what was found, and how the run ended."""
+
+    findings: tuple[Finding, ...]
+    segments: int
+    messages: int
+    frames: int
+    bytes: int
+    run: Run
+
+    @property
+    def files(self) -> Files:
+        """The gravest of what was found."""
+        words = {finding.files for finding in self.findings}
+        return next((word for word in (Files.DAMAGED, Files.INCOMPLETE) if word in words), Files.SOUND)
+
+    @property
+    def is_sound(self) -> bool:
+        """Nothing is damaged or missing."""
+        return not any(finding.severity is Severity.ERROR for finding in self.findings)
+
+
+@dataclass
+class _Read:
+    """What the finished ones of `files` hold, their checks by their names."""
+
+    files: tuple[SegmentFile, ...]
+    contents: Contents = field(default_factory=Contents)
+    images: Counter[FrameKey] = field(default_factory=Counter[FrameKey])
+    checks: dict[str, SegmentCheck] = field(default_factory=dict[str, SegmentCheck])
+
+    def receive(self, message: Message) -> None:
+        """Keep what is compared later; SessionError when the message cannot be read."""
+        if message.topic == CAMERA_IMAGE:
+            self.images[message.time_ns, message.sequence] += 1
+        else:
+            self.contents.receive(message)
+
+    def is_damaged_at(self, series: str, time_ns: int) -> bool:
+        """What the series held of that instant may be in damage that is a finding already."""
+        return any(
+            damage.begin_ns <= time_ns <= damage.end_ns
+            for name, check in self.checks.items()
+            if name.startswith(f"{series}/")
+            for damage in check.damages
+        )
+
+    def coverage(self, journal: JournalFacts | None) -> Coverage:
+        """Which instants the segments that were read cover."""
+        session = self.session()
+        links = {file.name: _link(file, self.checks[file.name]) for file in self.files if file.name in self.checks}
+        return coverage_of(self.files, links, self.contents.events, holes_in(session.get("holes", "")), journal)
+
+    def session(self) -> dict[str, str]:
+        """The record `session` that most segments have."""
+        told = Counter(_entries(check.metadata.get(SESSION_METADATA)) for check in self.checks.values())
+        return dict(told.most_common(1)[0][0]) if told else {}
+
+
+def _link(file: SegmentFile, check: SegmentCheck) -> Link:
+    is_salvaged = SALVAGE_METADATA in check.metadata
+    return Link(file.series, file.number, check.messages, check.first_ns, check.last_ns, is_salvaged)
+
+
+def _extent(extent: Extent | None, utc: UtcOffsets) -> Iterator[Finding]:
+    if extent is not None:
+        yield _note(extent.text(utc))
+
+
+def _no_report(done_bytes: float, text: str) -> None:
+    """Nobody watches."""
+
+
+def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Verification:
+    """Read the whole session in `path`; `report` gets the bytes read so far and the segment.
+
+    SessionError when `path` is no session. Damage is not raised, it is found.
+    """
+    files = inventory(path)
+    if not files:
+        raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
+    finished = [file for file in files if file.state is State.FINISHED]
+    read = _Read(files)
+    done_bytes = 0
+    for file in finished:
+        read.checks[file.name] = _checked(file, read, report, done_bytes)
+        done_bytes += file.size_bytes
+    journal, utc = journal_facts(path), offsets_of(read.contents.events)
+    coverage = read.coverage(journal)
+    extent = extent_of(read.session())
+    findings = (
+        *_extent(extent, utc),
+        *_not_finished(files, read.checks),
+        *_missing(coverage, utc),
+        *_damaged(read),
+        *_metadata(finished, read),
+        *(() if extent else _journal_and_end(read.contents, coverage, journal, utc)),
+        *_frames_against_descriptions(read, coverage),
+        *_frames_lost(read.contents),
+        *_silences(read.contents),
+        *_camera_temperature(read.contents),
+    )
+    total = sum(check.messages for check in read.checks.values())
+    is_recording = any(file.state is State.RECORDING for file in files)
+    run = extent.run if extent else run_word(read.contents.events, journal, is_recording=is_recording)
+    return Verification(findings, len(finished), total, read.images.total(), done_bytes, run)
+
+
+def _checked(file: SegmentFile, read: _Read, report: Callable[[float, str], None], before_bytes: int) -> SegmentCheck:
+    unreadable: list[Damage] = []
+
+    def receive(message: Message) -> None:
+        try:
+            read.receive(message)
+        except SessionError as error:
+            unreadable.append(Damage(str(error), message.time_ns, message.time_ns))
+
+    check = check_segment(file.path, receive, lambda done_bytes: report(before_bytes + done_bytes, file.name))
+    check.damages.extend(unreadable)
+    return check
+
+
+def _not_finished(files: Iterable[SegmentFile], checks: Mapping[str, SegmentCheck]) -> Iterator[Finding]:
+    for file in files:
+        match file.state:
+            case State.UNFINISHED:
+                yield _missing_part("is not finished; `stand session salvage` recovers what is in it", file.name)
+            case State.DAMAGED if _is_recovered(file, checks.get(f"{file.series}/{file.number:04d}{FINISHED}")):
+                yield _note(
+                    "a salvage recovered every message and kept the original because it was finished and damaged; "
+                    "remove it when it is not needed",
+                    file.name,
+                )
+            case State.DAMAGED:
+                yield _error("is what a salvage kept of a segment because it could not recover all of it", file.name)
+            case State.RECORDING:
+                yield _note("is being recorded now and was not read", file.name)
+            case State.FINISHED:
+                pass
+
+
+def _is_recovered(kept: SegmentFile, salvaged: SegmentCheck | None) -> bool:
+    return salvaged is not None and is_recovered(kept, salvaged.metadata.get(SALVAGE_METADATA, {}), salvaged.messages)
+
+
+def _error(text: str, where: str = "") -> Finding:
+    return Finding(Severity.ERROR, where, text, Files.DAMAGED)
+
+
+def _missing_part(text: str, where: str = "") -> Finding:
+    return Finding(Severity.ERROR, where, text, Files.INCOMPLETE)
+
+
+def _note(text: str, where: str = "") -> Finding:
+    return Finding(Severity.NOTE, where, text)
+
+
+def _missing(coverage: Coverage, utc: UtcOffsets) -> Iterator[Finding]:
+    """Segments are numbered from 0 without a gap; a copy of a session with gaps has them in its record."""
+    for series in (TELEMETRY, FRAMES):
+        numbers = {file.number for file in coverage.files if file.series == series}
+        for number in sorted(foreign_numbers(numbers)):
+            yield _error(
+                f"is foreign: no segment of this session has a number beyond {MOST_MISSING} missing ones",
+                f"{series}/{number:04d}.mcap",
+            )
+        for hole in missing_segments(series, numbers, coverage.links.values()):
+            yield _missing_part(_are_missing(hole, utc), f"{series}/{hole.first:04d}.mcap")
+        if not numbers and series == TELEMETRY:
+            yield _missing_part("is missing", TELEMETRY)
+    for hole in coverage.holes:
+        found = _note if hole.excused else _missing_part
+        yield found(f"missing in the session this was copied from: {hole.text(utc)}")
+
+
+def _are_missing(hole: Hole, utc: UtcOffsets) -> str:
+    if hole.first == hole.last:
+        return "is missing"
+    when = hole.when(utc)
+    return f"is missing, and so are all up to {hole.last:04d}.mcap{f', {when}' if when else ''}"
+
+
+def _journal_and_end(
+    contents: Contents, coverage: Coverage, journal: JournalFacts | None, utc: UtcOffsets
+) -> Iterator[Finding]:
+    """The journal by itself, and what it says that is not in the recording."""
+    if journal is None and is_of_a_run(contents.events, contents.marks):
+        yield _missing_part("is missing; what the recording itself says of the run counts", JOURNAL_NAME)
+    if journal is not None and journal.damage:
+        yield _error(journal.damage, JOURNAL_NAME)
+    has_gap = any(hole.series == TELEMETRY for hole in coverage.holes) or any(
+        missing_segments(TELEMETRY, (file.number for file in coverage.files if file.series == TELEMETRY), ())
+    )
+    lost = lost_end(coverage, contents.events, () if has_gap else contents.marks, journal, utc)
+    if lost is not None and lost.hole.first is not None:
+        where = segments_text(TELEMETRY, lost.hole.first, None).partition(" ")[0]
+        yield _missing_part(f"is missing, with all that followed: {lost.why}", where)
+
+
+def _damaged(read: _Read) -> Iterator[Finding]:
+    for name, check in read.checks.items():
+        for damage in check.damages:
+            yield _error(f"is damaged: {damage.text}", name)
+
+
+def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
+    """Every segment tells of the same session, and of its own place in it."""
+    told = {file.name: check.metadata for file, check in zip(finished, read.checks.values(), strict=True)}
+    sessions = Counter(_entries(metadata.get(SESSION_METADATA)) for metadata in told.values())
+    for file in finished:
+        metadata = told[file.name]
+        is_whole = SESSION_METADATA in metadata and SEGMENT_METADATA in metadata
+        if not is_whole and read.checks[file.name].damages:
+            continue  # a finding already
+        if _entries(metadata.get(SESSION_METADATA)) != sessions.most_common(1)[0][0]:
+            yield _error("tells of another session than the other segments", file.name)
+        segment, session = metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})
+        if misplaced(file.series, file.number, segment, session):
+            yield _error("tells of another place in the session than its name does", file.name)
+        if (salvage := metadata.get(SALVAGE_METADATA)) is not None:
+            yield _note(f"was salvaged ({', '.join(f'{key}: {text}' for key, text in salvage.items())})", file.name)
+
+
+def _entries(metadata: dict[str, str] | None) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((metadata or {}).items()))
+
+
+def _frames_against_descriptions(read: _Read, coverage: Coverage) -> Iterator[Finding]:
+    """Every image has its description in the telemetry and the other way round; what was not read may have it."""
+    described = Counter(key for key, _ in read.contents.metas)
+    block_ids = {key: meta.block_id for key, meta in read.contents.metas}
+    told, utc = told_blocks(read.contents.events), offsets_of(read.contents.events)
+    found = frame_account(read.images, block_ids, described, told, coverage, read.is_damaged_at)
+    yield from _frames(_missing_part, found.bare, "without a description in the telemetry", utc)
+    yield from _frames(_missing_part, found.gone, "missing, though described in the telemetry", utc)
+    yield from _frames(_note, found.gone_told, "described but lost by the recorder, as its events say", utc)
+    yield from _frames(
+        _note, found.bare_torn, "without a description, which was lost when the recorder was killed", utc
+    )
+    yield from _frames(_note, found.gone_torn, "described but lost when the recorder was killed", utc)
+
+
+def _frames(
+    kind: Callable[[str], Finding], keys: Collection[FrameKey], what: str, utc: UtcOffsets
+) -> Iterator[Finding]:
+    """One finding for all frames of a kind."""
+    if keys:
+        times_ns, blocks = sorted(time_ns for time_ns, _ in keys), sorted(block for _, block in keys)
+        if len(keys) == 1:
+            yield kind(f"1 frame is {what}: block {blocks[0]}, {utc.date_time(times_ns[0])} UTC")
+            return
+        yield kind(
+            f"{len(keys)} frames are {what}: blocks {blocks[0]} to {blocks[-1]}, "
+            f"{utc.date_time(times_ns[0])} to {utc.date_time(times_ns[-1])} UTC"
+        )
+
+
+def _frames_lost(contents: Contents) -> Iterator[Finding]:
+    """What the recorder, and what camera and wire lost, as recorded."""
+    utc = offsets_of(contents.events)
+    for event in contents.events:
+        if event.kind == FRAMES_DROPPED:
+            yield _note(f"{utc.date_time(event.time_ns)} UTC: {event.text}")
+    dropped: Counter[str] = Counter()
+    for _, meta in contents.metas:
+        dropped[meta.step_id] += meta.dropped
+    steps = {mark.step_id: f"step {mark.index} ({mark.kind})" for mark in contents.marks}
+    for step_id, count in dropped.items():
+        if count:
+            lost = "1 frame" if count == 1 else f"{count} frames"
+            yield _note(f"{lost} of {steps.get(step_id, 'no step')} lost by the camera or its wire")
+
+
+def _camera_temperature(contents: Contents) -> Iterator[Finding]:
+    if has_temperature(meta for _, meta in contents.metas) is False:
+        yield _note(f"{NO_TEMPERATURE}: no drift over temperature can be fitted to them")
+
+
+def _silences(contents: Contents) -> Iterator[Finding]:
+    utc = offsets_of(contents.events)
+    for silence in silences({name: channel.sorted_times_ns() for name, channel in contents.channels.items()}):
+        yield _note(silence.text(utc))

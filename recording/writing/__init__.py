@@ -1,0 +1,1 @@
+"""Items onto the disk, durable before they count."""

@@ -1,0 +1,131 @@
+"""Whether the folders of a session are still where they were, and what is told when they are not."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from foundation.instants import utc_text
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.writing.home import FolderLost
+from recording.writing.space import Notice
+
+Refound = Callable[[], Awaitable[bool]]
+
+
+class Kept(NamedTuple):
+    """What a folder holds of this run: up to which instant, and how many frames or messages."""
+
+    until_ns: int
+    items: int
+
+
+_UNITS = {TELEMETRY: "messages", FRAMES: "frames"}
+
+
+class Beside(Protocol):
+    """A file of the session that somebody else writes, such as the journal."""
+
+    name: str
+
+    @property
+    def lost(self) -> str:
+        """Why it is not there any more, "" while it is."""
+        ...
+
+    async def refound(self) -> bool:
+        """Whether it is back; else it has been written anew. OSError when that cannot be done."""
+        ...
+
+
+class Homes:
+    """The losses that stand; used from the event loop. `there` is set while the frames' folder is."""
+
+    def __init__(self, directory: Path, tell: Callable[[Notice], None]) -> None:
+        self._directory = directory
+        self._tell = tell
+        self._lost: dict[str, str] = {}
+        self._kept: dict[str, Kept] = {}  # by what was lost
+        self._anew: list[str] = []  # made anew by a refounding that has not come to its end
+        self._reason = ""
+        self.beside: list[Beside] = []
+        self.refinding = asyncio.Event()
+        self.there = asyncio.Event()
+        self.there.set()
+
+    @property
+    def lost(self) -> str:
+        """The first loss as a sentence; "" when there is none, or while it is being made good."""
+        if self.refinding.is_set():
+            return ""
+        return self._first()
+
+    def _first(self) -> str:
+        return next((reason for reason in (*self._lost.values(), *(each.lost for each in self.beside)) if reason), "")
+
+    def follow(self, name: str, failure: OSError | str | None, kept: Kept) -> None:
+        """How the last look at one folder ended: only a FolderLost, or its sentence, is a loss; None ends it."""
+        was = self._first()
+        if isinstance(failure, FolderLost):
+            failure = str(failure.strerror)
+        if isinstance(failure, str):
+            self._lost[name] = failure
+            self._kept.setdefault(name, kept)
+        elif failure is None:
+            self._lost.pop(name, None)
+            self._kept.pop(name, None)
+        if FRAMES not in self._lost:
+            self.there.set()
+        else:
+            self.there.clear()
+        self._follow_change(was)
+
+    def _follow_change(self, was: str) -> None:
+        now = self._first()
+        if now and not was:
+            self._reason = now
+            self._tell(Notice("error", "folder_lost", now, {"folder": str(self._directory)}))
+        if was and not now and not self._anew:
+            self._tell(Notice("info", "folder_back", f"the session's folder {self._directory} is back"))
+
+    def refind(self) -> None:
+        """Ask for `refound`, when there is something to find again."""
+        if self._first():
+            self.refinding.set()
+
+    async def refound(self, telemetry: Refound, frames: Refound) -> tuple[str, ...]:
+        """Find or make again each part; the names of what had to be made anew. When the disk refuses, that is told and
+        the loss stands."""
+        parts = [(TELEMETRY, telemetry), (FRAMES, frames), *((each.name, each.refound) for each in self.beside)]
+        try:
+            for name, refound in parts:
+                if not await refound() and name not in self._anew:
+                    self._anew.append(name)
+                self._lost.pop(name, None)
+        except OSError as error:
+            text = f"{self._directory}: no folder can be made there again ({error})"
+            self._tell(Notice("error", "folder_not_made", text))
+            return ()
+        finally:
+            self.refinding.clear()
+        self.there.set()
+        anew, self._anew = tuple(self._anew), []
+        if not anew:
+            self._tell(Notice("info", "folder_back", f"the session's folder {self._directory} is back"))
+        return anew
+
+    def loss(self, anew: tuple[str, ...], from_ns: int) -> Notice:
+        """What is not in the session's folder any more: all that this run had recorded in what was made anew."""
+        gone = {name: self._kept[name] for name in anew if name in self._kept}
+        self._kept.clear()
+        to_ns = max((kept.until_ns for kept in gone.values()), default=from_ns)
+        counts = {name: kept.items for name, kept in gone.items()}
+        data = {"what": list(anew), "from_ns": from_ns, "to_ns": to_ns, "counts": counts, "reason": self._reason}
+        lost = "".join(f", {counts[name]} {_UNITS[name]}" for name in counts)
+        text = (
+            f"{self._reason}; {' and '.join(anew)} go on in a new place without what was recorded from "
+            f"{utc_text(from_ns)} to {utc_text(to_ns)}{lost}"
+        )
+        return Notice("error", "recording_lost", text, data)

@@ -1,0 +1,75 @@
+"""Who holds the lock of a recording's file: a daemon, or what a daemon that has gone has left behind.
+
+The disk process of a daemon that was killed ends within milliseconds; while the disk hangs it cannot, and its locks
+tell truly that a block may still be written.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from pathlib import Path
+
+from recording.writing.disk_process import MODULE
+
+_LEFT_WITHIN_S = 2.0
+_AGAIN_S = 0.02
+
+
+def lock(fd: int) -> None:
+    """Lock the file (flock); BlockingIOError, which says who, when somebody else has it. A disk process whose daemon
+    has gone is waited for for 2 s: it may just have been killed."""
+    deadline_s = time.monotonic() + _LEFT_WITHIN_S
+    while True:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            pid = holder(fd)
+            if not _may_end(pid) or time.monotonic() > deadline_s:
+                raise BlockingIOError(error.errno, _who(pid)) from None
+            time.sleep(_AGAIN_S)  # noqa: TID251 - as above
+        else:
+            return
+
+
+def holder(fd: int) -> int:
+    """The process that has locked this file, 0 when it cannot be told."""
+    found = os.fstat(fd)
+    device = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}"
+    lines = (line.split() for line in Path("/proc/locks").read_text().splitlines())
+    pids = {fields[5]: int(fields[4]) for fields in lines if fields[1] == "FLOCK"}
+    exactly = pids.get(f"{device}:{found.st_ino}", 0)
+    # Some file systems give their files another device than they lock them under.
+    return exactly or next((pids[place] for place in pids if place.endswith(f":{found.st_ino}")), 0)
+
+
+def _may_end(pid: int) -> bool:
+    """Whether the holder is no daemon and none's: a disk process that was left behind, or one that is just ending."""
+    return _is_left(pid) or not _command(pid)
+
+
+def _is_left(pid: int) -> bool:
+    """Whether this is a disk process whose daemon has gone."""
+    command = _command(pid)
+    if MODULE.encode() not in command:
+        return False
+    try:
+        parent = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
+    except OSError:
+        return True
+    return command[command.index(MODULE.encode()) + 1] != parent.encode()
+
+
+def _command(pid: int) -> list[bytes]:
+    """Empty for a process that has ended, or is ending."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[:-1]
+    except OSError:
+        return []
+
+
+def _who(pid: int) -> str:
+    if _is_left(pid):
+        return f"its daemon has ended, but process {pid} still waits for the disk; try again when the disk answers"
+    return "a daemon is running this session already"

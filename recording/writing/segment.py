@@ -1,0 +1,186 @@
+"""One MCAP segment of a series (frames or telemetry) of a session, written so that what is acknowledged survives.
+
+`NNNN.mcap.part` grows by whole blocks of records: one write, one fdatasync, then it is acknowledged. Its share of the
+disk is reserved when it is opened, so that a full disk refuses a new segment and not a frame. A finished segment gets
+its index, is synced and renamed to `NNNN.mcap`; one of many small chunks is written anew with large ones first.
+Metadata (`session`, `segment`) and attachments are the first records of every segment, so each is readable alone.
+Chunks have a CRC; a commit ends the chunk, so the frames series has one frame per chunk and the chunk index is its
+frame index.
+
+After any OSError the file is cut back to its last whole block and left as `.part`; its Writer is never used again,
+because its index would name chunks that were not written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding
+from mcap.writer import CompressionType
+from mcap_protobuf.schema import register_schema
+
+from foundation.sink import CommitSink, sync_folder
+from recording.format.damage import DAMAGE
+from recording.format.layout import DEVICES, FINISHED, SEGMENT_METADATA, SESSION_METADATA, UNFINISHED, segment_metadata
+from recording.writing.block import Block, chunk_writer
+from recording.writing.compaction import merge_chunks
+from recording.writing.space import disk_space
+
+MANY_CHUNKS = 32  # opening a chunk takes a reader as long as a dozen messages
+FILE_SYSTEM_BYTES = 1_000_000  # never reserved: the file system needs blocks of its own to hold a reserve
+
+
+class Record(NamedTuple):
+    """One encoded message; log and publish time are both `time_ns`."""
+
+    topic: str
+    time_ns: int
+    data: bytes
+    sequence: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a series, the class of its messages and the devices that publish on it."""
+
+    name: str
+    message: type[Message]
+    devices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SeriesForm:
+    """What every segment of a series has in common.
+
+    A segment is full at `segment_bytes` or `segment_ns`. `reserve_bytes` of the disk are allocated when it is opened,
+    less where that would leave less than `keep_free_bytes`. `merge_chunks`: a finished segment of many small chunks
+    is written anew with large ones.
+    """
+
+    name: str
+    topics: tuple[Topic, ...]
+    compression: CompressionType
+    session: Mapping[str, str]
+    attachments: Mapping[str, str]
+    segment_bytes: int
+    segment_ns: int
+    reserve_bytes: int = 0
+    keep_free_bytes: int = 0
+    merge_chunks: bool = False
+
+
+class Segment:
+    """One file of a series, from creation to finish; after an OSError of any method only `abandon` is left."""
+
+    def __init__(self, folder: Path, number: int, form: SeriesForm, time_ns: int) -> None:
+        self.begun_ns = time_ns
+        self.number = number
+        self._form = form
+        self._part = folder / f"{number:04d}{UNFINISHED}"
+        self._finished = folder / f"{number:04d}{FINISHED}"
+        self._block = Block()
+        self._writer = chunk_writer(self._block, form.compression)
+        self._chunk_count = 0
+        self._sink = CommitSink(self._part, _affordable_bytes(folder, form))
+        try:
+            sync_folder(folder)
+            self._channels = self._begin(number)
+            self._sink.append(self._block.take())
+        except OSError:
+            self._remove()
+            raise
+        self._opening_bytes = self._sink.committed_bytes  # what stands before the first message
+
+    def _begin(self, number: int) -> dict[str, int]:
+        """Header, attachments, metadata; schemas and channels go into the first chunk. Returns topic -> channel id."""
+        self._writer.start()
+        for name, text in self._form.attachments.items():
+            media_type = "application/yaml" if name.endswith(".yaml") else "text/plain"
+            self._writer.add_attachment(0, self.begun_ns, name, media_type, text.encode())
+        session = self._form.session
+        self._writer.add_metadata(SESSION_METADATA, dict(session))
+        self._writer.add_metadata(SEGMENT_METADATA, segment_metadata(self._form.name, number, session))
+        return {topic.name: self._register(topic) for topic in self._form.topics}
+
+    def _register(self, topic: Topic) -> int:
+        schema = register_schema(self._writer, topic.message)
+        devices = {DEVICES: ",".join(topic.devices)} if topic.devices else {}
+        return self._writer.register_channel(topic.name, MessageEncoding.Protobuf, schema, devices)
+
+    def commit(self, records: Iterable[Record]) -> None:
+        """All of `records` on the disk when this returns."""
+        for record in records:
+            self._writer.add_message(
+                self._channels[record.topic], record.time_ns, record.data, record.time_ns, record.sequence
+            )
+        self._writer.flush()
+        self._sink.append(self._block.take())
+        self._chunk_count += 1
+
+    @property
+    def committed_bytes(self) -> int:
+        """Size of the file."""
+        return self._sink.committed_bytes
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no message has been committed."""
+        return self._sink.committed_bytes <= self._opening_bytes
+
+    @property
+    def reserved_bytes(self) -> int:
+        """What of the reserve is not used yet."""
+        return self._sink.reserved_bytes
+
+    def finish(self) -> None:
+        """Index, sync, rename: the segment is complete and stays so. It is locked until it has its final name."""
+        self._writer.finish()
+        self._sink.append(self._block.take())
+        self._sink.settle()
+        if not (self._form.merge_chunks and self._chunk_count >= MANY_CHUNKS and self._merged()):
+            os.replace(self._part, self._finished)
+            sync_folder(self._part.parent)
+        self._sink.close()
+
+    def _merged(self) -> bool:
+        """Whether the finished segment is now the copy with large chunks; when the disk has no room for it, or gives
+        back other bytes than it took, the file stays as it was committed."""
+        try:
+            merge_chunks(self._part, self._finished, self._form.compression)
+        except DAMAGE:
+            return False
+        with suppress(OSError):  # the finished one counts where both are
+            self._part.unlink()
+        return True
+
+    def abandon(self) -> None:
+        """Let go after an error: what was committed stays as `.part`; a file without a message is removed. OSError
+        when the file cannot be cut back: as long as that lasts the block that failed may be in it."""
+        self._sink.settle()
+        if self.is_empty:
+            self._remove()
+        else:
+            self.close()
+
+    def close(self) -> None:
+        """Let go of the file as it is; may be called twice."""
+        self._sink.close()
+
+    def _remove(self) -> None:
+        with suppress(OSError):
+            self._part.unlink()
+        self.close()
+
+
+def _affordable_bytes(folder: Path, form: SeriesForm) -> int:
+    """What a segment may reserve here and now."""
+    if not form.reserve_bytes:
+        return 0
+    spare_bytes = disk_space(folder).free_bytes - max(form.keep_free_bytes, FILE_SYSTEM_BYTES)
+    return min(form.reserve_bytes, max(0, spare_bytes))

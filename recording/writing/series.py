@@ -1,0 +1,157 @@
+"""The segments of one folder, one after the other."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+
+from foundation.sink import CommitSink
+from recording.format.chain import foreign_numbers
+from recording.format.layout import TEMPORARY
+from recording.writing.home import Home
+from recording.writing.segment import Record, Segment, SeriesForm
+
+
+class Series:
+    """The segments of one folder, one open at a time. Blocking; used from one thread.
+
+    The folder is made when there is none, and never again but by `refound`: when it is removed or renamed, every write
+    raises FolderLost.
+    """
+
+    def __init__(self, folder: Path, form: SeriesForm) -> None:
+        self._folder = folder
+        self._form = form
+        self._home = Home(folder)
+        self._used = -1  # the highest number that a message was committed under; it is never used again
+        self._segment: Segment | None = None
+        self._failed: Segment | None = None  # given up, but not yet cut back to what was acknowledged
+        self.troubles: deque[str] = deque()  # errors that were overcome, as sentences; another thread may take them
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is an open segment."""
+        return self._segment is not None
+
+    @property
+    def reserved_bytes(self) -> int:
+        """What the open segment has reserved and not yet used; any thread may ask."""
+        segment = self._segment
+        return 0 if segment is None else segment.reserved_bytes
+
+    def open(self, time_ns: int) -> Segment:
+        """The open segment, begun when there is none; raises OSError.
+
+        None is begun while the one before still holds a block that was refused: it would be in both.
+        """
+        if self._segment is None:
+            self._home.check()
+            self._let_go()
+            number = max(next_number(self._folder), self._used + 1)
+            self._segment = Segment(self._folder, number, self._form, time_ns)
+        return self._segment
+
+    def commit(self, records: Sequence[Record], time_ns: int) -> None:
+        """All of `records` on the disk when this returns, in a new segment when the present one is full or fails;
+        OSError when the new one fails, too; FolderLost before anything is written. `time_ns` (now) decides whether a
+        segment is old enough to be closed."""
+        self._home.check()
+        self.finish_full(time_ns)
+        segment = self.open(time_ns)
+        try:
+            self._commit(segment, records)
+        except OSError:
+            self._commit(self.open(time_ns), records)
+
+    def _commit(self, segment: Segment, records: Sequence[Record]) -> None:
+        try:
+            segment.commit(records)
+        except OSError as error:
+            self._give_up(segment, error)
+            raise
+        self._used = max(self._used, segment.number)
+
+    def _give_up(self, segment: Segment, error: OSError) -> None:
+        if not segment.is_empty:  # else nothing is left behind that anybody would miss
+            self.troubles.append(f"a segment of {self._form.name} was given up ({error})")
+        self._failed, self._segment = segment, None
+        with suppress(OSError):  # tried again before the next segment
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Cut the segment that failed back and close it; OSError while the disk does not allow it."""
+        if self._failed is not None:
+            self._failed.abandon()
+            self._failed = None
+
+    def check(self) -> None:
+        """FolderLost when the folder has been removed or renamed; any OSError when it cannot be asked."""
+        self._home.check()
+
+    def probe(self, size_bytes: int, time_ns: int) -> None:
+        """OSError while the disk would refuse a segment, or a block of that size; nothing of it stays."""
+        self._home.check()
+        path = self._folder / f"probe{TEMPORARY}"  # the next salvage removes it when this process is killed meanwhile
+        path.unlink(missing_ok=True)
+        try:
+            with closing(CommitSink(path)) as sink:
+                sink.append([bytes(size_bytes)])
+                segment = self.open(time_ns)
+                if segment.is_empty:
+                    self._segment = None
+                    segment.abandon()
+        finally:
+            path.unlink(missing_ok=True)
+
+    def refound(self) -> bool:
+        """After a FolderLost: whether the folder is back, and writing goes on where it was; else one is made at its
+        place, and the numbers go on. OSError when that cannot be done."""
+        if self._home.refound():
+            return True
+        segment, self._segment = self._segment, None
+        self._close(segment)
+        return False
+
+    def close(self) -> None:
+        """Let go of the folder, after `finish`."""
+        self._home.close()
+
+    def finish_full(self, time_ns: int) -> None:
+        """Close the open segment when it has its size or age."""
+        segment, form = self._segment, self._form
+        if segment is None:
+            return
+        if segment.committed_bytes >= form.segment_bytes or time_ns - segment.begun_ns >= form.segment_ns:
+            self.finish()
+
+    def finish(self) -> bool:
+        """Close the open segment, if any; False when it cannot be finished: it stays `.part`, and that is a trouble."""
+        segment, self._segment = self._segment, None
+        try:
+            self._let_go()
+            if segment is not None:
+                segment.finish()
+        except OSError as error:
+            self.troubles.append(f"a segment of {self._form.name} stays unfinished ({error})")
+            self._close(segment)
+            return False
+        return True
+
+    def _close(self, unfinished: Segment | None) -> None:
+        """The last try to cut back what failed, then close it as it is: nothing of it is written elsewhere later."""
+        failed, self._failed = self._failed, None
+        for segment in (failed, unfinished):
+            if segment is not None:
+                with suppress(OSError):
+                    segment.abandon()
+                segment.close()
+
+
+def next_number(folder: Path) -> int:
+    """The number after the highest segment in `folder`, finished or not, damaged or half copied; 0 in an empty one. A
+    file that somebody has put there under a number far outside does not count."""
+    numbers = [int(match[1]) for path in folder.iterdir() if (match := re.match(r"(\d{4,})\.mcap", path.name))]
+    return max(set(numbers) - foreign_numbers(numbers), default=-1) + 1

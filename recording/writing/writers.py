@@ -1,0 +1,132 @@
+"""What the recorder's two threads do: frames, and telemetry, onto the disk. Each writer is used from its own thread;
+its counts may be read from any."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import Enum
+
+from foundation.items import Item
+from foundation.readings import Frame
+from recording.format.images import CAMERA_IMAGE
+from recording.format.items import Description
+from recording.writing.home import FolderLost
+from recording.writing.losses import Losses
+from recording.writing.segment import Record
+from recording.writing.store import SeriesFace, SpaceFace
+from recording.writing.telemetry import SEQUENCE_MASK, TelemetryEncoder
+
+PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second
+_OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
+
+
+class Fate(Enum):
+    """What became of a frame. LOST: for a reason that is not the disk's, or on a nearly full one, which is told by
+    itself. REFUSED: lost because the disk refuses it. HOMELESS: its folder is gone, and it may be saved later."""
+
+    SAVED = "saved"
+    LOST = "lost"
+    REFUSED = "refused"
+    HOMELESS = "homeless"
+
+
+class ImageWriter:
+    """Encodes and commits frames one by one. `done` frames are `saved` or counted as lost."""
+
+    def __init__(self, series: SeriesFace, encode: Callable[[Frame], bytes], space: SpaceFace, losses: Losses) -> None:
+        self._series = series
+        self._encode = encode
+        self._space = space
+        self._losses = losses
+        self._block_bytes = 0  # of the last frame that was offered to the disk
+        self.homeless: Frame | None = None  # found its folder gone; it is the first to be saved again
+        self.saved = 0
+        self.done = 0
+
+    def save(self, frame: Frame) -> tuple[Fate, str]:
+        """The frame on the disk; or why it is not, and it is counted as lost: the disk refuses it twice, it is nearly
+        full, or the frame cannot be encoded. One whose folder is gone is not lost."""
+        fate, reason = self._fate(frame)
+        self.homeless = frame if fate is Fate.HOMELESS else None
+        if self.homeless is not None:
+            return fate, reason
+        if fate is Fate.SAVED:
+            self.saved += 1
+        else:
+            self._losses.count(frame, reason)
+        self.done += 1
+        return fate, reason
+
+    def give_up(self, frame: Frame, reason: str) -> None:
+        """A frame that found no folder to the end."""
+        self.homeless = None
+        self._losses.count(frame, reason)
+        self.done += 1
+
+    def _fate(self, frame: Frame) -> tuple[Fate, str]:
+        try:
+            self._series.finish_full(frame.time_ns)
+            if not self._series.is_open:
+                self._space.check()
+            if self._space.frames_stopped:
+                self._series.finish()  # for as long as that takes nothing is left open, or reserved
+                return Fate.LOST, self._space.stop_reason
+            data = self._encode(frame)
+            self._block_bytes = len(data)
+            self._series.commit(
+                [Record(CAMERA_IMAGE, frame.time_ns, data, frame.block_id & SEQUENCE_MASK)], frame.time_ns
+            )
+        except FolderLost as error:
+            return Fate.HOMELESS, str(error.strerror)
+        except OSError as error:
+            return Fate.REFUSED, str(error)
+        except Exception as error:  # noqa: BLE001 - whatever an encoder makes of one frame, the night goes on
+            return Fate.LOST, f"{type(error).__name__}: {error}"
+        return Fate.SAVED, ""
+
+    def tend(self, now_ns: int, refused: bool) -> OSError | None:
+        """Without a frame: close the segment when it is old, and say whether frames could be written; `refused`: the
+        last one could not, and so a block as large is tried."""
+        try:
+            self._series.check()
+            self._series.finish_full(now_ns)
+            if refused:
+                self._series.probe(self._block_bytes + _OPENING_BYTES, now_ns)
+        except OSError as error:
+            return error
+        return None
+
+
+class TelemetryWriter:
+    """Encodes and commits items; what the disk refuses waits in memory and goes first the next time."""
+
+    def __init__(self, series: SeriesFace, encoder: TelemetryEncoder, space: SpaceFace) -> None:
+        self._series = series
+        self._encoder = encoder
+        self._space = space
+        self._backlog: list[Record] = []
+        self._items_encoded = 0
+        self.items_saved = 0
+        self.messages_saved = 0
+
+    @property
+    def waiting(self) -> int:
+        """Messages that are not on the disk yet."""
+        return len(self._backlog)
+
+    def save(self, items: Sequence[Item | Description], now_ns: int) -> OSError | None:
+        """All items so far on the disk, or why they are not; FolderLost also when there was nothing to write."""
+        for item in items:
+            self._backlog.extend(self._encoder.encode(item))
+            self._items_encoded += 1
+        try:
+            self._space.check()
+            self._series.check()
+            while portion := self._backlog[:PORTION_RECORDS]:
+                self._series.commit(portion, now_ns)
+                del self._backlog[: len(portion)]
+                self.messages_saved += len(portion)
+        except OSError as error:
+            return error
+        self.items_saved = self._items_encoded
+        return None

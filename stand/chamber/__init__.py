@@ -1,0 +1,1 @@
+"""The chamber: heat and cold with their permits, and the compressor."""

@@ -1,0 +1,136 @@
+"""When the refrigeration compressor runs: the regulator's cooling output is a wish, the compressor's health decides.
+
+The regulator's cooling period (at most 99 s) is far shorter than a compressor's minimum off time, so its output is
+read as a demand. Once started, the compressor keeps running and the heater trims the temperature, as in commercial
+climate chambers: that holds the air steady, where cycling at full stroke would swing it by kelvins. It stops when the
+regulator heats hard against it.
+
+What it did last is kept in a small file, so that a daemon that restarts, or crashes again and again, spares it as one
+that goes on: `restored` and `keep`. The file counts in the host's boot time and names the boot, so that a system clock
+that is stepped between two daemons neither shortens nor lengthens the rest. In virtual time, which has no boot, it
+counts in instants of the stand's clock.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from foundation.clock import Boot, seconds_ns
+from foundation.sink import sync_folder
+
+# Calls of `keep`, and of which of them the file at a path is.
+_calls = itertools.count(1)
+_placed: dict[Path, int] = {}
+_placing = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class CompressorLimits:
+    """Minimum off and on times (s), starts per hour, and the regulator outputs (%) that start and stop it."""
+
+    min_off_s: float
+    min_on_s: float
+    max_starts_per_h: int
+    start_above_cool_percent: float
+    stop_above_heat_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class CompressorState:
+    """`since_ns`: when it was last switched; `starts_ns`: starts of the last hour."""
+
+    running: bool
+    since_ns: int
+    starts_ns: tuple[int, ...] = ()
+
+
+def decide(
+    state: CompressorState, limits: CompressorLimits, mv_heat: float, mv_cool: float, now_ns: int
+) -> CompressorState:
+    """The compressor's state from now on; outputs in %, NaN (an unknown output) never starts it."""
+    hour_ago_ns = now_ns - seconds_ns(3600)
+    starts_ns = tuple(start for start in state.starts_ns if start > hour_ago_ns)
+    held_ns = now_ns - state.since_ns
+    if state.running:
+        unwanted = mv_heat > limits.stop_above_heat_percent and not mv_cool > 0
+        if unwanted and held_ns >= seconds_ns(limits.min_on_s):
+            return CompressorState(running=False, since_ns=now_ns, starts_ns=starts_ns)
+        return replace(state, starts_ns=starts_ns)
+    wanted = mv_cool > limits.start_above_cool_percent and mv_heat <= 0
+    rested = held_ns >= seconds_ns(limits.min_off_s)
+    if wanted and rested and len(starts_ns) < limits.max_starts_per_h:
+        return CompressorState(running=True, since_ns=now_ns, starts_ns=(*starts_ns, now_ns))
+    return replace(state, starts_ns=starts_ns)
+
+
+class _Kept(BaseModel):
+    """The file's content. boot_id: since_ns and starts_ns are boot time of that start of the host; without it (virtual
+    time, and files of before 2026-11-22) they are instants of the stand's clock."""
+
+    model_config = ConfigDict(strict=True)
+
+    running: bool
+    since_ns: int
+    starts_ns: list[int]
+    boot_id: str | None = None
+
+    def counts_in(self, boot: Boot | None) -> bool:
+        """Whether its times can be understood now."""
+        return self.boot_id is None if boot is None else boot.id != "" and self.boot_id == boot.id
+
+
+def restored(path: Path | None, now_ns: int, boot: Boot | None) -> CompressorState:
+    """What `path` keeps, for a compressor that is off now. When it was switched off is unknown, and so taken for just
+    now, when the file is missing or damaged, is of another boot, ends with a running compressor, or tells of the
+    future. Starts of another boot are forgotten."""
+    unknown = CompressorState(running=False, since_ns=now_ns)
+    if path is None:
+        return unknown
+    try:
+        kept = _Kept.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError):
+        return unknown
+    if not kept.counts_in(boot):
+        return unknown
+    began_ns = 0 if boot is None else boot.began_ns
+    starts_ns = tuple(start_ns + began_ns for start_ns in kept.starts_ns if start_ns + began_ns <= now_ns)
+    since_ns = kept.since_ns + began_ns
+    return CompressorState(False, now_ns if kept.running or since_ns > now_ns else since_ns, starts_ns)
+
+
+def keep(path: Path | None, state: CompressorState, boot: Boot | None) -> None:
+    """Write `state` to `path`, whole or not at all; it blocks for the disk. Raises OSError.
+
+    Several threads may keep at once: each has a temporary file of its own, and the state of the latest call stays.
+    """
+    if path is None:
+        return
+    number = next(_calls)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}-{number}.part")
+    try:
+        _write(part, state, boot)
+        with _placing:
+            if number > _placed.get(path, 0):
+                part.replace(path)
+                _placed[path] = number
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def _write(path: Path, state: CompressorState, boot: Boot | None) -> None:
+    began_ns = 0 if boot is None else boot.began_ns
+    starts_ns = [start_ns - began_ns for start_ns in state.starts_ns]
+    kept = {"running": state.running, "since_ns": state.since_ns - began_ns, "starts_ns": starts_ns}
+    with path.open("w", encoding="utf-8") as file:
+        json.dump(kept if boot is None else {**kept, "boot_id": boot.id}, file)
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,0 +1,65 @@
+"""What the compressor did last, on the disk for the next daemon; nobody waits for it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from foundation.clock import Clock, boot_of
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.lane import Lane
+from stand.chamber.compressor import CompressorState, keep
+
+_CLOSE_LIMIT_S = 1.0  # real seconds for the last state; a disk that hangs keeps no daemon
+
+
+class CompressorFile:
+    """Keeps the last state noted in `path`, None to keep none. States that come while the disk works wait their turn,
+    and only the last of them is written."""
+
+    def __init__(self, path: Path | None, hub: Hub, clock: Clock) -> None:
+        self._path = None if path is None else path.absolute()
+        self._hub = hub
+        self._clock = clock
+        self._lane: Lane | None = None
+        self._waiting: CompressorState | None = None
+        self._writing: asyncio.Task[None] | None = None
+        self._run: Callable[..., object] = _here
+
+    def through(self, run: Callable[..., object]) -> None:
+        """From now on `run(function, *arguments)` touches the disk: a process that may hang in our place."""
+        self._run = run
+
+    def note(self, state: CompressorState) -> None:
+        """Write `state` as soon as the disk takes it; returns at once."""
+        if self._path is None:
+            return
+        self._waiting = state
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.create_task(self._write(self._path))
+
+    async def close(self) -> None:
+        """Give the disk a moment for the last state; may be called twice."""
+        if self._writing is not None:
+            await asyncio.wait([self._writing], timeout=_CLOSE_LIMIT_S)
+            self._writing.cancel()
+        if self._lane is not None:
+            self._lane.close()
+            self._lane = None
+
+    async def _write(self, path: Path) -> None:
+        self._lane = self._lane or Lane("compressor-file", self._clock, patient=False)
+        while self._waiting is not None:
+            state, self._waiting = self._waiting, None
+            try:
+                await self._lane.call(self._run, keep, path, state, boot_of(self._clock))
+            except OSError as error:
+                text = f"the next start will not know when the compressor last ran: {error}"
+                self._hub.publish(Event(self._clock.now_ns(), "warning", "compressor_not_kept", text))
+
+
+def _here(function: Callable[..., object], *arguments: object) -> object:
+    """In this process."""
+    return function(*arguments)

@@ -1,0 +1,82 @@
+"""Renews the permits while the guard finds all well, and sees to it that nothing is on that is not permitted.
+
+It speaks to the bus, and may have to wait for it; the guard's looks do not. When it cannot renew, the relays drop by
+themselves, which is their safe state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from drivers.devices.regulator import Regulator
+from drivers.devices.relays import CAMERA_POWER
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.chamber.permits import Permission, Permits
+from stand.fault import value_of
+
+_SUPERVISED_S = 2.5  # between looks at relays and regulator while nothing is permitted: off again within 5 s
+
+
+@dataclass
+class Keeper:
+    """Every `renew_s` the permits while they are granted; without them every 2.5 s a look at what must be off.
+
+    `camera_dropped` is called when the camera's supply reads off though `camera_wanted` says that it is switched on.
+    """
+
+    permits: Permits
+    regulator: Regulator
+    hub: Hub
+    clock: Clock
+    renew_s: float
+    camera_wanted: Callable[[], bool]
+    camera_dropped: Callable[[], None]
+
+    async def run(self) -> None:
+        """Keep until cancelled."""
+        due_ns = self.clock.now_ns()
+        while True:
+            try:
+                await self.beat()
+            except DeviceError as error:
+                text = f"heating and cooling permits not renewed: {error}"
+                self._tell("permit_not_renewed", text)
+            period_s = self.renew_s if self.permits.granted else min(self.renew_s, _SUPERVISED_S)
+            due_ns = max(due_ns + seconds_ns(period_s), self.clock.now_ns())
+            await self.clock.sleep_until(due_ns)
+
+    async def beat(self) -> None:
+        """Once: the relays compared, and armed while that is permitted, else whatever runs stopped; DeviceError."""
+        if self.permits.granted:
+            mv_heat, mv_cool = (value_of(self.hub, f"{self.regulator.name}.{name}") for name in ("mv_heat", "mv_cool"))
+            coils = await self.permits.arm(mv_heat, mv_cool)
+        else:
+            coils = await self.permits.supervise()
+            await self._stop_regulator()
+        self._compare_supply(coils)
+
+    async def _stop_regulator(self) -> None:
+        """A regulator that runs, or gives an output, while nothing is permitted."""
+        if self.permits.permission is not Permission.WITHDRAWN:
+            return
+        readings = {reading.channel: reading.value for reading in await self.regulator.read()}
+        found = [
+            name for name in ("running", "mv_heat", "mv_cool") if readings.get(f"{self.regulator.name}.{name}", 0) > 0
+        ]
+        if not found or self.permits.permission is not Permission.WITHDRAWN:  # after the wait it may be permitted
+            return
+        self.permits.intrusions += 1
+        await self.regulator.make_safe()
+        text = f"{self.regulator.name} ran without permission ({', '.join(found)} above 0); stopped"
+        self._tell("switched_off", text, {"device": self.regulator.name, "times": self.permits.intrusions})
+
+    def _compare_supply(self, coils: Mapping[str, bool]) -> None:
+        if self.camera_wanted() and not coils.get(CAMERA_POWER, True):
+            self.camera_dropped()
+
+    def _tell(self, kind: str, text: str, data: Mapping[str, object] | None = None) -> None:
+        self.hub.publish(Event(self.clock.now_ns(), "warning", kind, text, data or {}))

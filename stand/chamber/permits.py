@@ -1,0 +1,235 @@
+"""Heat and cold are permitted for some seconds at a time, and relays are compared with what they were told.
+
+The relays of heater and compressor are only ever switched on by the board's own timer: a daemon that dies neither
+heats nor cools. Each is read before it is armed again; one that is off before its time has been dropped by something
+else (a brown-out of the board, another master), and a compressor that was dropped has stopped: it rests, and its next
+start counts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from drivers.devices.relays import Relays
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.errors import DeviceError, DeviceFault
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.chamber.compressor import CompressorLimits, CompressorState, decide
+
+HEATER, COMPRESSOR = "heater_enable", "compressor"
+_EARLY_S = 1.0  # a relay that is off so shortly before its time may just have dropped by itself
+
+# The self-test of the dead-man, in units of self_test_s / 3: armed, armed again, must be on, must be off.
+_AGAIN, _STILL_ON, _OFF, _PULSE = 2.0, 4.0, 6.5, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class PermitLimits:
+    """hold_s: how long a permission lives unless it is renewed. self_test_s: of the timed-on that tests the board."""
+
+    hold_s: float
+    self_test_s: float
+    compressor: CompressorLimits
+
+
+class Permission(StrEnum):
+    """revoked: the relays may still be on; withdrawn: they have been confirmed off, and must stay so."""
+
+    GRANTED = "granted"
+    REVOKED = "revoked"
+    WITHDRAWN = "withdrawn"
+
+
+class Permits:
+    """The relays of heater and compressor. `allowed` says whether the guard looks and finds all well: else nothing is
+    armed. `keep` is told of each change of the compressor, and must not wait."""
+
+    def __init__(
+        self,
+        relays: Relays,
+        limits: PermitLimits,
+        compressor: CompressorState,
+        keep: Callable[[CompressorState], None],
+        hub: Hub,
+        clock: Clock,
+    ) -> None:
+        self.name = relays.name
+        self.permission = Permission.REVOKED
+        self.intrusions = 0  # how often somebody else has switched heat or cold on since the permission was withdrawn
+        self.allowed: Callable[[], bool] = lambda: True
+        self._relays = relays
+        self._limits = limits
+        self._compressor = compressor
+        self._keep = keep
+        self._hub = hub
+        self._clock = clock
+        self._until_ns: dict[str, int] = {}  # when an armed relay drops unless it is armed again
+        self._comparing = asyncio.Lock()  # what is compared must not be switched meanwhile, but for making safe
+
+    @property
+    def granted(self) -> bool:
+        """Whether heat and cold are permitted."""
+        return self.permission is Permission.GRANTED
+
+    def grant(self) -> None:
+        """Permit heat and cold; `arm` switches."""
+        self.permission, self.intrusions = Permission.GRANTED, 0
+
+    def revoke(self) -> None:
+        """Nothing is armed from now on."""
+        self.permission = Permission.REVOKED
+
+    def forgive(self) -> None:
+        """An operator has seen to whoever switched what was not permitted."""
+        self.intrusions = 0
+
+    async def make_safe(self) -> None:
+        """Both off, confirmed; DeviceError."""
+        self.revoke()
+        await self._relays.make_safe()
+        self._are_off()
+
+    async def withdraw_left_on(self) -> None:
+        """Before anything else: what another daemon, or somebody by hand, left on is switched off and told. A
+        compressor that ran until now begins its rest now."""
+        left_on = {name for name, on in (await self._coils()).items() if on} & {HEATER, COMPRESSOR}
+        await self._relays.make_safe()
+        for channel in sorted(left_on):
+            self._tell("left_on", f"{self.name}.{channel} was on; switched off", channel)
+        if COMPRESSOR in left_on:
+            self._set(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
+        self._are_off()
+
+    async def arm(self, mv_heat: float, mv_cool: float) -> dict[str, bool]:
+        """Compare and, while permitted and allowed, arm the relays again; the regulator's outputs in %. Returns what
+        the coils read before that. Both drop by themselves `hold_s` later."""
+        async with self._comparing:
+            coils = await self._coils()
+            if self.granted:
+                self._compare(coils)
+            if self.granted and coils[COMPRESSOR] and not self._compressor.running:
+                await self._intruded(COMPRESSOR)
+            if self.granted and self.allowed():
+                await self._hold_on(HEATER)
+            if self.granted and self.allowed():  # still, after the wait
+                await self._arm_compressor(mv_heat, mv_cool)
+            return coils
+
+    async def supervise(self) -> dict[str, bool]:
+        """While the permission is withdrawn: whatever reads on nevertheless is switched off, and told. Returns what the
+        coils read before that."""
+        async with self._comparing:
+            was_withdrawn = self.permission is Permission.WITHDRAWN
+            coils = await self._coils()
+            for channel in (HEATER, COMPRESSOR):
+                if coils[channel] and was_withdrawn and self.permission is Permission.WITHDRAWN:
+                    await self._intruded(channel)
+            return coils
+
+    async def test_dead_man(self) -> None:
+        """Before the heater's relay is trusted: does the board drop it in time, and does arming it again start its time
+        again? DeviceFault when not: such a board would cut the heat at random, or never.
+
+        The regulator must be stopped, with an output of 0. Event "dead_man_tested" with what was found.
+        """
+        unit_s, begin_ns = self._limits.self_test_s / _PULSE, self._clock.now_ns()
+
+        async def at(units: float) -> bool:
+            await self._clock.sleep_until(begin_ns + seconds_ns(units * unit_s))
+            return (await self._coils())[HEATER]
+
+        try:
+            await self._relays.hold_on(HEATER, self._limits.self_test_s)
+            await at(_AGAIN)
+            await self._relays.hold_on(HEATER, self._limits.self_test_s)
+            on, off = await at(_STILL_ON), not await at(_OFF)
+        finally:
+            await self._relays.switch(HEATER, on=False)
+        data: dict[str, object] = {"rearmed": on, "dropped": off, "pulse_s": self._limits.self_test_s}
+        if on and off:
+            text = f"{self.name}: the heater's relay is held by timed commands and drops without them"
+            self._hub.publish(Event(self._clock.now_ns(), "info", "dead_man_tested", text, data))
+            return
+        fault = "does not drop by itself when its time is over" if on else "does not start its time again when re-armed"
+        text = f"this board is not suited: a timed-on of the heater's relay {fault}; heat could not be guarded with it"
+        self._hub.publish(Event(self._clock.now_ns(), "error", "dead_man_tested", f"{self.name}: {text}", data))
+        raise DeviceFault(self.name, text)
+
+    def _compare(self, coils: dict[str, bool]) -> None:
+        """What has dropped though its time was not over."""
+        now_ns = self._clock.now_ns()
+        for channel in (HEATER, COMPRESSOR):
+            until_ns = self._until_ns.get(channel, 0)
+            if coils[channel] or not until_ns:
+                continue
+            del self._until_ns[channel]
+            early = until_ns - now_ns > seconds_ns(_EARLY_S)
+            if channel == COMPRESSOR and self._compressor.running:
+                # One that was not renewed in time has dropped by itself: its rest began there.
+                self._set(
+                    CompressorState(False, now_ns if early else min(now_ns, until_ns), self._compressor.starts_ns)
+                )
+            if early:
+                left_s = (until_ns - now_ns) / NS_PER_S
+                rest = "; it counts as a stop, and the compressor rests" if channel == COMPRESSOR else ""
+                text = f"{self.name}.{channel} is off {left_s:.1f} s before its time: something else switched it{rest}"
+                self._tell(f"{channel}_dropped", text, channel)
+
+    async def _arm_compressor(self, mv_heat: float, mv_cool: float) -> None:
+        wanted = decide(self._compressor, self._limits.compressor, mv_heat, mv_cool, self._clock.now_ns())
+        switched = wanted.running != self._compressor.running
+        if wanted.running:
+            if switched:
+                self._set(wanted)  # before it runs: a start that nobody sees confirmed is a start
+            await self._hold_on(COMPRESSOR)
+        elif switched:
+            await self._relays.switch(COMPRESSOR, on=False)
+            self._until_ns.pop(COMPRESSOR, None)
+        self._set(wanted)
+        if switched:
+            text = "compressor started" if wanted.running else "compressor stopped"
+            self._hub.publish(Event(self._clock.now_ns(), "info", "compressor", text, {"running": wanted.running}))
+
+    async def _intruded(self, channel: str) -> None:
+        """Somebody else has switched it on."""
+        self.intrusions += 1
+        now_ns = self._clock.now_ns()
+        await self._relays.switch(channel, on=False)
+        if channel == COMPRESSOR:
+            self._set(CompressorState(False, self._clock.now_ns(), (*self._compressor.starts_ns, now_ns)))
+        self._tell("switched_off", f"{self.name}.{channel} was on without permission; switched off", channel)
+
+    async def _hold_on(self, channel: str) -> None:
+        """Armed from the instant of the call at the earliest."""
+        until_ns = self._clock.now_ns() + seconds_ns(self._limits.hold_s)
+        try:
+            await self._relays.hold_on(channel, self._limits.hold_s)
+        except DeviceError:  # it may be on all the same: a compressor that then drops has run, and has to rest
+            self._until_ns.setdefault(channel, until_ns)
+            raise
+        self._until_ns[channel] = until_ns
+
+    def _are_off(self) -> None:
+        """Both have been confirmed off."""
+        self._until_ns.clear()
+        if not self.granted:
+            self.permission = Permission.WITHDRAWN
+        if self._compressor.running:
+            self._set(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
+
+    def _set(self, compressor: CompressorState) -> None:
+        was, self._compressor = self._compressor, compressor
+        if (compressor.running, compressor.since_ns) != (was.running, was.since_ns):
+            self._keep(compressor)
+
+    async def _coils(self) -> dict[str, bool]:
+        readings = await self._relays.read()
+        return {reading.channel.partition(".")[2]: reading.value == 1 for reading in readings}
+
+    def _tell(self, kind: str, text: str, channel: str) -> None:
+        data: dict[str, object] = {"relay": channel, "times": self.intrusions}
+        self._hub.publish(Event(self._clock.now_ns(), "warning", kind, text, data))

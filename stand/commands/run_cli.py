@@ -1,0 +1,206 @@
+"""The commands that run a recipe: demo, run, resume."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated
+
+import typer
+
+from foundation.errors import ConfigError, SessionError
+from foundation.exit_codes import INTERRUPTED, NOT_REPORTED, one_line_errors
+from foundation.hub import Hub
+from foundation.progress import progress
+from foundation.usage import one_line, tell
+from recording.repair.salvage import salvage_line
+from stand.aside import aside
+from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.estimating.estimate import PricedStep, price
+from stand.estimating.follow import Follow
+from stand.estimating.learned import learn, load_learned
+from stand.running.order_files import load_order
+from stand.running.resume import interruption
+from stand.running.run import resume, run_real, run_virtual
+from stand.running.stop import Interrupted
+from stand.session_report import NotReported, check_reportable, report_session
+
+app = typer.Typer(add_completion=False)
+
+ReportOption = Annotated[
+    bool, typer.Option("--report", help="Then fit the drift: model.json and report.html, in the session's folder.")
+]
+
+AttendedOption = Annotated[
+    bool, typer.Option("--attended", help="Somebody is there: the run waits at each prompt until `stand continue`.")
+]
+
+
+@app.command()
+def demo(
+    out: Annotated[
+        Path, typer.Option(help="Where the session and the report go; numbered when there is a demo already.")
+    ] = Path("demo"),
+) -> None:
+    """Run a simulated thermal cycle, fit the drift, and print what compensation gains.
+
+    Example: stand demo --out /tmp/demo
+    """
+    with _run_errors():
+        order = load_order("demo", "simulated")
+        directory = _unused(out)
+        _check_writable(directory)
+        with _run_progress(price(order.recipe.plan(), order.config)) as watch:
+            session = asyncio.run(run_virtual(order, directory, None, watch))
+        typer.echo(f"session  {session}")
+        _report(session, directory)
+
+
+@app.command()
+def run(
+    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
+    config: Annotated[
+        str, typer.Option("--config", help="A configuration file, or the name of an installed one.")
+    ] = "simulated",
+    out: Annotated[Path | None, typer.Option(help="Where the session goes; else recording.directory.")] = None,
+    virtual_time: Annotated[
+        bool, typer.Option("--virtual-time", help="As fast as it goes, with a simulated laboratory of its own.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="The simulated laboratory's seed (with --virtual-time).")] = None,
+    attended: AttendedOption = False,
+    report: ReportOption = False,
+) -> None:
+    """Run a recipe and record it; prints the session's folder.
+
+    Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions --report
+    """
+    with _run_errors():
+        if seed is not None and not virtual_time:
+            raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
+        if seed is not None and seed < 0:
+            raise ConfigError(f"--seed is 0 or more, not {seed}")
+        order = replace(load_order(recipe, config), attended=attended)
+        if report:
+            check_reportable(order.recipe.plan())
+        directory = out or order.config.recording.directory
+        _check_writable(directory)
+        steps = price(order.recipe.plan(), order.config, load_learned(directory))
+        if lack := small_disk(shutil.disk_usage(_existing(directory)).free, steps, order.config):
+            typer.echo(one_line(f"warning: {directory}: {lack}"), err=True)
+        with _run_progress(steps) as watch:
+            work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
+            session = asyncio.run(work)
+        _finished(session, order.config, report=report)
+
+
+@app.command("resume")
+def resume_run(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="The session of a run that did not end.")],
+    config: Annotated[
+        str, typer.Option("--config", help="This stand's configuration: a file, or the name of an installed one.")
+    ] = "simulated",
+    clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
+    attended: AttendedOption = False,
+    report: ReportOption = False,
+) -> None:
+    """Go on with a run that was killed or interrupted, in its session: what is done is not done again.
+
+    Recipe, seed, target and camera settings are the session's; programs, files, addresses and limits are this stand's.
+
+    Example: stand resume sessions/20260101T180000Z-thermal-cycle --config laboratory.yaml
+    """
+    with _run_errors():
+        before = interruption(directory, load_config(packaged("", config)), clear=clear)
+        order = replace(before.order, attended=attended)
+        before = replace(before, order=order)
+        try:
+            if report:
+                check_reportable(order.recipe.plan())
+            for segment in before.salvaged:
+                typer.echo(salvage_line(segment), err=True)
+            steps = price(order.recipe.plan(), order.config, load_learned(before.directory.parent))
+        except BaseException:
+            before.release()
+            raise
+        with _run_progress(steps, before.progress.done, before.progress.earned_s) as watch:
+            session = asyncio.run(resume(before, watch))
+        _finished(session, order.config, report=report)
+
+
+def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
+    """What follows a complete run: the next plan's durations, its folder told, its report."""
+    try:
+        learn(session.parent, config)
+    except (SessionError, OSError) as error:  # what cannot be kept is no reason for a run to fail
+        typer.echo(f"warning: {one_line(error)}", err=True)
+    typer.echo(session)
+    if report:
+        _report(session, session)
+
+
+def _report(session: Path, folder: Path) -> None:
+    """Show the report's lines; status NOT_REPORTED when there is none: the run itself has gone well."""
+    try:
+        for line in report_session(session, folder):
+            typer.echo(line)
+    except NotReported as error:
+        tell(error)
+        raise typer.Exit(NOT_REPORTED) from error
+
+
+def _unused(out: Path) -> Path:
+    """`out`, or `out-2`, `out-3` ... when it exists: a second demo never touches the first."""
+    if not out.name:
+        raise ConfigError(f"--out {out}: a demo needs a folder of its own name")
+    candidates = (out.with_name(f"{out.name}-{number}") for number in itertools.count(2))
+    return out if not out.exists() else next(path for path in candidates if not path.exists())
+
+
+def _existing(directory: Path) -> Path:
+    """`directory`, or the nearest folder above it that is there."""
+    return next(path for path in (directory, *directory.absolute().parents) if path.exists() or path.is_symlink())
+
+
+def small_disk(free_bytes: int, steps: Iterable[PricedStep], config: StandConfig) -> str:
+    """What is wrong with so much room for a run that would stop in the middle of the night; "" when it will do."""
+    plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
+    if free_bytes / 1e9 >= plan_GB + least_GB:
+        return ""
+    return f"{free_bytes / 1e9:.1f} GB are free; the plan records {plan_GB:.1f} GB and waits below {least_GB:.1f} GB"
+
+
+def _check_writable(directory: Path) -> None:
+    """ConfigError when no session could be made below `directory`: to be told before anything is opened."""
+    try:
+        Path(tempfile.mkdtemp(prefix=".writable-", dir=_existing(directory))).rmdir()
+    except OSError as error:
+        raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error
+
+
+@contextmanager
+def _run_progress(
+    steps: tuple[PricedStep, ...], done: Collection[str] = (), earned_s: Mapping[str, float] = MappingProxyType({})
+) -> Generator[Callable[[Hub], None]]:
+    """Progress in expected seconds of the plan, the time left as the run goes; warnings and errors as they come. The
+    run never waits for the terminal."""
+    with progress("run", sum(step.duration_s for step in steps)) as report, aside() as later:
+        follow = Follow(steps, later(report), later(lambda line: typer.echo(line, err=True)), done, earned_s)
+        yield lambda hub: hub.subscribe(follow)
+
+
+@contextmanager
+def _run_errors() -> Generator[None]:
+    """As every error; an interrupted run says whether the stand is safe."""
+    with one_line_errors():
+        try:
+            yield
+        except Interrupted as error:
+            typer.echo(one_line(error), err=True)
+            raise typer.Exit(INTERRUPTED) from error

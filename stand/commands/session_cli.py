@@ -1,0 +1,348 @@
+"""The `stand session` commands: recorded sessions listed, shown, verified, salvaged, replayed, exported and trimmed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.errors import ConfigError, SessionError
+from foundation.exit_codes import FAILED, one_line_errors
+from foundation.hub import Hub
+from foundation.instants import parse_instant
+from foundation.items import Event, Item, StepMark
+from foundation.progress import Report, late_progress, progress
+from foundation.usage import OneLineUsage, one_line
+from recording.exporting.export import export
+from recording.exporting.replay import ReplayClock, replay, replay_and_record
+from recording.exporting.trim import trim
+from recording.format.inventory import State, inventory
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.glance import Glance, glance
+from recording.reading.overview import overview
+from recording.reading.run_word import Files, Run
+from recording.reading.session import Session
+from recording.reading.using import check_whole
+from recording.repair.salvage import Salvaged, salvage_line, salvage_session
+from recording.repair.verify import verify
+from stand.commands.session_text import (
+    LIST_COLUMNS,
+    glance_json,
+    info_json,
+    info_lines,
+    list_row,
+    table_lines,
+    verify_json,
+    verify_lines,
+)
+
+app = typer.Typer(
+    cls=OneLineUsage,
+    no_args_is_help=True,
+    add_completion=False,
+    help="Recorded sessions: list, look at, verify, salvage, replay, export, trim.\n\n"
+    "Example: stand session info sessions/20260101T180000Z-thermal-cycle",
+)
+
+SessionArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a recorded session.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to make; it must not exist.")]
+IncompleteOption = Annotated[
+    bool, typer.Option("--incomplete", help="Use what is there of a session of which something is missing.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
+
+
+@app.command("list")
+def list_sessions(
+    directory: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the sessions are.")] = Path("sessions"),
+    as_json: JsonOption = False,
+) -> None:
+    """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, how the
+    run ended, and whether the files are sound.
+
+    Example: stand session list /data/sessions
+    """
+    with one_line_errors():
+        seen = sorted(map(glance, _sessions_in(directory)), key=lambda session: (session.begin_ns or 0, session.path))
+        if as_json:
+            typer.echo(json.dumps([glance_json(session) for session in seen], indent=2))
+        elif not seen:
+            typer.echo(f"{directory}: no sessions there", err=True)
+        elif sys.stdout.isatty():
+            Console().print(_table(seen))
+        else:
+            for line in table_lines(map(list_row, seen)):
+                typer.echo(line)
+
+
+def _sessions_in(directory: Path) -> list[Path]:
+    """`directory` itself when it is a session, else those in it; ConfigError when there is no such folder."""
+    if not directory.is_dir():
+        raise ConfigError(f"{directory}: {'is a file, not a folder' if directory.exists() else 'no such folder'}")
+    if inventory(directory):
+        return [directory]
+    return [path for path in sorted(directory.iterdir()) if path.is_dir() and inventory(path)]
+
+
+def _table(sessions: list[Glance]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in LIST_COLUMNS:
+        table.add_column(column, justify="right" if column in ("duration", "frames", "size") else "left")
+    for session in sessions:
+        *cells, run, files = list_row(session)
+        run_style = "" if session.run in (Run.COMPLETE, Run.RUNNING) else "yellow"
+        files_style = "" if session.state is Files.SOUND else "yellow"
+        table.add_row(*map(Text, cells), Text(run, style=run_style), Text(files, style=files_style))
+    return table
+
+
+@app.command()
+def info(directory: SessionArgument, as_json: JsonOption = False) -> None:
+    """What a session holds: when, steps, frames, gaps, temperatures, events, versions.
+
+    Example: stand session info sessions/20260101T180000Z-thermal-cycle
+    """
+    with one_line_errors():
+        found = overview(_session_in(directory))
+        if as_json:
+            typer.echo(json.dumps(info_json(found), indent=2))
+            return
+        for line in info_lines(found):
+            typer.echo(line)
+
+
+def _session_in(directory: Path) -> Path:
+    """`directory`; ConfigError when it is no session."""
+    if inventory(directory):
+        return directory
+    if _sessions_in(directory):
+        raise ConfigError(f"{directory}: is a folder of sessions; `stand session list {directory}` shows them")
+    raise ConfigError(f"{directory}: not a session; `stand session list` shows those in a folder")
+
+
+@contextmanager
+def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
+    """The session in `directory` for a command that takes all of it. SessionError when segments of it would be left
+    out because they are not finished, or when something of it is missing and not `incomplete`; what is being recorded
+    is left out with a warning. Damage that the command meets becomes a sentence that says what helps."""
+    files = inventory(_session_in(directory))
+    help_text = f"`stand session salvage {directory}`"
+    left = [file.name for file in files if file.state is State.UNFINISHED]
+    growing = [file.name for file in files if file.state is State.RECORDING]
+    if left:
+        are = "is" if len(left) == 1 else f"and {len(left) - 1} more are"
+        raise SessionError(f"{directory}: {left[0]} {are} not finished and would be left out; {help_text} first")
+    if growing:
+        _warn(f"{directory}: is being recorded; without what is not finished yet: {', '.join(growing)}")
+    try:
+        session = Session.open(directory)
+        check_whole(session, _warn if incomplete else None)
+        yield session
+    except SessionError as error:
+        if str(error).startswith((str(directory / TELEMETRY), str(directory / FRAMES))):
+            raise SessionError(f"{error}; {help_text} recovers what is sound") from error
+        raise
+
+
+def _warn(text: str) -> None:
+    typer.echo(one_line(f"warning: {text}"), err=True)
+
+
+@app.command("verify")
+def verify_session(directory: SessionArgument, as_json: JsonOption = False) -> None:
+    """Read every byte of a session and say what is damaged or missing; status 1 when anything is,
+    however the run ended.
+
+    Example: stand session verify sessions/20260101T180000Z-thermal-cycle
+    """
+    with one_line_errors():
+        files = inventory(_session_in(directory))
+        total_bytes = sum(file.size_bytes for file in files if file.state is State.FINISHED)
+        with late_progress("verify", total_bytes) as report:
+            found = verify(directory, report)
+        if as_json:
+            typer.echo(json.dumps(verify_json(found), indent=2))
+        else:
+            for line in verify_lines(found):
+                typer.echo(line)
+        if not found.is_sound:
+            raise typer.Exit(FAILED)
+
+
+def _part_of(report: Report, done_bytes: int, size_bytes: int) -> Callable[[float, str], None]:
+    """Takes the share that is done of one session of that size, behind those before it."""
+    return lambda share, text: report(done_bytes + share * size_bytes, one_line(text))
+
+
+@app.command()
+def salvage(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="A recorded session, or a folder of sessions.")],
+) -> None:
+    """Finish unfinished segments and repair damaged ones; nothing valid is lost. Status 1 when something was not
+    recovered: its original is then kept as .damaged.
+
+    Example: stand session salvage sessions
+    """
+    with one_line_errors():
+        sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
+        done: list[Salvaged] = []
+        done_bytes = 0
+        with late_progress("salvage", sum(sizes.values())) as report:
+            for path, size_bytes in sizes.items():
+                for salvaged in salvage_session(path, _part_of(report, done_bytes, size_bytes)):
+                    typer.echo(one_line(salvage_line(salvaged)))
+                    done.append(salvaged)
+                done_bytes += size_bytes
+        if not done:
+            typer.echo("nothing to salvage")
+        if any(salvaged.kept for salvaged in done):
+            raise typer.Exit(FAILED)
+
+
+@app.command("replay")
+def replay_session(
+    directory: SessionArgument,
+    speed: Annotated[str, typer.Option(metavar="N|max", help="Times as fast as it was, or max.")] = "1",
+    record: Annotated[Path | None, typer.Option(help="Record the replay as this new session.")] = None,
+    incomplete: IncompleteOption = False,
+) -> None:
+    """Publish a session again, at its own pace or faster; its steps and events are printed as they come.
+
+    Example: stand session replay sessions/20260101T180000Z-thermal-cycle --speed 60
+    """
+    with one_line_errors():
+        times = _speed(speed)
+        if record is not None:
+            _check_new(record, directory)
+        seen = glance(_session_in(directory))
+        with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session) as watch:
+            if record is None:
+                asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
+            else:
+                typer.echo(asyncio.run(replay_and_record(session, record, times, watch)))
+
+
+def _speed(text: str) -> float | None:
+    """Times as fast as it was; None is as fast as possible."""
+    if text == "max":
+        return None
+    if re.fullmatch(r"\d+(\.\d*)?|\.\d+", text) and 0.001 <= float(text) <= 1e6:
+        return float(text)
+    raise ConfigError(f"--speed {text}: expected max or a number from 0.001 to 1000000")
+
+
+def _check_new(out: Path, session: Path) -> None:
+    """ConfigError when `out` cannot become a folder beside `session`."""
+    if out.resolve().is_relative_to(session.resolve()) and out.resolve() != session.resolve():
+        raise ConfigError(f"{out}: is inside the session; choose a place outside of it")
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; choose another name or move it away")
+
+
+@contextmanager
+def _replay_progress(seen: Glance, session: Session) -> Generator[Callable[[Hub], None]]:
+    """Progress in seconds of the session; its steps and events as lines, in UTC."""
+    begin_ns, end_ns, utc = seen.begin_ns or 0, seen.end_ns or 0, session.utc
+    with progress("replay", (end_ns - begin_ns) / NS_PER_S) as report:
+
+        def follow(item: Item) -> None:
+            at = utc.date_time(item.time_ns)
+            report((item.time_ns - begin_ns) / NS_PER_S, f"{at} UTC")
+            if isinstance(item, StepMark):
+                typer.echo(f"{at}  step {item.index} {one_line(item.kind)} {item.state}")
+            elif isinstance(item, Event):
+                typer.echo(f"{at}  {one_line(f'{item.level} {item.kind}: {item.text}')}")
+
+        yield lambda hub: hub.subscribe(follow)
+
+
+async def _replay(session: Session, begin_ns: int, speed: float | None, watch: Callable[[Hub], None]) -> None:
+    hub = Hub()
+    watch(hub)
+    if speed is not None:
+        await replay(session, hub, ReplayClock(begin_ns, speed))
+        return
+    clock = VirtualClock(begin_ns)
+    running = asyncio.create_task(clock.run())
+    try:
+        await replay(session, hub, clock)
+    finally:
+        running.cancel()
+
+
+@app.command("export")
+def export_session(
+    directory: SessionArgument,
+    out: OutOption,
+    table_format: Annotated[Literal["csv", "parquet"], typer.Option("--format", help="Of the telemetry's tables.")] = (
+        "csv"
+    ),
+    frames: Annotated[bool, typer.Option("--frames/--no-frames", help="Images with their temperatures.")] = True,
+    telemetry: Annotated[bool, typer.Option("--telemetry/--no-telemetry", help="Tables of every topic.")] = True,
+    incomplete: IncompleteOption = False,
+) -> None:
+    """A session as PNG files with their temperatures, and its telemetry as tables.
+
+    Example: stand session export sessions/20260101T180000Z-thermal-cycle --out night --format parquet
+    """
+    with one_line_errors():
+        _check_new(out, directory)
+        with _session_to_use(directory, incomplete) as session, late_progress("export", 1.0) as report:
+            tables = table_format if telemetry else None
+            export(session, out, frames=frames, telemetry=tables, report=report)
+        typer.echo(out)
+
+
+@app.command("trim")
+def trim_session(
+    directory: SessionArgument,
+    out: OutOption,
+    begin: Annotated[str, typer.Option("--from", metavar="T", help="2026-01-01T18:30:00 (UTC), +1h30m or step:12.")] = (
+        "+0s"
+    ),
+    end: Annotated[str | None, typer.Option("--to", metavar="T", help="Not included; else the session's end.")] = None,
+    incomplete: IncompleteOption = False,
+) -> None:
+    """A part of a session as a new one. +1h30m counts from the session's start; step:12 is when step 12 began.
+
+    Example: stand session trim sessions/20260101T180000Z-thermal-cycle --out part --from step:12 --to +5h
+    """
+    with one_line_errors():
+        _check_new(out, directory)
+        seen = glance(_session_in(directory))
+        with _session_to_use(directory, incomplete) as session:
+            typer.echo(trim(session, out, *_range(begin, end, session, seen)))
+
+
+def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple[int, int]:
+    """From when up to when; ConfigError when that is not a time, or none."""
+    begin_ns = _instant(begin, session, seen)
+    if seen.end_ns is not None and begin_ns > seen.end_ns:
+        raise ConfigError(f"--from {begin} is after the session's end ({session.utc.date_time(seen.end_ns)} UTC)")
+    end_ns = (seen.end_ns or 0) + 1 if end is None else _instant(end, session, seen)
+    if end_ns <= begin_ns:
+        raise ConfigError(f"--to {end} is not after --from {begin}")
+    return begin_ns, end_ns
+
+
+def _instant(text: str, session: Session, seen: Glance) -> int:
+    """ns since the epoch; ConfigError when the text is no time, or names no step of the session."""
+    step = re.fullmatch(r"step:(\d+)", text)
+    if step is None:
+        return parse_instant(text, seen.begin_ns or 0, session.utc.stand_ns)
+    begun = (mark.time_ns for mark in session.steps() if mark.index == int(step[1]))
+    time_ns = next(begun, None)
+    if time_ns is None:
+        raise ConfigError(f"{text}: the session has no step {step[1]}")
+    return time_ns

@@ -1,0 +1,286 @@
+"""Recorded sessions for people (lines of at most 100 columns) and for programs (JSON)."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from foundation.instants import duration
+from foundation.items import Event, StepState
+from foundation.usage import one_line
+from recording.format.inventory import State
+from recording.format.utc_offsets import UtcOffsets
+from recording.reading.glance import Glance
+from recording.reading.overview import Frames, Overview, Step, Temperature
+from recording.repair.verify import Verification
+
+WIDTH = 100
+_LABEL = 14
+_MOST = 20  # entries of a list before the rest is only counted
+LIST_COLUMNS = ("session", "recipe", "start (UTC)", "duration", "frames", "size", "devices", "run", "files")
+ENCODING = {CompressedImage.DESCRIPTOR.full_name: "PNG", RawImage.DESCRIPTOR.full_name: "raw"}
+
+
+def size(size_bytes: int) -> str:
+    """`143.7 MB`, in powers of 1000."""
+    for limit, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if size_bytes >= limit:
+            return f"{size_bytes / limit:.1f} {unit}"
+    return f"{size_bytes} B"
+
+
+def list_row(seen: Glance) -> tuple[str, ...]:
+    """A session's cells below LIST_COLUMNS."""
+    length = "" if seen.begin_ns is None or seen.end_ns is None else duration(seen.end_ns - seen.begin_ns)
+    return (
+        one_line(seen.path.resolve().name),
+        one_line(seen.metadata.get("recipe", "?")),
+        "" if seen.begin_ns is None else seen.utc.date_time(seen.begin_ns),
+        length,
+        str(seen.frames),
+        size(seen.size_bytes),
+        "simulated" if seen.simulated else "real",
+        str(seen.run),
+        one_line(f"{seen.state_text}{'; ' if seen.lacks else ''}{seen.lacks}"),
+    )
+
+
+def glance_json(seen: Glance, utc: UtcOffsets | None = None) -> dict[str, object]:
+    """One session of `stand session list --json`, the head of `info --json`. start and end are UTC, what ends in _ns is
+    an instant of the stand's clock, and durations are differences of those."""
+    utc = seen.utc if utc is None else utc
+    has_times = seen.begin_ns is not None and seen.end_ns is not None
+    return {
+        "name": seen.path.resolve().name,
+        "path": str(seen.path),
+        "metadata": seen.metadata,
+        "start": _instant(seen.begin_ns, utc),
+        "end": _instant(seen.end_ns, utc),
+        "begin_ns": seen.begin_ns,
+        "end_ns": seen.end_ns,
+        "duration_s": ((seen.end_ns or 0) - (seen.begin_ns or 0)) / 1e9 if has_times else None,
+        "frames": seen.frames,
+        "bytes": seen.size_bytes,
+        "simulated": seen.simulated,
+        "run": str(seen.run),
+        "files": str(seen.state),
+        "segments": [{"file": file.name, "state": str(file.state), "bytes": file.size_bytes} for file in seen.files],
+        "troubles": list(seen.troubles),
+        "missing": list(seen.missing),
+        "has_camera_temperature": seen.has_camera_degC,
+    }
+
+
+def _instant(time_ns: int | None, utc: UtcOffsets) -> str | None:
+    return None if time_ns is None else utc.utc_text(time_ns)
+
+
+def info_lines(found: Overview) -> Iterator[str]:
+    """`stand session info`."""
+    utc = found.utc
+    parts = (
+        _facts(found, utc),
+        _steps(found, utc),
+        _frames(found, utc),
+        _temperatures(found.temperatures),
+        (*_gaps(found, utc), *_events(found.events, utc)),
+    )
+    for position, part in enumerate(parts):
+        if position:
+            yield ""
+        yield from part
+
+
+def _row(label: str, text: str) -> Iterator[str]:
+    """A label and its text, wrapped beside it; a path stays whole, to be copied."""
+    wrapper = textwrap.TextWrapper(
+        WIDTH, f"{label:<{_LABEL}}", " " * _LABEL, break_long_words=False, break_on_hyphens=False
+    )
+    yield from wrapper.wrap(one_line(text))
+
+
+def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+    seen = found.glance
+    told = seen.metadata.get
+    name, known_as = seen.path.resolve().name, told("session_id", "")
+    alias = f", recorded as {known_as}" if known_as not in ("", name) else ""
+    yield from _row("session", f"{name}{alias}")
+    yield from _row("run", str(seen.run))
+    yield from _row("files", str(found.state))
+    yield from _row("recipe", told("recipe", "?") + (", simulated devices" if seen.simulated else ""))
+    if seen.begin_ns is not None and seen.end_ns is not None:
+        span = f"{utc.date_time(seen.begin_ns)} to {utc.date_time(seen.end_ns)} UTC"
+        yield from _row(
+            "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {told('clock_source', '?')} clock"
+        )
+    ending = "the recording does not tell" if found.ending is None else found.ending.text
+    yield from _row("ended", ending)
+    yield from _row("operator", told("operator", "") or "not told")
+    yield from _row("camera", told("camera_serial", "?") + (f"; {seen.lacks}" if seen.lacks else ""))
+    host = f", host {told('host')}" if told("host") else ""
+    yield from _row("software", f"thermostand {told('software_version', '?')}{host}")
+    yield from _row("segments", _segments(seen))
+    yield from _row("attached", ", ".join(seen.attachments) or "nothing")
+    for trouble in _limited(found.troubles):
+        yield from _row("damaged", trouble)
+    for text in _limited(seen.missing):
+        yield from _row("missing", text)
+    if found.troubles or seen.count(State.UNFINISHED):
+        yield from _row("to do", f"stand session salvage {seen.path}")
+
+
+def _segments(seen: Glance) -> str:
+    by_series: dict[str, list[int]] = {}
+    for file in seen.files:
+        if file.state is State.FINISHED:
+            by_series.setdefault(file.series, []).append(file.size_bytes)
+    parts = [f"{series} {len(sizes)} ({size(sum(sizes))})" for series, sizes in by_series.items()]
+    others = [
+        f"{file.name} is {file.state} ({size(file.size_bytes)})"
+        for file in seen.files
+        if file.state is not State.FINISHED
+    ]
+    return "; ".join([", ".join(parts) or "none finished", *_limited(others)])
+
+
+def _limited(entries: Sequence[str]) -> list[str]:
+    """The first entries and how many more there are."""
+    more = len(entries) - _MOST
+    return [*entries[:_MOST], *([f"and {more} more"] if more > 0 else [])]
+
+
+def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+    """Finished steps are counted against the plan, not against those that were begun."""
+    steps = found.steps
+    kinds = Counter(step.kind for step in steps if step.state is StepState.DONE)
+    listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    planned = "" if found.planned_steps is None else f" of {found.planned_steps}"
+    yield from _row("steps", f"{kinds.total()}{planned} done{f': {listed}' if listed else ''}" if steps else "none")
+    told = {StepState.FAILED: "failed", StepState.STARTED: "has no end in the recording"}
+    for step in steps:
+        if step.state is not StepState.DONE:
+            parameters = " ".join(f"{name}={value}" for name, value in step.parameters.items())
+            begun = f"begun {utc.date_time(step.begin_ns)} UTC"
+            text = f"{step.index} {step.kind} {parameters} {told[step.state]}, {begun}"
+            yield from _row("  not done", text)
+
+
+def _frames(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+    frames = found.frames
+    if not frames.count:
+        yield from _row("frames", f"none{_lost(frames)}")
+        return
+    encoding = ENCODING.get(frames.schema, frames.schema)
+    each = size(round(frames.size_bytes / frames.count))
+    yield from _row("frames", f"{frames.count}, {frames.pixels}, {encoding}, {each} each{_lost(frames)}")
+    if frames.first_ns is not None and frames.last_ns is not None:
+        yield from _row("", f"from {utc.date_time(frames.first_ns)} to {utc.date_time(frames.last_ns)} UTC")
+    captures = [step for step in found.steps if step.frames]
+    yield from _limited([_capture(step, utc) for step in captures])
+
+
+def _lost(frames: Frames) -> str:
+    parts: list[str] = []
+    if frames.dropped:
+        parts.append(f"{frames.dropped} lost by the camera or its wire")
+    if frames.lost_by_recorder:
+        parts.append(f"{frames.lost_by_recorder} lost by the recorder")
+    if frames.described != frames.count:
+        parts.append(f"{frames.described} are described in the telemetry")
+    return "".join(f"; {part}" for part in parts)
+
+
+def _capture(step: Step, utc: UtcOffsets) -> str:
+    told = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
+    asked = step.parameters.get("frames", "?")
+    begun = utc.date_time(step.begin_ns)
+    return f"{'':<{_LABEL}}step {step.index:<4d} {step.frames} of {asked} frames from {begun}  {told}"
+
+
+def _temperatures(temperatures: Sequence[Temperature]) -> Iterator[str]:
+    if not temperatures:
+        yield from _row("temperatures", "none")
+        return
+    width = max(len(temperature.channel) for temperature in temperatures)
+    yield f"{'temperatures':<{_LABEL}}{'degC':<{width}}{'min':>9}{'mean':>9}{'max':>9}{'readings':>10}{'BAD':>8}"
+    for row in temperatures:
+        numbers = "".join(
+            f"{value:9.2f}" if not math.isnan(value) else f"{'-':>9}"
+            for value in (row.min_degC, row.mean_degC, row.max_degC)
+        )
+        yield f"{'':<{_LABEL}}{one_line(row.channel):<{width}}{numbers}{row.count:>10}{row.bad:>8}"
+
+
+def _gaps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+    for position, gap in enumerate(_limited([gap.text(utc) for gap in found.gaps]) or ["none"]):
+        yield from _row("" if position else "gaps", gap)
+
+
+def _events(events: Sequence[Event], utc: UtcOffsets) -> Iterator[str]:
+    counts = Counter(event.level for event in events)
+    yield from _row("events", ", ".join(f"{count} {level}" for level, count in sorted(counts.items())) or "none")
+    grave = [event for event in events if event.level != "info"]
+    for line in _limited([f"{utc.date_time(event.time_ns)} {event.level}: {event.text}" for event in grave]):
+        yield from _row("", line)
+
+
+def info_json(found: Overview) -> dict[str, object]:
+    """`stand session info --json`: everything, lists in full; a temperature that was never good is null.
+    Instants are as in glance_json."""
+    utc = found.utc
+    return {
+        **glance_json(found.glance, utc),
+        "files": str(found.state),
+        "troubles": list(found.troubles),
+        "planned_steps": found.planned_steps,
+        "attachments": list(found.glance.attachments),
+        "ending": None if found.ending is None else found.ending.text,
+        "steps": [
+            {**asdict(step), "begin": _instant(step.begin_ns, utc), "end": _instant(step.end_ns, utc)}
+            for step in found.steps
+        ],
+        "images": {
+            **asdict(found.frames),
+            "first": _instant(found.frames.first_ns, utc),
+            "last": _instant(found.frames.last_ns, utc),
+        },
+        "temperatures": [
+            {name: None if value != value else value for name, value in asdict(temperature).items()}
+            for temperature in found.temperatures
+        ],
+        "gaps": [
+            {**asdict(gap), "begin": _instant(gap.begin_ns, utc), "end": _instant(gap.end_ns, utc)}
+            for gap in found.gaps
+        ],
+        "events": [{**asdict(event), "time": _instant(event.time_ns, utc)} for event in found.events],
+    }
+
+
+def verify_lines(found: Verification) -> Iterator[str]:
+    """`stand session verify`: the findings, then what was read."""
+    yield from map(one_line, map(str, found.findings))
+    errors = sum(finding.severity == "error" for finding in found.findings)
+    count = f" ({errors} {'error' if errors == 1 else 'errors'})" if errors else ""
+    yield (
+        f"files {found.files}{count}; run {found.run}; {found.segments} segments, {found.messages} messages, "
+        f"{found.frames} frames, {size(found.bytes)} read"
+    )
+
+
+def verify_json(found: Verification) -> dict[str, object]:
+    """`stand session verify --json`."""
+    return {"sound": found.is_sound, "files": str(found.files), **asdict(found)}
+
+
+def table_lines(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
+    """LIST_COLUMNS and the rows in columns, for a file or a pipe."""
+    lines = [LIST_COLUMNS, *rows]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(LIST_COLUMNS))]
+    for line in lines:
+        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()

@@ -1,0 +1,122 @@
+"""The configuration's guard section: when the stand is made safe. The upper bounds hold whatever a file says."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from foundation.documents import Document
+from stand.config.looks import (
+    CameraFeelsConfig,
+    FirstHeatConfig,
+    FrozenConfig,
+    GraniteFeelsConfig,
+    HeatFeltConfig,
+    NeededOutputConfig,
+)
+
+
+class HeatingConfig(Document):
+    """Heater on, but not warming. While the regulator's output is above output_percent, its relay is on and the
+    temperature is more than hysteresis_K below the set-point, it must rise by gain_K every window_s. When it does not,
+    what it lacks is summed up, and more than max_error_K_s is a fault. gain_K in window_s should be about half of your
+    chamber's slowest rate at such an output: the simulated one never takes longer than 170 s for 2 K.
+    """
+
+    output_percent: float = Field(default=50.0, gt=0, le=100)
+    hysteresis_K: float = Field(default=1.0, gt=0, le=10)
+    gain_K: float = Field(default=2.0, gt=0, le=10)
+    window_s: float = Field(default=600.0, gt=0, le=3600)
+    max_error_K_s: float = Field(default=600.0, gt=0, le=36000)
+
+
+class HeaterOffConfig(Document):
+    """Warming with the heater off. settle_s after the heat was switched off the air may rise by rise_K, or end less
+    than above_surroundings_K above laboratory and granite."""
+
+    settle_s: float = Field(default=120.0, ge=0, le=3600)
+    rise_K: float = Field(default=2.0, gt=0, le=20)
+    above_surroundings_K: float = Field(default=5.0, ge=0, le=20)
+
+
+class CoolingConfig(Document):
+    """Cooling in vain. While the compressor runs, the heater's output is 0 and the air is more than margin_K above
+    laboratory and granite, it must fall by fall_K every window_s: a welded relay could balance the cold."""
+
+    window_s: float = Field(default=600.0, gt=0, le=3600)
+    fall_K: float = Field(default=0.5, gt=0, le=10)
+    margin_K: float = Field(default=2.0, ge=0, le=20)
+
+
+class SensorsConfig(Document):
+    """Regulator and air thermometer, and values that do not change. A difference above warn_K for warn_after_s is told,
+    one above trip_K for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A thermometer
+    that is exactly constant for stuck_after_s is told; the regulator's value constant for pv_stuck_after_s while the
+    air goes air_moves_K is a fault.
+    """
+
+    warn_K: float = Field(default=3.0, gt=0, le=20)
+    warn_after_s: float = Field(default=600.0, ge=0, le=3600)
+    trip_K: float = Field(default=6.0, gt=0, le=20)
+    trip_after_s: float = Field(default=120.0, ge=0, le=3600)
+    stuck_after_s: float = Field(default=900.0, ge=60, le=36000)
+    pv_stuck_after_s: float = Field(default=60.0, ge=10, le=3600)
+    air_moves_K: float = Field(default=1.0, gt=0, le=20)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.warn_K > self.trip_K:
+            raise ValueError(f"warn_K {self.warn_K} is above trip_K {self.trip_K}")
+        return self
+
+
+class GuardConfig(Document):
+    """When the guard makes the stand safe. The upper bounds are what the chamber survives: no file may lift them.
+
+    keys_s: how long the unit and we may differ about running, permits and the set-point. flap_open_s: how long the flap
+    may be open outside captures, flap_capture_s in all. disk_low_s: how long the recorder may refuse frames.
+    camera_temperature_s: how long a powered camera with frames to come may have no temperature.
+    pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
+    hours. notify: a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may
+    take. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
+    safe_limit_s: how long, at the end of a run, it is tried to have every actuator confirm that it is safe.
+    heat_max_Wh_per_h: within any hour; good nights took up to 900.
+    """
+
+    period_s: float = Field(default=1.0, gt=0, le=10)
+    max_air_degC: float = Field(default=65.0, le=80)
+    max_granite_degC: float = Field(default=60.0, le=80)
+    max_camera_degC: float = Field(default=85.0, le=100)
+    stale_after_s: float = Field(default=15.0, gt=0, le=120)
+    heater_hold_s: float = Field(default=15.0, ge=2.0, le=60.0)
+    heater_renew_s: float = Field(default=5.0, gt=0)
+    heating: HeatingConfig = HeatingConfig()
+    heater_off: HeaterOffConfig = HeaterOffConfig()
+    cooling: CoolingConfig = CoolingConfig()
+    sensors: SensorsConfig = SensorsConfig()
+    heat_max_Wh_per_h: float = Field(default=1400.0, gt=0, le=20_000)
+    heat_felt: HeatFeltConfig = HeatFeltConfig()
+    granite_feels: GraniteFeelsConfig = GraniteFeelsConfig()
+    camera_feels: CameraFeelsConfig = CameraFeelsConfig()
+    needed_output: NeededOutputConfig = NeededOutputConfig()
+    frozen: FrozenConfig = FrozenConfig()
+    first_heat: FirstHeatConfig = FirstHeatConfig()
+    keys_s: float = Field(default=30.0, ge=1, le=600)
+    flap_open_s: float = Field(default=300.0, gt=0, le=36000)
+    flap_capture_s: float = Field(default=2700.0, gt=0, le=36000)
+    disk_low_s: float = Field(default=900.0, ge=0, le=36000)
+    camera_temperature_s: float = Field(default=60.0, gt=0, le=36000)
+    notify: tuple[Annotated[str, Field(min_length=1)], ...] = Field(default=(), max_length=100)
+    notify_limit_s: float = Field(default=10.0, gt=0, le=60)
+    accept: tuple[str, ...] = ()
+    pause_limit_h: float = Field(default=12.0, gt=0, le=24)
+    safe_limit_s: float = Field(default=600.0, ge=1, le=3600)
+
+    @model_validator(mode="after")
+    def _renewed_in_time(self) -> Self:
+        if self.heater_renew_s * 2 > self.heater_hold_s:
+            raise ValueError("heater_renew_s must be at most half of heater_hold_s, or one lost command cuts the heat")
+        if self.period_s + self.heater_renew_s >= self.heater_hold_s:  # renewals fall on the guard's own looks
+            raise ValueError("period_s + heater_renew_s must be below heater_hold_s, or the heat drops out in between")
+        return self

@@ -1,0 +1,51 @@
+"""What the guard objects to, and what a rule may look at."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from foundation.readings import Reading
+
+
+class Readings(Protocol):
+    """What a rule may look at; the hub is one."""
+
+    def latest(self, channel: str) -> Reading | None:
+        """The last reading, whatever its quality."""
+        ...
+
+    def known(self, channel: str) -> Reading | None:
+        """The last reading that is not BAD by the wire."""
+        ...
+
+    def last_good_ns(self, channel: str) -> int | None:
+        """When the channel last gave a GOOD reading."""
+        ...
+
+
+# abort: make safe and end the run. hold: make safe and wait for an operator. warn: say so.
+Action = Literal["abort", "hold", "warn"]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What a rule objects to, and what has to be done about it.
+
+    ends_itself: the hold is over when the rule objects no more; else an operator has to clear it. cuts_camera: the
+    camera's supply is switched off as well.
+    """
+
+    rule: str
+    text: str
+    action: Action = "abort"
+    ends_itself: bool = False
+    cuts_camera: bool = False
+
+
+def value_of(readings: Readings, channel: str) -> float:
+    """The last known value, over polls that failed on the wire: whether it is too old is the business of `trustworthy`.
+    NaN when the device says itself that it has none, or it was never read, and every comparison with that is false."""
+    reading = readings.known(channel)
+    return math.nan if reading is None else reading.value

@@ -1,0 +1,1 @@
+"""Camera and flap, and when a camera is in thermal equilibrium."""

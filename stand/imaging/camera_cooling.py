@@ -1,0 +1,66 @@
+"""How cold a camera without power is by now: nobody can ask it, but its last word and a time constant tell."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.readings import Quality, Reading
+
+_LOOK_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Cooling:
+    """The camera's temperature, degC, at an instant (ns)."""
+
+    camera_degC: float
+    time_ns: int
+
+    def after(self, time_ns: int, air_degC: float, time_constant_s: float) -> Cooling:
+        """At `time_ns`, when the air has been at `air_degC` meanwhile: the excess over it has decayed exponentially."""
+        decayed = math.exp(-(time_ns - self.time_ns) / NS_PER_S / time_constant_s)
+        return Cooling(air_degC + (self.camera_degC - air_degC) * decayed, time_ns)
+
+
+def last_word(reading: Reading | None) -> Cooling | None:
+    """The last temperature of a camera that is about to be switched off; None when it gave none."""
+    if reading is None or reading.quality is not Quality.GOOD:
+        return None
+    return Cooling(reading.value, reading.time_ns)
+
+
+async def cool_down(
+    cooling: Cooling | None, band_K: float, time_constant_s: float, max_s: float, hub: Hub, clock: Clock
+) -> None:
+    """Wait until the camera is within `band_K` of the air near it, or `max_s` is over.
+
+    `cooling` is the camera's last word before it was switched off; without one all of `max_s` is waited for. The events
+    "cooled_down" and "cool_down_unsure" (a warning) say how it ended.
+    """
+    begin_ns = clock.now_ns()
+    deadline_ns = begin_ns + seconds_ns(max_s)
+    if cooling is None:
+        await clock.sleep_until(deadline_ns)
+        text = f"the camera told no temperature before it was switched off; waited {max_s:g} s"
+        hub.publish(Event(clock.now_ns(), "warning", "cool_down_unsure", text))
+        return
+    while True:
+        now_ns, air = clock.now_ns(), hub.latest("thermometers.air")
+        excess_K = math.inf
+        if air is not None and air.quality is Quality.GOOD:
+            cooling = cooling.after(now_ns, air.value, time_constant_s)
+            excess_K = cooling.camera_degC - air.value
+        if abs(excess_K) <= band_K or now_ns >= deadline_ns:
+            break
+        await clock.sleep_until(min(deadline_ns, now_ns + seconds_ns(_LOOK_S)))
+    waited = f"after {(now_ns - begin_ns) / NS_PER_S:.0f} s the camera should be {excess_K:+.2f} K from the air"
+    if abs(excess_K) <= band_K:
+        hub.publish(Event(now_ns, "info", "cooled_down", f"{waited}, within {band_K:g} K"))
+        return
+    if math.isinf(excess_K):
+        waited = "the air near the camera is not measured"
+    hub.publish(Event(now_ns, "warning", "cool_down_unsure", f"{waited}; going on without being within {band_K:g} K"))

@@ -1,0 +1,138 @@
+"""Whether the camera is in thermal equilibrium with the chamber, as far as its supply is concerned.
+
+A camera that was off, or may have been, is cold: what it was soaked before does not count. It has come to equilibrium
+when its own temperature moves slowly for a while, or, when it tells none, after five time constants of its slowest
+part.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item
+from foundation.readings import Quality
+from stand.imaging.settling import Float, camera_rate, digit_K, seconds
+
+LOST, REACHED = "camera_equilibrium_lost", "camera_equilibrium"  # kinds of events
+
+CAMERA = "camera.temperature"
+_TIME_CONSTANTS = 5.0
+_LOOK_S = 10.0
+_UNKNOWN_S = 60.0  # without a reading; a longer gap leaves open what happened in it
+_KEPT = 20_000  # readings: hours
+
+
+@dataclass(frozen=True, slots=True)
+class EquilibriumLimits:
+    """Reached below `rate_K_per_min` for `duration_s`, or after 5 x `time_constant_s` without a temperature."""
+
+    rate_K_per_min: float = 0.2
+    duration_s: float = 600.0
+    time_constant_s: float = 1500.0
+
+
+class CameraEquilibrium:
+    """Of one camera; `is_lost` from `lose` until `regained` has returned, or `forget`."""
+
+    def __init__(self, limits: EquilibriumLimits, hub: Hub, clock: Clock) -> None:
+        self.is_lost = False
+        self._limits = limits
+        self._hub = hub
+        self._clock = clock
+        self._since_ns = clock.now_ns()  # what is read before counts for nothing
+        self._readings: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+        self._listeners: list[Callable[[], None]] = []
+        hub.subscribe(self._receive)
+
+    def subscribe(self, listener: Callable[[], None]) -> None:
+        """Call `listener()` at once whenever the equilibrium is lost."""
+        self._listeners.append(listener)
+
+    def lose(self, reason: str, data: Mapping[str, object] | None = None) -> None:
+        """It is lost from now on; event `camera_equilibrium_lost`."""
+        self.is_lost = True
+        self.begin()
+        text = f"the camera's equilibrium is lost, it is soaked anew: {reason}"
+        self._hub.publish(Event(self._clock.now_ns(), "warning", LOST, text, {"reason": reason, **(data or {})}))
+        for listener in self._listeners:
+            listener()
+
+    def begin(self) -> None:
+        """The camera is on from now on."""
+        self._since_ns = self._clock.now_ns()
+        self._readings.clear()
+
+    def forget(self) -> None:
+        """The plan itself switches the camera: what follows in it is made for that."""
+        self.is_lost = False
+
+    async def regained(self, is_disturbed: Callable[[], bool]) -> None:
+        """Return when the camera is in equilibrium, with the event `camera_equilibrium`, or when it is disturbed."""
+        tell_ns = self._since_ns + self._longest_ns
+        while self.is_lost and not is_disturbed():
+            now_ns = self._clock.now_ns()
+            rate_K_per_min = self._rate_K_per_min(now_ns)
+            if self._is_reached(now_ns, rate_K_per_min):
+                return self._reached(now_ns, rate_K_per_min)
+            if now_ns >= tell_ns:
+                tell_ns += self._longest_ns
+                self._tell_moving(now_ns, rate_K_per_min)
+            await self._clock.sleep_until(now_ns + seconds_ns(_LOOK_S))
+
+    @property
+    def _longest_ns(self) -> int:
+        return seconds_ns(_TIME_CONSTANTS * self._limits.time_constant_s)
+
+    def _is_reached(self, now_ns: int, rate_K_per_min: float) -> bool:
+        if math.isnan(rate_K_per_min):
+            has_temperature = bool(self._readings) and seconds(now_ns) - self._readings[-1][0] <= _UNKNOWN_S
+            return not has_temperature and now_ns - self._since_ns >= self._longest_ns
+        return rate_K_per_min < self._limits.rate_K_per_min
+
+    def _rate_K_per_min(self, now_ns: int) -> float:
+        """How fast the camera's temperature may have moved within the last `duration_s`; NaN when it was not known
+        throughout."""
+        end_s, length_s = seconds(now_ns), self._limits.duration_s
+        if seconds(self._since_ns) > end_s - length_s:
+            return math.nan
+        readings: Float = np.array([each for each in self._readings if each[0] >= end_s - length_s], np.float64)
+        times_s = np.concatenate(([end_s - length_s], readings.reshape(-1, 2)[:, 0], [end_s]))
+        if len(readings) < 8 or np.diff(times_s).max() > min(_UNKNOWN_S, length_s / 4):
+            return math.nan
+        digit = digit_K(readings[:, 1])
+        # An exponential approach is fastest at the window's beginning: its first half must be slow by itself, too.
+        first = readings[readings[:, 0] < end_s - length_s / 2]
+        rates = (camera_rate(readings.T, digit).bound, abs(camera_rate(first.T, digit).per_min))
+        return float(np.max(rates))  # NaN when one of them is
+
+    def _reached(self, now_ns: int, rate_K_per_min: float) -> None:
+        self.is_lost = False
+        soaked_s = (now_ns - self._since_ns) / NS_PER_S
+        known = not math.isnan(rate_K_per_min)
+        how = f"moves by at most {rate_K_per_min:.3f} K/min" if known else "is not known; five time constants are over"
+        data = {"soaked_s": soaked_s, "rate_K_per_min": rate_K_per_min if known else None}
+        text = f"the camera is in equilibrium after {soaked_s / 60:.0f} min: its temperature {how}"
+        self._hub.publish(Event(now_ns, "info", REACHED, text, data))
+
+    def _tell_moving(self, now_ns: int, rate_K_per_min: float) -> None:
+        soaked_s = (now_ns - self._since_ns) / NS_PER_S
+        known = not math.isnan(rate_K_per_min)
+        data = {"soaked_s": soaked_s, "rate_K_per_min": rate_K_per_min if known else None}
+        how = f"moves by up to {rate_K_per_min:.3f} K/min" if known else "is known at times only"
+        text = f"the camera is not in equilibrium after {soaked_s / 60:.0f} min: its temperature {how}; waiting on"
+        self._hub.publish(Event(now_ns, "warning", "camera_equilibrium_late", text, data))
+
+    def _receive(self, item: Item) -> None:
+        """The hub's subscriber."""
+        if isinstance(item, Batch):
+            for reading in item.readings:
+                is_good = reading.channel == CAMERA and reading.quality is Quality.GOOD
+                if is_good and reading.time_ns >= self._since_ns:
+                    self._readings.append((seconds(reading.time_ns), reading.value))

@@ -1,0 +1,41 @@
+"""Orders from files: the one place where configuration, recipe and target are found, read and checked together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from drivers.wires.registers import load_register_map
+from foundation.documents import parse_document, read_document
+from markers.target import Target
+from stand.config.recipe import Recipe
+from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.estimating.estimate import price
+from stand.running.session_setup import Order
+
+
+def load_order(recipe: str, config: str) -> Order:
+    """The files (or installed names), read and checked as far as can be without the stand: ConfigError
+    names what is wrong in which of them."""
+    paths = {"config.yaml": packaged("", config), "recipe.yaml": packaged("recipes", recipe)}
+    paths["target.yaml"] = packaged("targets", load_config(paths["config.yaml"]).target)
+    texts = {name: read_document(path) for name, path in paths.items()}
+    order = parse_order(texts, {name: str(path) for name, path in paths.items()})
+    stand = order.config
+    for registers in (stand.regulator.registers, stand.relays.registers, stand.thermometers.registers):
+        load_register_map(packaged("registers", registers))
+    price(order.recipe.plan(), stand)
+    return order
+
+
+def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:
+    """The order of these texts, by the names under which a session has them (Order.attachments); `names` are for
+    messages. ConfigError when this version of the program refuses one of them."""
+    order = Order(
+        parse_document(texts["config.yaml"], StandConfig, names["config.yaml"]),
+        parse_document(texts["recipe.yaml"], Recipe, names["recipe.yaml"]),
+        texts["config.yaml"],
+        texts["recipe.yaml"],
+        texts["target.yaml"],
+    )
+    parse_document(order.target_text, Target, names["target.yaml"])
+    return order

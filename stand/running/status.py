@@ -1,0 +1,119 @@
+"""What a run tells of itself while it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from foundation.clock import Clock, seconds_ns, utc_offset_ns
+from foundation.items import Batch, Event, Item, StepMark
+from foundation.readings import Quality
+from recording.writing.recorder import Recorder
+from stand.estimating.estimate import PricedStep
+from stand.estimating.eta import Eta
+from stand.estimating.follow import parameters_text
+from stand.fault import Fault
+from stand.gate import Gate, Phase
+from stand.running.scheduler import Progress
+from stand.running.stop import OPERATOR, Stop
+from stand.serving.control import RunStatus
+
+State = Literal["running", "held", "stopping"]
+_STATES: dict[Phase, State] = {
+    Phase.IDLE: "running",
+    Phase.RUNNING: "running",
+    Phase.HELD: "held",
+    Phase.ABORTING: "stopping",
+    Phase.ENDED: "stopping",
+}
+
+
+class StatusBoard:
+    """A subscriber of the hub that remembers what an operator asks for. `held` gives why the guard holds the run."""
+
+    def __init__(
+        self,
+        recipe: str,
+        steps: Sequence[PricedStep],
+        progress: Progress,
+        gate: Gate,
+        stop: Stop,
+        held: Callable[[], Fault | None],
+        recorder: Recorder,
+        clock: Clock,
+    ) -> None:
+        self._recipe = recipe
+        self._count = len(steps)
+        self._eta = Eta(steps, progress.done, progress.earned_s)
+        self._gate = gate
+        self._stop = stop
+        self._held = held
+        self._recorder = recorder
+        self._clock = clock
+        self._step = 0
+        self._doing = ""
+        self._state: State = _STATES[stop.phase]
+        self._since_ns = clock.now_ns()
+        self._since_utc_offset_ns = self._warning_utc_offset_ns = utc_offset_ns(clock)
+        self._temperatures_degC: dict[str, float | None] = {}
+        self._warning: Event | None = None
+
+    def __call__(self, item: Item) -> None:
+        """Follow one item."""
+        self._follow_state()
+        match item:
+            case StepMark():
+                self._eta.mark(item)
+                self._step = item.index + 1
+                self._doing = f"{item.kind} {parameters_text(item.parameters)}".rstrip()
+            case Event():
+                self._eta.event(item)
+                if item.level != "info":
+                    self._warning, self._warning_utc_offset_ns = item, utc_offset_ns(self._clock)
+            case Batch():
+                for reading in item.readings:
+                    if reading.unit == "degC":
+                        is_bad = reading.quality is Quality.BAD
+                        self._temperatures_degC[reading.channel] = None if is_bad else reading.value
+            case _:
+                pass
+
+    def status(self) -> RunStatus:
+        """As it is now."""
+        self._follow_state()
+        now_ns, saved = self._clock.now_ns(), self._recorder.saved
+        warning, fault = self._warning, self._fault()
+        return RunStatus(
+            recipe=self._recipe,
+            step=self._step,
+            steps=self._count,
+            doing=self._doing,
+            state=self._state,
+            reasons=tuple(sorted(self._gate.reasons)),
+            now_ns=now_ns,
+            since_ns=self._since_ns,
+            end_ns=None if self._state == "stopping" else now_ns + seconds_ns(self._eta.left_s(now_ns)),
+            temperatures_degC=self._temperatures_degC,
+            frames_saved=saved.frames,
+            frames_lost=saved.frames_lost,
+            disk_free_bytes=self._recorder.disk_free_bytes,
+            warning="" if warning is None else warning.text,
+            warning_level="" if warning is None else "error" if warning.level == "error" else "warning",
+            warning_ns=None if warning is None else warning.time_ns,
+            utc_offset_ns=utc_offset_ns(self._clock),
+            since_utc_offset_ns=self._since_utc_offset_ns,
+            warning_utc_offset_ns=self._warning_utc_offset_ns,
+            fault_rule="" if fault is None else fault.rule,
+            fault="" if fault is None else fault.text,
+        )
+
+    def _fault(self) -> Fault | None:
+        """What has tripped; an operator who stops the run is no fault."""
+        fault = self._stop.fault or self._held()
+        return None if fault is None or fault.rule == OPERATOR else fault
+
+    def _follow_state(self) -> None:
+        state = _STATES[self._stop.phase]
+        if state != self._state:
+            self._state, self._since_ns = state, self._clock.now_ns()
+            self._since_utc_offset_ns = utc_offset_ns(self._clock)

@@ -1,0 +1,220 @@
+"""The one owner of making safe: every actuator, until it has confirmed.
+
+Whoever finds a reason (a rule, the operator, a run that ends) demands it; that takes nobody's time. Permissions are
+gone at once. Each actuator has a task of its own, so that one that does not answer keeps none of the others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Protocol
+
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import GarbledReply, Unreachable
+from foundation.hub import Hub
+from foundation.items import Event
+
+TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
+_PAUSE_S = 1.0  # between tries
+_TOLD_EVERY_S = 60.0
+_GIVEN_UP_AFTER_S = 60.0  # before that, a second signal does not end it
+
+
+class Harmful(Protocol):
+    """What of an actuator is needed here."""
+
+    @property
+    def name(self) -> str:
+        """For the sentence that says what is not confirmed."""
+        ...
+
+    async def make_safe(self) -> None:
+        """Bring it to its safe state, now; raises when that could not be confirmed."""
+        ...
+
+
+class _Maker:
+    """Makes one actuator safe as often as it is demanded, and until it confirms.
+
+    A demand is met by a call that begins after it: one under way may already have passed what a verb commands now.
+    """
+
+    def __init__(self, actuator: Harmful, pause_s: float, clock: Clock, changed: Callable[[], None]) -> None:
+        self.failure = ""  # why the last try did not confirm
+        self.demanded = self.begun = self.tried = self.confirmed = 0
+        self._actuator = actuator
+        self._pause_s = pause_s
+        self._clock = clock
+        self._changed = changed
+        self._demand = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+
+    def demand(self) -> None:
+        """Begin at once, also when the last try has just failed; one that has not begun yet serves two demands."""
+        if self.demanded > self.begun:
+            return
+        self.demanded += 1
+        self._demand.set()
+        if self._task is None or self._task.done() or self._task.cancelling():
+            self._task = asyncio.create_task(self._until_confirmed())
+
+    def forgive(self) -> None:
+        """An operator has seen to it: what is not confirmed yet is tried no more."""
+        if self._task is not None and self.confirmed < self.demanded:
+            self._task.cancel()
+        self.failure, self.begun, self.tried, self.confirmed = "", self.demanded, self.demanded, self.demanded
+
+    async def close(self) -> None:
+        """Try no more."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    async def _until_confirmed(self) -> None:
+        while self.confirmed < self.demanded:
+            self._demand.clear()
+            demand = self.begun = self.demanded
+            self.failure = await self._try()
+            self.tried = demand
+            if not self.failure:
+                self.confirmed = demand
+            self._changed()
+            if self.failure:
+                await self._paused()
+
+    async def _try(self) -> str:
+        """Why it is not confirmed, "" when it is; a lost answer is worth a second call at once."""
+        name = self._actuator.name
+        try:
+            async with asyncio.timeout(TRY_LIMIT_S):
+                try:
+                    await self._actuator.make_safe()
+                except (Unreachable, GarbledReply):
+                    await self._actuator.make_safe()
+        except Exception as error:  # noqa: BLE001 - whatever one actuator does, it has to be tried again
+            return f"{name} did not confirm its safe state: {str(error) or 'no answer in time'}"
+        return ""
+
+    async def _paused(self) -> None:
+        """Until the next try is due, or demanded."""
+        sleeping = asyncio.ensure_future(self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._pause_s)))
+        demanded = asyncio.ensure_future(self._demand.wait())
+        try:
+            await asyncio.wait((sleeping, demanded), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            sleeping.cancel()
+            demanded.cancel()
+
+
+class Safety:
+    """Brings every actuator it has taken to its safe state. `revoke` takes back every permission, at once.
+
+    It goes on until each has confirmed what was demanded last; `close` ends that. An actuator is taken when it has been
+    opened: whoever has not opened a device does not command it either.
+    """
+
+    def __init__(self, revoke: Callable[[], None], hub: Hub, clock: Clock) -> None:
+        self._makers: tuple[_Maker, ...] = ()
+        self._revoke = revoke
+        self._hub = hub
+        self._clock = clock
+        self._told: dict[_Maker, str] = {}
+        self._changed = asyncio.Event()  # set, and replaced, when something was tried
+        self._unsafe_since_ns: int | None = None
+        self._given_up = False
+
+    @property
+    def unconfirmed(self) -> tuple[str, ...]:
+        """What has been tried and not confirmed, a sentence each."""
+        return tuple(maker.failure for maker in self._makers if maker.failure)
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether everything demanded so far is confirmed."""
+        return all(maker.confirmed == maker.demanded for maker in self._makers)
+
+    def demand(self) -> None:
+        """Permissions are gone when this returns, and every actuator is being made safe; it waits for nothing."""
+        self._revoke()
+        if self._unsafe_since_ns is None:
+            self._unsafe_since_ns = self._clock.now_ns()
+        for maker in self._makers:
+            maker.demand()
+
+    def take(self, actuator: Harmful, pause_s: float = _PAUSE_S) -> None:
+        """From now on this actuator, too, is made safe with each demand, and again after `pause_s` while it does not
+        confirm."""
+        self._makers = (*self._makers, _Maker(actuator, pause_s, self._clock, self._on_change))
+
+    def give_up(self) -> bool:
+        """An operator does not want to wait for the confirmation any more: whether that ends the wait, as it does from
+        a minute after the demand on."""
+        since_ns = self._unsafe_since_ns
+        late = since_ns is not None and self._clock.now_ns() - since_ns >= seconds_ns(_GIVEN_UP_AFTER_S)
+        if late and not self._given_up:
+            self._given_up = True
+            self._on_change()
+        return self._given_up
+
+    def forgive(self) -> None:
+        """An operator has cleared the hold: what is not confirmed is tried no more, or it would undo what the run does
+        from now on."""
+        for maker in self._makers:
+            maker.forgive()
+        self._on_change()
+
+    async def tried(self) -> None:
+        """Return when every actuator has been tried once since the last demand, whatever came of it."""
+        while any(maker.tried < maker.demanded for maker in self._makers):
+            await self._changed.wait()
+
+    async def confirmed(self, limit_s: float) -> bool:
+        """Whether everything is confirmed within that time, on the stand's clock, and before somebody gives up; an
+        event each minute says what is not."""
+        end_ns = self._clock.now_ns() + seconds_ns(limit_s)
+        await self.tried()
+        while not self.is_confirmed and not self._given_up and self._clock.now_ns() < end_ns:
+            due_ns = min(end_ns, self._clock.now_ns() + seconds_ns(_TOLD_EVERY_S))
+            if not await self._changes_before(due_ns) and not self.is_confirmed:
+                text = f"still trying: {'; '.join(self.unconfirmed)}"
+                self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text, self._data()))
+        return self.is_confirmed
+
+    async def close(self) -> None:
+        """Try no more; may be called twice."""
+        await asyncio.gather(*(maker.close() for maker in self._makers))
+
+    async def _changes_before(self, due_ns: int) -> bool:
+        """Wait for the confirmation, or for somebody to give up, until then."""
+        sleeping = asyncio.ensure_future(self._clock.sleep_until(due_ns))
+        try:
+            while not (sleeping.done() or self.is_confirmed or self._given_up):
+                changed = asyncio.ensure_future(self._changed.wait())
+                await asyncio.wait((sleeping, changed), return_when=asyncio.FIRST_COMPLETED)
+                changed.cancel()
+            return not sleeping.done()
+        finally:
+            sleeping.cancel()
+
+    def _on_change(self) -> None:
+        self._tell()
+        if self.is_confirmed:
+            self._unsafe_since_ns = None
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _tell(self) -> None:
+        """Each new reason, and the end of the last one."""
+        for maker in self._makers:
+            if maker.failure and self._told.get(maker) != maker.failure:
+                self._told[maker] = maker.failure
+                data: dict[str, object] = {"unconfirmed": [maker.failure]}
+                event = Event(self._clock.now_ns(), "error", "not_confirmed_safe", maker.failure, data)
+                self._hub.publish(event)
+        if self._told and self.is_confirmed:
+            self._told.clear()
+            self._hub.publish(Event(self._clock.now_ns(), "info", "confirmed_safe", "the stand is safe"))
+
+    def _data(self) -> dict[str, object]:
+        return {"unconfirmed": list(self.unconfirmed)}

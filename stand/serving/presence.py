@@ -1,0 +1,175 @@
+"""The daemons that live now: for each an entry and its control socket in the runtime folder.
+
+`ID.json` says which session is run, by which process, on which stand; the daemon keeps it locked (flock), so an entry
+that can be locked was left by a dead one and is removed by whoever sees it. `ID.sock` is the control socket, mode 0600.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import socket
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import cast
+
+from foundation.errors import SessionError
+from foundation.lock_file import is_at, remove, take, try_lock
+from stand.runtime import runtime_folder, runtime_folders
+
+_BACKLOG = 128
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """session: its folder's path when the run began. real_path: the same without symbolic links, and identity: its
+    device and inode, once the disk has told them."""
+
+    session: str
+    pid: int
+    stand: str
+    real_path: str = ""
+    identity: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Daemon:
+    """A living daemon and where it answers."""
+
+    entry: Entry
+    socket: Path
+
+
+class Presence:
+    """A daemon's own entry and socket; `appear` before anything else."""
+
+    def __init__(self, entry: Entry) -> None:
+        self._entry = entry
+        self._id = f"{entry.pid}-{secrets.token_hex(4)}"
+        self._path = Path()
+        self._file: int | None = None
+
+    def appear(self) -> socket.socket:
+        """Make, or make again, both files; returns the listening socket. SessionError when they cannot be made."""
+        path = runtime_folder() / f"{self._id}.json"
+        try:
+            self._publish(path)
+            return _listening(self._socket)
+        except OSError as error:
+            self.disappear()
+            raise SessionError(f"{path.parent}: no control socket can be made there ({error.strerror})") from error
+
+    def is_there(self) -> bool:
+        """Whether both files are still there; a logout removes $XDG_RUNTIME_DIR with all that is in it."""
+        with suppress(OSError):
+            return self._file is not None and is_at(self._file, self._path) and self._socket.is_socket()
+        return False
+
+    def tell(self, entry: Entry) -> None:
+        """Say this from now on."""
+        self._entry = entry
+        with suppress(OSError):  # what was said before stays
+            if self._file is not None:
+                self._publish(self._path)
+
+    def disappear(self) -> None:
+        """Remove both files; may be called twice."""
+        if self._file is not None:
+            with suppress(OSError):
+                self._socket.unlink()
+            remove(self._path, self._file)
+            self._file = None
+
+    @property
+    def _socket(self) -> Path:
+        return self._path.with_suffix(".sock")
+
+    def _publish(self, path: Path) -> None:
+        """The entry appears whole and locked."""
+        part = path.with_name(f".{path.name}")
+        file = take(part, json.dumps(asdict(self._entry)).encode())
+        if file is None:
+            raise BlockingIOError(0, "somebody else has locked it")
+        try:
+            part.replace(path)
+        except OSError:
+            remove(part, file)
+            raise
+        before, self._file, self._path = self._file, file, path
+        if before is not None:
+            os.close(before)
+
+
+def living() -> list[Daemon]:
+    """Every daemon of this user on this machine, in the order of their processes; what dead ones left is removed."""
+    found = [
+        daemon
+        for folder in runtime_folders()
+        for path in folder.glob("[!.]*.json")
+        if (daemon := _living(path)) is not None
+    ]
+    return sorted(found, key=lambda daemon: (daemon.entry.pid, daemon.socket))
+
+
+@contextmanager
+def opened_folder(path: Path) -> Generator[int]:
+    """The folder's descriptor while inside; raises OSError."""
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield folder
+    finally:
+        os.close(folder)
+
+
+def address_in(folder: int, name: str) -> str:
+    """The socket by its opened folder: the kernel takes no more than 107 bytes of a path."""
+    return f"/proc/self/fd/{folder}/{name}"
+
+
+def _listening(path: Path) -> socket.socket:
+    listening = socket.socket(socket.AF_UNIX)
+    try:
+        listening.setblocking(False)
+        path.unlink(missing_ok=True)
+        os.fchmod(listening.fileno(), 0o600)  # before bind, so that the name never has another mode
+        with opened_folder(path.parent) as folder:
+            listening.bind(address_in(folder, path.name))
+        listening.listen(_BACKLOG)
+    except OSError:
+        listening.close()
+        raise
+    return listening
+
+
+def _living(path: Path) -> Daemon | None:
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:  # gone meanwhile
+        return None
+    try:
+        if try_lock(file, shared=True):
+            if is_at(file, path):
+                path.with_suffix(".sock").unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
+            return None
+        with open(file, "rb", closefd=False) as opened:
+            return Daemon(_decoded(opened.read()), path.with_suffix(".sock"))
+    except (OSError, ValueError, LookupError, TypeError):  # nothing of ours
+        return None
+    finally:
+        os.close(file)
+
+
+def _decoded(content: bytes) -> Entry:
+    fields = cast("dict[str, object]", json.loads(content))
+    identity = cast("list[int] | None", fields["identity"])
+    return Entry(
+        str(fields["session"]),
+        int(str(fields["pid"])),
+        str(fields["stand"]),
+        str(fields["real_path"]),
+        None if identity is None else (identity[0], identity[1]),
+    )

@@ -1,0 +1,1 @@
+"""Where the target stands: the stages."""
