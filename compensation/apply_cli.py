@@ -16,10 +16,10 @@ from compensation.apply.images import Form, corrected_image, middle_flags, write
 from compensation.apply.points import CAMERA, X, Y, numbers, outside_text, read_points, times, write_corrected
 from compensation.command_line import Incomplete, one_line_errors, said_if
 from compensation.drift.drift_model import DriftModel
-from compensation.drift.history import recorded_history, states_at
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
-from compensation.drift.states import States
+from compensation.history.history import recorded_history, states_at
+from compensation.history.states import States
 from foundation.errors import ConfigError, SessionError
 from foundation.files import check_writable, whole_file
 from foundation.progress import progress

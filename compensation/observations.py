@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.history import History, recorded_history
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
+from compensation.history.history import History, recorded_history
 from compensation.one_equilibrium import check_sessions
 from foundation.documents import parse_document
 from foundation.errors import SessionError

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from compensation.drift.candidates import Candidate, Pair
 from compensation.drift.hull import MARGIN_PX, distances_px
-from compensation.drift.lags import Float
-from compensation.drift.states import Memory, States
+from compensation.history.lags import Float
+from compensation.history.states import Memory, States
 
 Flags = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from compensation.drift.lags import Float
+from compensation.history.lags import Float
 
 MARGIN_PX = 1.0
 """The markers themselves move by this much over the calibrated temperatures."""

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.displacements import Displacements
-from compensation.drift.lags import Float
 from compensation.drift.terms import MOTIONS, motions
+from compensation.history.lags import Float
 from compensation.observations import Mask, Observations
 from foundation.clock import NS_PER_S
 

@@ -16,11 +16,11 @@ from pydantic import Field, TypeAdapter, ValidationError
 from compensation.drift.candidates import Candidate, Pair
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.hull import is_area
-from compensation.drift.lags import Float
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Scaling, exponents
 from compensation.drift.terms import MOTIONS, Kind, Origin, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from compensation.history.lags import Float
 from foundation.documents import Document
 from foundation.errors import SessionError
 from foundation.files import write_whole

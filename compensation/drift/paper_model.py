@@ -25,7 +25,7 @@ from compensation.drift.drift_model import (
     states_of,
 )
 from compensation.drift.polynomial import Float, Scaling, design
-from compensation.drift.states import Memory
+from compensation.history.states import Memory
 from foundation.documents import Document
 
 MAX_DEGREE = 5

@@ -11,8 +11,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from compensation.drift.lags import Float
-from compensation.drift.states import Memory, States
+from compensation.history.lags import Float
+from compensation.history.states import Memory, States
 
 MOTIONS = 8
 _SPAN_K = 20.0

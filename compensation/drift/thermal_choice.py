@@ -15,13 +15,13 @@ from compensation.drift.candidates import Candidate, as_good_as_best, discrepanc
 from compensation.drift.displacements import Displacements, reference_centres
 from compensation.drift.families import PLAYS_K, TAUS_S, Family, Terms, all_terms, families
 from compensation.drift.hull import convex_hull, is_area
-from compensation.drift.lags import Float
 from compensation.drift.paper_fit import reference_chamber_degC
-from compensation.drift.states import Memory
 from compensation.drift.terms import MOTIONS, Kind, motions
 from compensation.drift.thermal_fit import RIDGE, RIDGE_WITH_PLAYS, Equations, equations, solve_thermal
 from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
 from compensation.drift.training import Training, self_heating_K, training
+from compensation.history.lags import Float
+from compensation.history.states import Memory
 from compensation.observations import Observations, Role
 from foundation.errors import SessionError
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.instants import Instants
-from compensation.drift.lags import Float
 from compensation.drift.terms import MOTIONS
+from compensation.history.lags import Float
 
 Columns = NDArray[np.int64]
 

@@ -22,9 +22,9 @@ from compensation.drift.drift_model import (
     range_flags,
     states_of,
 )
-from compensation.drift.lags import Float
-from compensation.drift.states import SETTLED_TAUS, Memory, States
 from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
+from compensation.history.lags import Float
+from compensation.history.states import SETTLED_TAUS, Memory, States
 
 _MARGIN = 0.02
 """Of a calibrated range: it is known to no better than the noise of its ends."""

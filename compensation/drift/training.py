@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensation.drift.displacements import Displacements, anchors, displacements
-from compensation.drift.history import states_at
 from compensation.drift.instants import Instants, condense_instants
-from compensation.drift.lags import Float
-from compensation.drift.states import Memory, States
 from compensation.drift.terms import Kind, Origin, Term, features
+from compensation.history.history import states_at
+from compensation.history.lags import Float
+from compensation.history.states import Memory, States
 from compensation.observations import Mask, Observations, Role
 from foundation.errors import SessionError
 

@@ -18,13 +18,13 @@ from compensation.apply.drift_runtime import Drift
 from compensation.apply.export import export, runtime_model
 from compensation.cli import app
 from compensation.drift.drift_model import DriftModel, Outside
-from compensation.drift.history import recorded_history, states_at
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import Scaling, exponents
-from compensation.drift.states import States, ThermalState
 from compensation.drift.terms import Kind, Origin, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from compensation.history.history import recorded_history, states_at
+from compensation.history.states import States, ThermalState
 from compensation.observations import session_target
 from foundation.errors import SessionError
 from markers.detection import detect

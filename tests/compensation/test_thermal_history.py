@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.drift.history import History, refined, states_at
-from compensation.drift.lags import played
-from compensation.drift.states import Memory, States, ThermalState
+from compensation.history.history import History, refined, states_at
+from compensation.history.lags import played
+from compensation.history.states import Memory, States, ThermalState
 
 S = 1_000_000_000
 MEMORY = Memory((600.0, 3600.0), (2.0,), 20.0)

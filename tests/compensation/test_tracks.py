@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.drift.history import History
+from compensation.history.history import History
 from compensation.observations import Observations, Role, concatenate
 from compensation.report import drift_figures
 from compensation.report.figures import as_svg

@@ -1,6 +1,6 @@
 """What a camera remembers of its thermal past: the recursion that follows it, and its values at many instants.
 
-`ThermalState.advance` is fed sample by sample, from a recording (compensation/drift/history.py) or live; both give the
+`ThermalState.advance` is fed sample by sample, from a recording (history.py) or live; both give the
 same state.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.lags import Float, lagged, played
+from compensation.history.lags import Float, lagged, played
 
 RATE_TAU_S = 600.0
 """The ambient's rate of change is that of its 10 min lag."""

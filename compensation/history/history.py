@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.lags import Float
-from compensation.drift.states import Memory, States, ThermalState
+from compensation.history.lags import Float
+from compensation.history.states import Memory, States, ThermalState
 from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
 from foundation.items import StepState

@@ -1,0 +1,1 @@
+"""What a camera has been through: recorded temperatures, their lags, thermal states."""
