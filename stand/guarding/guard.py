@@ -33,7 +33,8 @@ class Guard:
     every trip aborts. A guard that fails aborts.
 
     A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
-    wait for a GOOD reading of each of `vital`, the channels without which nobody may heat, taken since.
+    wait for a GOOD reading of each of `vital`, the channels without which nobody may heat, taken since. What is too old
+    only because of it is given time to be renewed (Watch.after_gap_s).
     """
 
     safety: Safety
@@ -51,6 +52,7 @@ class Guard:
     _ended: bool = False
     _looked_ns: int | None = None
     _fresh_after_ns: int = 0
+    _late_ns: int | None = None  # of the last look that came late
     _endings_ns: list[int] = field(default_factory=list[int])
     _warned: set[int] = field(default_factory=set[int])  # watches whose warning stands
     _telling: set[asyncio.Task[None]] = field(default_factory=set[asyncio.Task[None]])
@@ -151,7 +153,7 @@ class Guard:
         looked_ns, self._looked_ns = self._looked_ns, now_ns
         if looked_ns is None or now_ns - looked_ns <= _LATE_PERIODS * seconds_ns(self.period_s):
             return
-        self._fresh_after_ns = now_ns + seconds_ns(_STRADDLING_S)
+        self._late_ns, self._fresh_after_ns = now_ns, now_ns + seconds_ns(_STRADDLING_S)
         gap_s = (now_ns - looked_ns) / NS_PER_S
         text = f"the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up"
         data: dict[str, object] = {"gap_s": gap_s, "from_ns": looked_ns, "to_ns": now_ns}
@@ -163,6 +165,8 @@ class Guard:
         faults: list[Fault] = []
         for index, watch in enumerate(self.watches):
             fault = watch.check(self.hub, now_ns)
+            if self._late_ns is not None and now_ns - self._late_ns < seconds_ns(watch.after_gap_s):
+                fault = None
             if watch.action != "warn":
                 if fault is not None:
                     faults.append(fault)

@@ -20,13 +20,18 @@ Rule = Callable[[Readings, int], Fault | None]
 
 @dataclass(slots=True)
 class Watch:
-    """A rule, how long it must object without a break before it counts (s), and what is then done."""
+    """A rule, how long it must object without a break before it counts (s), and what is then done.
+
+    after_gap_s: for so long after a look that came late its objection does not count, because it judges by how old
+    something is that nobody could renew meanwhile. Permits wait for fresh readings all that time.
+    """
 
     rule: Rule
     grace_s: float = 0.0
     action: Action = "abort"
     since_ns: int | None = None
     ends_itself: bool = False
+    after_gap_s: float = 0.0
 
     def check(self, readings: Readings, now_ns: int) -> Fault | None:
         """The rule's fault once it has stood for the grace time."""

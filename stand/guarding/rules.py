@@ -51,6 +51,7 @@ PV, AIR, GRANITE, LABORATORY = (
 )
 RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
 FLAP, CAMERA = "flap.position", "camera.temperature"
+_CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
 VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these nobody may heat
 
 
@@ -97,7 +98,7 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
         Watch(over_temperature(AIR, limits.max_air_degC)),
         Watch(over_temperature(GRANITE, limits.max_granite_degC)),
         Watch(over_temperature(CAMERA, limits.max_camera_degC, cuts_camera=True)),
-        *(Watch(trustworthy(channel, limits.stale_after_s)) for channel in VITAL),
+        *(Watch(trustworthy(channel, limits.stale_after_s), after_gap_s=limits.stale_after_s) for channel in VITAL),
     )
 
 
@@ -199,7 +200,12 @@ def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
     return (
         Watch(recording_ended(recording)),
         Watch(folder_lost(recording), action="hold"),
-        Watch(not_recorded(recording, config.recording.durable_within_s), action="hold", ends_itself=True),
+        Watch(
+            not_recorded(recording, config.recording.durable_within_s),
+            action="hold",
+            ends_itself=True,
+            after_gap_s=_CATCH_UP_S,
+        ),
     )
 
 

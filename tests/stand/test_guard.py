@@ -215,6 +215,35 @@ async def test_after_a_late_look_permits_wait_for_readings_taken_since():
     assert bench.guard.may_permit()
 
 
+async def test_after_a_late_look_what_could_not_be_renewed_has_time_to_be():
+    bench = Bench("abort", "hold")
+    bench.guard.watches[0].after_gap_s = 5.0
+    await bench.run_for(3)
+    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(60))
+    bench.objecting = {0}
+    assert bench.guard.look()
+    await bench.run_for(4)
+    assert bench.log == []
+    bench.objecting = set()
+    await bench.run_for(10)
+    assert bench.log == []
+    bench.objecting = {0}
+    await bench.run_for(2)
+    assert "stop rule0" in bench.log
+
+
+async def test_after_a_late_look_what_is_not_renewed_in_time_trips_and_other_rules_do_at_once():
+    for objecting, within_s, log in (({0}, 4, False), ({0}, 7, True), ({1}, 1, True)):
+        bench = Bench("abort", "abort")
+        bench.guard.watches[0].after_gap_s = 5.0
+        await bench.run_for(3)
+        bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(60))
+        bench.objecting = objecting
+        bench.guard.look()
+        await bench.run_for(within_s)
+        assert bool(bench.log) == log
+
+
 async def test_a_hold_that_ends_by_itself_ends_when_the_stand_is_safe_and_nothing_is_wrong_three_times_an_hour():
     bench = Bench("hold")
     bench.guard.watches[0].ends_itself = True
