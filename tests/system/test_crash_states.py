@@ -149,8 +149,8 @@ def test_nothing_acknowledged_is_missing_in_any_state_of_the_disk(tmp_path):
     rounds = max(acknowledged(entry).get("rounds", 0) for entry in entries)
     all_frames, all_telemetry = frame_records(rounds + 1), telemetry_records(rounds + 1)
     lost_controls = 0
-    for crash, counts in states(image, entries, drawn, after):
-        with mounted(after, tmp_path / f"after-{crash.end}-{crash.kept}") as disk:
+    for number, (crash, counts) in enumerate(states(image, entries, drawn, after)):
+        with mounted(after, tmp_path / f"after-{number}-{crash.end}-{crash.kept}") as disk:
             salvage_unfinished(disk)
             session = Session.open(disk / SESSION)
             assert (session.incomplete, session.damaged) == ((), ()), crash
