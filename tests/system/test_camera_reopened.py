@@ -46,6 +46,7 @@ async def test_a_camera_that_was_cut_off_in_a_soak_is_opened_again_and_keeps_its
     assert not all(good)
 
 
+@pytest.mark.nightly  # a minute of real time
 async def test_a_camera_that_started_anew_by_itself_in_a_soak_is_soaked_anew(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
