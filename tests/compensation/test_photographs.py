@@ -38,8 +38,8 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
             pytest.skip(f"{path} is missing")
     detections: list[Detection] = []
 
-    def kept(*arguments: Any) -> Detection:
-        detections.append(detect(*arguments))
+    def kept(*arguments: Any, **options: Any) -> Detection:
+        detections.append(detect(*arguments, **options))
         return detections[-1]
 
     out = tmp_path_factory.mktemp("photographs") / "markers.csv"
