@@ -21,11 +21,12 @@ def lock(fd: int) -> None:
     """Lock the file (flock); BlockingIOError, which says who, when somebody else has it. A disk process whose daemon
     has gone is waited for for 2 s: it may just have been killed."""
     deadline_s = time.monotonic() + _LEFT_WITHIN_S
+    pid = 0
     while True:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            pid = holder(fd)
+            pid = holder(fd) or pid
             if not _may_end(pid) or time.monotonic() > deadline_s:
                 raise BlockingIOError(error.errno, _who(pid)) from None
             time.sleep(_AGAIN_S)  # noqa: TID251 - as above
@@ -34,7 +35,8 @@ def lock(fd: int) -> None:
 
 
 def holder(fd: int) -> int:
-    """The process that has locked this file, 0 when it cannot be told."""
+    """The process that has locked this file, 0 when it cannot be told: the kernel lists its locks page by page, and
+    leaves some out when others come and go meanwhile."""
     found = os.fstat(fd)
     device = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}"
     lines = (line.split() for line in Path("/proc/locks").read_text().splitlines())
