@@ -13,7 +13,7 @@ from compensation.calibration.camera_file import CameraFile, camera_file
 from compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.positions import observe_positions
-from compensation.calibration.table import TableSigma
+from compensation.calibration.stages import TableSigma
 from compensation.command_line import Incomplete, TargetOption, named_target, one_line_errors, said_if
 from compensation.observations import session_target
 from compensation.report.calibration_report import report_page

@@ -27,9 +27,9 @@ from compensation.command_line import (
 )
 from compensation.drift.choosing import Form, check_request
 from compensation.drift.choosing import fit as fit_model
+from compensation.drift.evaluation import evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
-from compensation.drift.validation import evaluate, table
 from compensation.finding.found import finder
 from compensation.observations import observe_sessions, read_frames, session_target
 from compensation.report.extras import Extras

@@ -27,7 +27,7 @@ from compensation.report.validation_report import validation_page
 from compensation.validation3d.document import as_json
 from compensation.validation3d.positions import validation_frames
 from compensation.validation3d.stand_part import StandPart, stand_part
-from compensation.validation3d.table import summary
+from compensation.validation3d.summary import summary
 from compensation.validation3d.validation import LensModel, camera_of, check_same, validate
 from foundation.errors import ConfigError
 from foundation.files import check_writable, write_whole

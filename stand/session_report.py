@@ -31,7 +31,7 @@ def report_session(session: Path, folder: Path) -> list[str]:
     the frames do not allow it or a file cannot be written; what was recorded is as it was.
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
-    from compensation.drift.validation import table
+    from compensation.drift.evaluation import table
     from compensation.report.report import analyse
 
     model, report = folder / MODEL_NAME, folder / REPORT_NAME

@@ -12,8 +12,8 @@ from compensation.budget.air import Index, ciddor_1996, edlen_1966
 from compensation.budget.correction import granite_mm, indices, post_mm, refraction_px, target_strain, varied
 from compensation.budget.geometry import Geometry, StandState
 from compensation.budget.refraction import tilted_shift_mm
+from compensation.budget.repeatability import Repeatability, home_residuals, v0_repeats
 from compensation.budget.states import capture_states, mean_state, states_at
-from compensation.budget.table import Repeatability, home_residuals, v0_repeats
 from foundation.errors import SessionError
 from markers.target import Target
 from recording.reading.session import Session

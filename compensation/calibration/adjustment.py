@@ -15,7 +15,7 @@ from compensation.calibration.least_squares import Float, Solution, minimise
 from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.positions import Positions
-from compensation.calibration.table import ERRORS, TableSigma
+from compensation.calibration.stages import ERRORS, TableSigma
 
 _ROUNDS = 10
 _OUTLIER = 8.0

@@ -9,11 +9,7 @@ import numpy as np
 
 from compensation.calibration.adjustment import Adjustment, adjust
 from compensation.calibration.board import board_of
-from compensation.calibration.positions import Positions
-from compensation.calibration.rays import DEGREES, RayLens
-from compensation.calibration.table import TableSigma
-from compensation.calibration.uncertainty import Difference, UncertaintyMap, projection_uncertainty
-from compensation.calibration.validation import (
+from compensation.calibration.model_scores import (
     BROWN,
     RATIONAL,
     ModelScore,
@@ -23,6 +19,10 @@ from compensation.calibration.validation import (
     rays_of,
     score_models,
 )
+from compensation.calibration.positions import Positions
+from compensation.calibration.rays import DEGREES, RayLens
+from compensation.calibration.stages import TableSigma
+from compensation.calibration.uncertainty import Difference, UncertaintyMap, projection_uncertainty
 from markers.target import Target
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
 from compensation.calibration.rotation import matrices, nearest, vector
-from compensation.calibration.table import Table
+from compensation.calibration.stages import Table
 
 _LEAST_TURN_DEG = 5.0
 _LEAST_TRAVEL_MM = 10.0

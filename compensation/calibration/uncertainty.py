@@ -13,7 +13,7 @@ import numpy as np
 from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.least_squares import Float
 from compensation.calibration.rotation import nearest
-from compensation.calibration.table import ERRORS, PARAMETERS
+from compensation.calibration.stages import ERRORS, PARAMETERS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from matplotlib.figure import Figure
 
 from compensation.drift.candidates import Candidate
-from compensation.drift.validation import Evaluation
+from compensation.drift.evaluation import Evaluation
 from compensation.observations import Observations
 from compensation.report import fit_figures as figures
 from compensation.report.figures import as_svg

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
-from compensation.drift.validation import Evaluation, improvement_percent
+from compensation.drift.evaluation import Evaluation, improvement_percent
 from compensation.observations import Float, Observations
 from compensation.report.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
 from compensation.report.path_figures import Paths, trajectories

@@ -13,9 +13,9 @@ import numpy as np
 
 from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.training import frame_states
-from compensation.drift.validation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.observations import Float, Mask, Observations, Role
 from compensation.report.extras import Extras
 from compensation.report.numbers import (

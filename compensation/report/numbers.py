@@ -14,8 +14,8 @@ from pydantic import BaseModel
 
 from compensation.budget.budget import Budget
 from compensation.drift.candidates import Candidate
+from compensation.drift.evaluation import TemperatureRms
 from compensation.drift.hysteresis import Gap
-from compensation.drift.validation import TemperatureRms
 from compensation.observations import Float
 from compensation.report.table_positions import TablePositions
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.model_file import save_model
-from compensation.drift.validation import Evaluation, evaluate
 from compensation.observations import Observations, Progress, Role, observe_sessions
 from compensation.report.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.report.data_section import data_section, utc

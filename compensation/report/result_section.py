@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from compensation.drift.validation import improvement_percent
+from compensation.drift.evaluation import improvement_percent
 from compensation.report.numbers import Numbers, Pair, ScoreNumbers
 from compensation.report.page import heading, paragraph, table
 from compensation.report.validation_report import gains_table

@@ -8,13 +8,13 @@ from itertools import chain
 import numpy as np
 
 from compensation.drift.drift_model import Outside
-from compensation.drift.validation import improvement_percent
+from compensation.drift.evaluation import improvement_percent
 from compensation.observations import Float
 from compensation.report import validation_figures as figures
 from compensation.report.figures import as_svg
 from compensation.report.page import facts, figure, heading, page, paragraph, table
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from compensation.validation3d.table import flagged, reason_names
+from compensation.validation3d.summary import flagged, reason_names
 from compensation.validation3d.validation import Validation
 
 _HEADS = ("Temp.", "Pos.", *(f"{axis} {when}" for when in ("before", "after") for axis in figures.AXES))

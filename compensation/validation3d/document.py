@@ -11,7 +11,7 @@ import numpy as np
 from compensation.drift.drift_model import Outside
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from compensation.validation3d.table import reason_names
+from compensation.validation3d.summary import reason_names
 from compensation.validation3d.validation import Validation
 
 FORMAT = "thermostand validation"

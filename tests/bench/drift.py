@@ -13,8 +13,8 @@ import numpy as np
 
 from compensation.drift.choosing import FORMS, Form, fit
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
-from compensation.drift.validation import evaluate
 from compensation.observations import Role
 from drivers.sim.optics import CameraKind
 from tests.bench.figures import Figure, at_most, progress, side_by_side

@@ -17,7 +17,7 @@ from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.pose import find_pose
 from compensation.calibration.rays import fit_rays
 from compensation.calibration.rotation import across, matrices, nearest, vector
-from compensation.calibration.table import TableSigma
+from compensation.calibration.stages import TableSigma
 
 from .calibration_cases import board, positions
 from .calibration_truth import SIZE, TrueCamera, Truth, draw, ellipse_centres

@@ -7,10 +7,10 @@ import yaml
 
 from compensation.calibration.adjustment import adjust
 from compensation.calibration.board import board_of
+from compensation.calibration.model_scores import rays_of
 from compensation.calibration.pose import find_pose
 from compensation.calibration.positions import Positions
-from compensation.calibration.table import TableSigma
-from compensation.calibration.validation import rays_of
+from compensation.calibration.stages import TableSigma
 from drivers.sim.optics import Nodes, Optics, Placement, optics_at, true_centres_px
 from markers.target import load_target
 from stand.config.stand_config import packaged

@@ -15,9 +15,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from compensation import cli
+from compensation.drift.evaluation import table
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
-from compensation.drift.validation import table
 from compensation.report.report import analyse
 from foundation.errors import SessionError
 from foundation.progress import progress

@@ -13,9 +13,9 @@ import pytest
 
 from compensation.budget.budget import Budget, Contribution
 from compensation.budget.geometry import StandState
+from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
-from compensation.drift.validation import Evaluation, evaluate
 from compensation.observations import Observations
 from compensation.report.compensation_section import uncertainty_section
 from compensation.report.extras import Extras

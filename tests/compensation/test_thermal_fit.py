@@ -11,13 +11,13 @@ import pytest
 
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel, Outside
+from compensation.drift.evaluation import evaluate
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.terms import Kind
 from compensation.drift.thermal_choice import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
-from compensation.drift.validation import evaluate
 from compensation.history.history import states_at
 from compensation.history.states import States, ThermalState
 from compensation.observations import Observations, Role, concatenate

@@ -20,7 +20,7 @@ from compensation.budget.geometry import load_geometry
 from compensation.calibration.calibrate import Model, calibrate
 from compensation.calibration.camera_file import camera_file
 from compensation.calibration.positions import Positions
-from compensation.calibration.table import TableSigma
+from compensation.calibration.stages import TableSigma
 from compensation.drift.model_file import save_model
 from compensation.drift.paper_fit import fit_paper
 from compensation.observations import Float, Observations, Role, observe, session_target

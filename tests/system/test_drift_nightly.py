@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
-from compensation.drift.validation import evaluate
 from compensation.observations import Observations, Role, observe_sessions
 from foundation.hub import Hub
 from foundation.items import Item

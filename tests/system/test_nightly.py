@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from compensation.drift.validation import Evaluation
+from compensation.drift.evaluation import Evaluation
 from compensation.report.report import analyse
 from foundation.progress import progress
 from stand.config.stand_config import packaged

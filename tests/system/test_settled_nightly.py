@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.evaluation import rms_px
 from compensation.drift.training import frame_states
-from compensation.drift.validation import rms_px
 from compensation.observations import Observations, Role, observe_sessions
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub

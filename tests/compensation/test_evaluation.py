@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from compensation.drift.evaluation import evaluate, improvement_percent, table
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
-from compensation.drift.validation import evaluate, improvement_percent, table
 from compensation.observations import Observations
 from foundation.errors import SessionError
 

@@ -15,7 +15,7 @@ from compensation.calibration.least_squares import Float
 from compensation.calibration.pose import Lens, find_pose
 from compensation.calibration.positions import Positions
 from compensation.calibration.rays import DEGREES, RayLens, fit_rays
-from compensation.calibration.table import TableSigma
+from compensation.calibration.stages import TableSigma
 from compensation.calibration.uncertainty import Difference, difference
 
 BROWN, RATIONAL = "pinhole, Brown", "pinhole, rational"
