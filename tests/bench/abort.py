@@ -35,7 +35,7 @@ from stand.running.stop import Interrupted, Stop
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from stand.stand import Devices, Limits, Stand
 from tests.bench.figures import Figure, at_most, progress
-from tests.bench.orders import simulated_order
+from tests.system.simulated_orders import simulated_order
 
 TRIPS = 60  # of each kind
 LIMIT_ms = 20.0

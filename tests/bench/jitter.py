@@ -21,7 +21,7 @@ from stand.running.run import run_real
 from stand.running.session_setup import Order
 from stand.simulator import Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
-from tests.bench.orders import simulated_order
+from tests.system.simulated_orders import simulated_order
 
 FRAMES = 101  # so that the 99th percentile is not the longest
 INTERVAL_s = 0.5

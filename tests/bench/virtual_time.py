@@ -23,7 +23,7 @@ from stand.running.run import run_virtual
 from stand.running.session_setup import Order
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
-from tests.bench.orders import simulated_order
+from tests.system.simulated_orders import simulated_order
 
 ROUNDS = 5
 SOAK_s = 1800.0

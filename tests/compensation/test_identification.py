@@ -8,7 +8,7 @@ import pytest
 from markers.detection import detect
 from markers.target import load_target
 from stand.config.stand_config import packaged
-from tests.bench.identification import TARGETS, judged, own, posed
+from tests.compensation.identified import TARGETS, judged, own, posed
 from tests.compensation.rendered import photograph, render, true_centres_px
 
 PAPER = load_target(packaged("targets", "paper-9x6"))

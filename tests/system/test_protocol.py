@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench.night import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes
-from tests.bench.orders import simulated_order
 from tests.system.conftest import require_aravis
+from tests.system.protocol_night import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes
+from tests.system.simulated_orders import simulated_order
 
 
 @pytest.mark.nightly

@@ -1,4 +1,4 @@
-"""Orders for a simulated stand at addresses of its own, which the benchmarks run."""
+"""Orders for a simulated stand at addresses of its own, to be run by a process of its own."""
 
 from __future__ import annotations
 
