@@ -21,6 +21,7 @@ from drivers.wires.registers import RegisterMap, load_register_map
 from foundation.clock import Clock, VirtualClock
 from foundation.errors import ConfigError
 from foundation.hub import Hub
+from stand.chamber.chamber import ChamberLimits
 from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import CameraConfig, StandConfig, packaged
@@ -30,9 +31,10 @@ from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
 from stand.guarding.rules import CAMERA, VITAL, Announcements, camera_measured, camera_stale, recorded, watches
+from stand.imaging.camera_supply import SupplyLimits
 from stand.imaging.equilibrium import EquilibriumLimits
 from stand.poller import Poller
-from stand.stand import Devices, Limits, Stand
+from stand.stand import Devices, Stand
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ class Assembly:
             stand.safety,
             (
                 *watches(self.config, announced),
-                Watch(intrusion(lambda: stand.permits.intrusions), action="hold"),
+                Watch(intrusion(lambda: stand.chamber.permits.intrusions), action="hold"),
                 *camera_measured(self.config, frames_to_come),
                 *(recorded(self.config, recording) if recording is not None else ()),
             ),
@@ -95,7 +97,7 @@ class Assembly:
             self.notifier,
             VITAL,
         )
-        stand.permits.allowed = guard.may_permit
+        stand.chamber.permits.allowed = guard.may_permit
         return guard
 
 
@@ -134,10 +136,9 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         state_file = config.recording.directory / "compressor.json"
     permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, compressor)
     equilibrium = EquilibriumLimits(**config.camera.equilibrium.model_dump())
-    limits = Limits(
-        config.limits.chamber_degC, permits, config.guard.heater_renew_s, config.camera.boot_s, equilibrium, state_file
-    )
-    return Assembly(config, hub, clock, bus, devices, Stand(devices, limits, hub, clock), notifier)
+    chamber = ChamberLimits(config.limits.chamber_degC, permits, config.guard.heater_renew_s, state_file)
+    supply = SupplyLimits(config.camera.boot_s, config.guard.heater_hold_s, equilibrium)
+    return Assembly(config, hub, clock, bus, devices, Stand(devices, chamber, supply, hub, clock), notifier)
 
 
 def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers:

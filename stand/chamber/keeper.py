@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from drivers.devices.regulator import Regulator
-from drivers.devices.relays import CAMERA_POWER
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError
 from foundation.hub import Hub
@@ -25,7 +24,7 @@ _SUPERVISED_S = 2.5  # between looks at relays and regulator while nothing is pe
 class Keeper:
     """Every `renew_s` the permits while they are granted; without them every 2.5 s a look at what must be off.
 
-    `camera_dropped` is called when the camera's supply reads off though `camera_wanted` says that it is switched on.
+    `coils_read` is given what the relays read each time, by channel.
     """
 
     permits: Permits
@@ -33,8 +32,7 @@ class Keeper:
     hub: Hub
     clock: Clock
     renew_s: float
-    camera_wanted: Callable[[], bool]
-    camera_dropped: Callable[[], None]
+    coils_read: Callable[[Mapping[str, bool]], None]
 
     async def run(self) -> None:
         """Keep until cancelled."""
@@ -57,7 +55,7 @@ class Keeper:
         else:
             coils = await self.permits.supervise()
             await self._stop_regulator()
-        self._compare_supply(coils)
+        self.coils_read(coils)
 
     async def _stop_regulator(self) -> None:
         """A regulator that runs, or gives an output, while nothing is permitted."""
@@ -73,10 +71,6 @@ class Keeper:
         await self.regulator.make_safe()
         text = f"{self.regulator.name} ran without permission ({', '.join(found)} above 0); stopped"
         self._tell("switched_off", text, {"device": self.regulator.name, "times": self.permits.intrusions})
-
-    def _compare_supply(self, coils: Mapping[str, bool]) -> None:
-        if self.camera_wanted() and not coils.get(CAMERA_POWER, True):
-            self.camera_dropped()
 
     def _tell(self, kind: str, text: str, data: Mapping[str, object] | None = None) -> None:
         self.hub.publish(Event(self.clock.now_ns(), "warning", kind, text, data or {}))

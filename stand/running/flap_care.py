@@ -29,7 +29,7 @@ async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
             continue
         while stand.gate.reasons:
             wait_s = _LOOK_S
-            if stand.flap_open and STOPPING not in stand.gate.reasons and not await _shut(stand, hub, clock):
+            if stand.imaging.flap_open and STOPPING not in stand.gate.reasons and not await _shut(stand, hub, clock):
                 wait_s = _AGAIN_S
             await _opens_within(stand.gate, clock, wait_s)
 
@@ -39,7 +39,7 @@ async def _shut(stand: Stand, hub: Hub, clock: Clock) -> bool:
     reasons = sorted(stand.gate.reasons)
     data = {"reasons": reasons}
     try:
-        await stand.close_flap()
+        await stand.imaging.close_flap()
     except DeviceError as error:
         text = f"the flap does not close, although the run is held ({', '.join(reasons)}): {error}"
         hub.publish(Event(clock.now_ns(), "error", "flap_not_shut", text, data))

@@ -79,9 +79,9 @@ async def perform(work: Performance) -> None:
         watchers.append(asyncio.create_task(_answer(work, await _board(work, guard), log)))
         watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
         watchers.append(asyncio.create_task(guard.run()))
-        watchers.append(asyncio.create_task(assembly.stand.keeper.run()))
+        watchers.append(asyncio.create_task(assembly.stand.chamber.keeper.run()))
         watchers.append(asyncio.create_task(keep_shut_in_holds(assembly.stand, assembly.hub, assembly.clock)))
-        watchers.append(asyncio.create_task(assembly.stand.opening.keep_open()))
+        watchers.append(asyncio.create_task(assembly.stand.imaging.supply.opening.keep_open()))
         if isinstance(assembly.clock, VirtualClock):
             limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
             watchers.append(asyncio.create_task(end_endless_holds(assembly.stand.gate, assembly.clock, limit_h)))
@@ -167,14 +167,14 @@ def _judge_camera(before: Interruption, assembly: Assembly) -> None:
     """A camera that the plan has on, and that may have been off since, has lost its equilibrium."""
     stand, boot = assembly.stand, boot_of(assembly.clock)
     if not before.set_up.camera_on:
-        stand.camera_is_off(before.camera.last)
+        stand.imaging.supply.last = before.camera.last
     elif reason := doubt(
         before.camera,
         None if boot is None else boot.id,
-        stand.camera_was_supplied,
+        stand.imaging.supply.was_on,
         assembly.hub.latest("camera.temperature"),
     ):
-        stand.lose_equilibrium(reason)
+        stand.imaging.supply.equilibrium.lose(reason)
 
 
 def _begin_data(work: Performance) -> dict[str, object]:
@@ -256,7 +256,7 @@ def _guard(work: Performance, log: Logbook) -> Guard:
 
     done = frozenset[str]() if work.before is None else work.before.progress.done
     stand = work.assembly.stand
-    frames = FramesToCome(lambda: stand.camera_supplied, work.order.recipe.plan(), done)
+    frames = FramesToCome(lambda: stand.imaging.supply.is_on, work.order.recipe.plan(), done)
     work.assembly.hub.subscribe(frames)
     return work.assembly.guard(trip, hold, lambda: gate.clear(INTERLOCK), work.recorder, frames.is_due)
 
@@ -264,7 +264,7 @@ def _guard(work: Performance, log: Logbook) -> Guard:
 def _forget_cleared(guard: Guard, work: Performance, reason: str, held: bool) -> None:
     """An operator has cleared the interlock: the guard's hold is over. Of a folder that is lost another one is made."""
     if reason == INTERLOCK and not held:
-        work.assembly.stand.permits.forgive()
+        work.assembly.stand.chamber.permits.forgive()
         work.assembly.stand.safety.forgive()
         work.recorder.refound()
         guard.clear()

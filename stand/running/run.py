@@ -196,8 +196,8 @@ async def _performed(
         disk = None if isinstance(assembly.clock, VirtualClock) else Disk()
         if disk is not None:
             stack.callback(disk.close)
-            assembly.stand.compressor_file.through(disk.line(FILES_LINE).run)
-        stack.push_async_callback(assembly.stand.compressor_file.close)
+            assembly.stand.chamber.compressor_file.through(disk.line(FILES_LINE).run)
+        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
         background: list[asyncio.Task[None]] = []
         stack.push_async_callback(cancelled, background)
         if time is not None:
@@ -293,7 +293,7 @@ async def _open(assembly: Assembly, *, camera_on: bool) -> None:
     await assembly.bus.open()
     await devices.relays.open()
     stand.opened(devices.relays)
-    await stand.withdraw_permits()
+    await stand.chamber.permits.withdraw_left_on()
     await devices.regulator.open()
     stand.opened(devices.regulator)
     await devices.regulator.stop()
@@ -304,9 +304,9 @@ async def _open(assembly: Assembly, *, camera_on: bool) -> None:
     for axis in devices.axes.values():
         await axis.open()
         stand.opened(axis)
-    await stand.test_dead_man()
+    await stand.chamber.test_dead_man()
     if camera_on:
-        await stand.power_camera(on=True)
+        await stand.imaging.supply.switch_on()
         has_temperature = assembly.config.camera.has_temperature
         await check_temperature(devices.camera, assembly.hub, assembly.clock, has_temperature=has_temperature)
 

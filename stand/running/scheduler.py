@@ -40,6 +40,7 @@ from foundation.hub import Hub
 from foundation.items import Event, StepMark, StepState
 from recording.format.restarts import restarted
 from stand.gate import INTERLOCK
+from stand.interlock import Interlocked
 from stand.running.camera_offset import OffsetWatch
 from stand.running.cold_start import cold_start
 from stand.running.earned import Earned, duration_of
@@ -47,7 +48,7 @@ from stand.running.journal import Again, Journal, Step
 from stand.running.outage import Outage
 from stand.running.set_up import SetUp
 from stand.running.settling_watch import SettlingWatch
-from stand.stand import Interlocked, Stand
+from stand.stand import Stand
 
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
 # chamber left alone for a minute has gone further. The camera, which is slower than the air, has then hardly moved.
@@ -115,9 +116,9 @@ class Scheduler:
         self._outage = Outage(stand.gate, clock)  # since the last frame
         if progress.until_ns is not None:
             self._outage.reset(clock.now_ns() - progress.until_ns)
-        self._lost_equilibrium = stand.equilibrium.is_lost  # and the soaks have not been taken back yet
+        self._lost_equilibrium = stand.imaging.supply.equilibrium.is_lost  # and the soaks have not been taken back yet
         stand.gate.subscribe(self._on_hold)
-        stand.equilibrium.subscribe(self._on_lost_equilibrium)
+        stand.imaging.supply.equilibrium.subscribe(self._on_lost_equilibrium)
 
     async def run(self, plan: Iterable[PlannedStep]) -> None:
         """What is not done of the plan."""
@@ -187,31 +188,32 @@ class Scheduler:
         stand = self._stand
         match planned.step:
             case StartChamber(chamber_degC):
-                await stand.start_chamber(chamber_degC)
+                await stand.chamber.start(chamber_degC)
             case SetTemperature(chamber_degC):
-                await stand.set_temperature(chamber_degC)
+                await stand.chamber.set_temperature(chamber_degC)
             case StopChamber():
-                await stand.stop_chamber()
+                await stand.chamber.stop()
             case Soak() | SoakUntilSettled():
                 await self._soak(planned, set_up)
             case OpenFlap():
-                await stand.open_flap()
+                await stand.imaging.open_flap()
             case CloseFlap():
-                await stand.close_flap()
+                await stand.imaging.close_flap()
             case Capture() as capture:
                 await self._capture(planned, capture, set_up)
             case MoveTo(axis, position):
-                await stand.move_to(axis, position)
+                await stand.table.move_to(axis, position)
             case PowerCamera(on):
                 self._warming_ns, self._was_held = self._clock.now_ns(), False
                 self._outage.reset()
                 self._lost_equilibrium = False
-                stand.equilibrium.forget()
-                await stand.power_camera(on=on)
+                supply = stand.imaging.supply
+                supply.equilibrium.forget()
+                await (supply.switch_on() if on else supply.switch_off())
             case CoolDown(band_K, time_constant_s, max_s):
-                await stand.cool_down(band_K, time_constant_s, max_s)
+                await stand.imaging.supply.cool_down(band_K, time_constant_s, max_s)
             case CheckHome(axis):
-                await stand.check_home(axis)
+                await stand.table.check_home(axis)
             case Prompt(text):
                 await stand.prompt(text)
 
@@ -221,7 +223,7 @@ class Scheduler:
         step_id = planned.step_id
         if not self._frames.get(step_id) and capture.role is not Role.WARM_UP:
             self._outage.reset()
-        await self._stand.approach_again()
+        await self._stand.table.approach_again()
         lead_ns = self._clock.lead_ns  # the camera is told of a frame before its instant, and prepared when it comes
         due_ns, interval_ns = self._clock.now_ns() + lead_ns, seconds_ns(capture.interval_s)
         is_lost = False  # the camera was, a moment ago
@@ -229,7 +231,7 @@ class Scheduler:
             await self._clock.sleep_until(due_ns - lead_ns)
             if is_lost or not self._is_ready(set_up):
                 await self._ready(planned, set_up)
-                await self._stand.approach_again()
+                await self._stand.table.approach_again()
                 due_ns += max(is_lost, math.ceil((self._clock.now_ns() - due_ns) / interval_ns)) * interval_ns
                 is_lost = False
                 continue
@@ -237,7 +239,7 @@ class Scheduler:
             if not self._frames.get(step_id) and set_up.soaks and capture.role is not Role.WARM_UP:
                 self._offsets.settled(capture.chamber_degC)
             self._tell_missing(capture)
-            is_lost = not await self._stand.take_frame(capture.exposure_s, step_id, due_ns)
+            is_lost = not await self._stand.imaging.take_frame(capture.exposure_s, step_id, due_ns)
             if not is_lost:
                 self._warming_ns = self._clock.now_ns()
                 self._outage.reset()
@@ -247,7 +249,7 @@ class Scheduler:
 
     def _is_ready(self, set_up: SetUp) -> bool:
         """Whether nothing holds the run, and nothing has undone what the steps have set up."""
-        is_shut = set_up.flap_open and not self._stand.flap_open  # in a hold
+        is_shut = set_up.flap_open and not self._stand.imaging.flap_open  # in a hold
         return not (self._stand.gate.reasons or self._disturbed or is_shut)
 
     async def _again_after_outage(self, planned: PlannedStep, capture: Capture) -> None:
@@ -331,29 +333,29 @@ class Scheduler:
             if soak != planned:
                 await self._dwell(soak)
         if set_up.camera_on and isinstance(planned.step, OpenFlap | Capture):
-            await stand.equilibrium.regained(lambda: self._disturbed)
+            await stand.imaging.supply.equilibrium.regained(lambda: self._disturbed)
         await stand.gate.passed()
         is_wanted_open = set_up.flap_open and not isinstance(planned.step, CloseFlap)
-        if is_wanted_open and not stand.flap_open and not self._disturbed:
-            await stand.open_flap()
+        if is_wanted_open and not stand.imaging.flap_open and not self._disturbed:
+            await stand.imaging.open_flap()
 
     async def _restore(self, set_up: SetUp) -> None:
         """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
         stand = self._stand
-        await stand.close_flap()
+        await stand.imaging.close_flap()
         for axis, position in set_up.positions.items():
             await stand.gate.passed()
-            await stand.move_to(axis, position)
+            await stand.table.move_to(axis, position)
         await stand.gate.passed()
         if set_up.camera_on:
-            await stand.restore_camera()
+            await stand.imaging.supply.restore()
         else:
-            stand.equilibrium.forget()
-            await stand.power_camera(on=False)
+            stand.imaging.supply.equilibrium.forget()
+            await stand.imaging.supply.switch_off()
         if set_up.chamber_degC is not None:
             await stand.gate.passed()
             await self._credit_soaks(set_up, set_up.chamber_degC)
-            await stand.start_chamber(set_up.chamber_degC)
+            await stand.chamber.start(set_up.chamber_degC)
         else:
             self._lost_equilibrium = False
         self._tell("info", "restored", set_up.text)

@@ -78,7 +78,7 @@ class SettlingWatch:
         if self._due_ns is None or now_ns < self._due_ns:
             return False
         self._due_ns += (1 + (now_ns - self._due_ns) // every_ns) * every_ns
-        frame = await self._stand.look(soak.exposure_s, step_id)
+        frame = await self._stand.imaging.look(soak.exposure_s, step_id)
         if frame is None:
             self._forget_looks("the camera was lost")
             return False

@@ -26,14 +26,16 @@ from foundation.errors import StandTripped
 from foundation.hub import Hub
 from foundation.tasks import cancelled
 from stand.assembly import Assembly, assemble
+from stand.chamber.chamber import ChamberLimits
 from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import StandConfig, packaged
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Watch, over_temperature
+from stand.imaging.camera_supply import SupplyLimits
 from stand.running.stop import Interrupted, Stop
 from stand.simulator import ControlSocket, Simulator, laboratory_of
-from stand.stand import Devices, Limits, Stand
+from stand.stand import Devices, Stand
 from tests.bench.figures import Figure, at_most, progress
 from tests.system.simulated_orders import simulated_order
 
@@ -95,11 +97,12 @@ async def _trip_ms(assembly: Assembly, control: ControlSocket, trip: Trip, delay
     config = assembly.config
     compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
     permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, compressor)
-    limits = Limits(config.limits.chamber_degC, permits, config.guard.heater_renew_s, config.camera.boot_s)
-    stand = Stand(assembly.devices, limits, assembly.hub, assembly.clock)
+    chamber = ChamberLimits(config.limits.chamber_degC, permits, config.guard.heater_renew_s)
+    supply = SupplyLimits(config.camera.boot_s, config.guard.heater_hold_s)
+    stand = Stand(assembly.devices, chamber, supply, assembly.hub, assembly.clock)
     for actuator in (relays, assembly.devices.regulator, assembly.devices.flap, *assembly.devices.axes.values()):
         stand.opened(actuator)
-    await stand.start_chamber(40.0)
+    await stand.chamber.start(40.0)
     await _expect_heater(control, 1)
     await assembly.clock.sleep_until(assembly.clock.now_ns() + seconds_ns(delay_s))
     relays.heater_off_s = math.nan

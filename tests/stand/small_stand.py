@@ -13,6 +13,7 @@ from foundation.readings import Frame, Reading
 from markers.target import Target
 from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
 from stand.imaging.equilibrium import LOST, CameraEquilibrium, EquilibriumLimits
+from stand.interlock import Interlocked
 from stand.running.camera_offset import OffsetWatch
 from stand.running.flap_care import keep_shut_in_holds
 from stand.running.journal import JOURNAL_NAME, Again, Journal
@@ -21,7 +22,6 @@ from stand.running.scheduler import Progress, Scheduler
 from stand.running.settling_watch import SettlingWatch
 from stand.running.stop import Stop
 from stand.safety import Safety
-from stand.stand import Interlocked
 
 TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
 TIME_CONSTANT_S = 5.0  # of a camera that tells no temperature
@@ -31,10 +31,11 @@ COMMIT_EVERY_S = 1.0  # and what was published before that, it has in any case
 
 class SmallStand:
     """As stand.stand.Stand towards the scheduler. broken: the next action fails; camera_back_ns: until then it is
-    lost; supplied: whether the camera is."""
+    lost; supplied: whether the camera is. It is its own chamber, imaging, camera supply and table."""
 
     def __init__(self, clock, hub, wrong):
         self.gate = Gate()
+        self.chamber = self.imaging = self.supply = self.table = self
         self.equilibrium = CameraEquilibrium(EquilibriumLimits(0.2, 600.0, TIME_CONSTANT_S), hub, clock)
         self.safety = Safety(lambda: None, hub, clock)
         self.safety.take(self)
@@ -69,7 +70,7 @@ class SmallStand:
             self.broken = False
             raise Unreachable("flap", "unplugged")
 
-    async def start_chamber(self, chamber_degC):
+    async def start(self, chamber_degC):
         found_degC = self._hub.latest("regulator.pv").value
         await self._act("start_chamber")
         self.heating, self.set_ns, self.started_at_degC = True, self._clock.now_ns(), found_degC
@@ -78,7 +79,7 @@ class SmallStand:
         await self._act("set_temperature")
         self.started_at_degC, self.set_ns = None, self._clock.now_ns()
 
-    async def stop_chamber(self):
+    async def stop(self):
         await self._act("stop_chamber")
         self.heating = False
 
@@ -117,7 +118,7 @@ class SmallStand:
             self.supplied = False
             self.equilibrium.lose("brown-out")
 
-    async def restore_camera(self):
+    async def restore(self):
         if not self.supplied:
             await self._act("restore_camera")
             self.supplied, self.supplied_ns = True, self._clock.now_ns()

@@ -71,6 +71,6 @@ async def test_a_compressor_that_somebody_else_switched_on_is_kept_as_started_an
             assert not kept.running
             assert 0 <= kept.since_ns - switched_ns <= seconds_ns(10)
             assert len(kept.starts_ns) == number
-            await bench.assembly.stand.stop_chamber()
+            await bench.assembly.stand.chamber.stop()
             await bench.wait(5)
         await bench.end()

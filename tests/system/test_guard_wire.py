@@ -61,8 +61,11 @@ class Bench:
         self.trips.clear()
         guard = self.assembly.guard(self.trips.append, self.trips.append)
         assert guard.look()
-        self.guarding = [asyncio.create_task(guard.run()), asyncio.create_task(self.assembly.stand.keeper.run())]
-        await self.assembly.stand.start_chamber(chamber_degC)
+        self.guarding = [
+            asyncio.create_task(guard.run()),
+            asyncio.create_task(self.assembly.stand.chamber.keeper.run()),
+        ]
+        await self.assembly.stand.chamber.start(chamber_degC)
         await self.wait(soak_s)
         assert self.trips == []
         assert await self.plant("heater_enabled") == 1
@@ -196,13 +199,13 @@ async def test_hands_on_the_regulator_alarms_and_an_open_flap_hold_the_stand(
         await bench.wait(60)
 
         await bench.start(26, 60)
-        await stand.open_flap()
+        await stand.imaging.open_flap()
         trip = await bench.tripped(400)
         assert (trip.rule, trip.action) == ("flap_open", "hold")
         assert await bench.plant("flap_open") < 0.05
 
         await bench.start(26, 60)
-        await stand.open_flap()
+        await stand.imaging.open_flap()
         await bench.fault("flap.jam", 2000)
         await bench.tripped(400)
         assert await bench.plant("flap_open") > 0.3
@@ -240,14 +243,14 @@ async def test_heat_that_does_not_come_or_comes_unasked_and_sensors_that_lie_are
 
         await bench.start(24, 600)
         await bench.fault("regulator.stuck_pv_degC", 24.0)
-        await bench.assembly.stand.set_temperature(45)
+        await bench.assembly.stand.chamber.set_temperature(45)
         trip = await bench.tripped(120)
         assert (trip.rule, trip.action) == ("sensor_stuck", "hold")
         await bench.fault("regulator.stuck_pv_degC", None)
 
         await bench.start(30, 300)
         await bench.fault("heater.cut_out", True)
-        await bench.assembly.stand.set_temperature(50)
+        await bench.assembly.stand.chamber.set_temperature(50)
         trip = await bench.tripped(700)
         assert (trip.rule, trip.action) == ("first_heat", "hold")  # no heat was needed before
         await bench.fault("heater.cut_out", False)
@@ -332,7 +335,7 @@ async def test_what_somebody_left_switched_on_is_switched_off_and_told_before_an
         await asyncio.to_thread(write_by_another_master, ordered, unit, function, address, value)
     async with bench_from(ordered, start_ns) as bench:
         assert (await bench.plant("heater_enabled"), await bench.plant("compressor_on")) == (1, 1)
-        await bench.assembly.stand.withdraw_permits()
+        await bench.assembly.stand.chamber.permits.withdraw_left_on()
         assert (await bench.plant("heater_enabled"), await bench.plant("compressor_on")) == (0, 0)
         left = [event.text for event in bench.events if event.kind == "left_on"]
         assert left == [f"relays.{name} was on; switched off" for name in ("compressor", "heater_enable")]

@@ -21,13 +21,16 @@ async def test_the_answer_to_a_pause_says_what_still_moves(order: Callable[..., 
     async with bench_of(order(), simulator) as bench:
         stand = bench.assembly.stand
         table = handlers(stand.gate, lambda: None, no_status, lambda: stand.motions.texts)
-        tasks = [asyncio.create_task(stand.move_to("linear", 140)), asyncio.create_task(stand.open_flap())]
+        tasks = [
+            asyncio.create_task(stand.table.move_to("linear", 140)),
+            asyncio.create_task(stand.imaging.open_flap()),
+        ]
         await bench.wait(1)
         held = ["operator"]
         assert table["pause"]({}) == {"reasons": held, "moving": ["linear homing, then to 140 mm", "flap opening"]}
         await asyncio.gather(*tasks)
         assert table["pause"]({}) == {"reasons": held, "moving": []}
-        tasks = [asyncio.create_task(stand.move_to("linear", 1)), asyncio.create_task(stand.close_flap())]
+        tasks = [asyncio.create_task(stand.table.move_to("linear", 1)), asyncio.create_task(stand.imaging.close_flap())]
         await bench.wait(1)
         assert table["pause"]({}) == {"reasons": held, "moving": ["linear to 1 mm", "flap closing"]}
         await asyncio.gather(*tasks)

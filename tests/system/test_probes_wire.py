@@ -56,7 +56,7 @@ async def _hottest_degC(bench: Bench, longest_s: float) -> float:
 async def _check(bench: Bench, failure: str) -> None:
     config = bench.assembly.config
     await bench.start(24, 600)
-    await bench.assembly.stand.set_temperature(HOT_DEGC)
+    await bench.assembly.stand.chamber.set_temperature(HOT_DEGC)
     await bench.wait(2400)
     assert bench.trips == []
     await _inject(bench, failure)

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from dataclasses import replace
 
 import pytest
 
@@ -10,6 +9,7 @@ from foundation.clock import seconds_ns
 from foundation.errors import DeviceFault, Unreachable
 from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
+from stand.imaging.camera_opening import CameraOpening
 from stand.running.session_setup import Order
 from tests.system.test_guard_wire import Bench, Start, bench_of, write_by_another_master
 
@@ -91,7 +91,7 @@ async def test_what_somebody_switches_on_in_a_hold_is_off_within_5_s_and_latched
     readings = {reading.channel: reading.value for reading in await bench.assembly.devices.regulator.read()}
     assert readings["regulator.running"] == 0
     assert len(kinds(bench, "switched_off")) == 2
-    assert bench.assembly.stand.permits.intrusions == 2
+    assert bench.assembly.stand.chamber.permits.intrusions == 2
     assert await bench.plant("heater_W") == 0
     await bench.end()
 
@@ -99,7 +99,7 @@ async def test_what_somebody_switches_on_in_a_hold_is_off_within_5_s_and_latched
 async def test_whoever_switches_heat_on_twice_without_permission_holds_the_run(bench: Bench):
     """Idle, before the chamber is started or after it was stopped; nothing else is wrong."""
     await bench.start(26, 60)
-    await bench.assembly.stand.stop_chamber()
+    await bench.assembly.stand.chamber.stop()
     for _ in range(2):
         assert bench.trips == []
         await another_master(bench, RELAYS, 5, COMPRESSOR, ON)
@@ -110,8 +110,8 @@ async def test_whoever_switches_heat_on_twice_without_permission_holds_the_run(b
 
 
 async def test_a_board_that_is_suited_passes_the_test_of_its_timer(bench: Bench):
-    await bench.assembly.stand.withdraw_permits()
-    await bench.assembly.stand.test_dead_man()
+    await bench.assembly.stand.chamber.permits.withdraw_left_on()
+    await bench.assembly.stand.chamber.test_dead_man()
     (told,) = [event for event in bench.events if event.kind == "dead_man_tested"]
     assert (told.level, told.data["rearmed"], told.data["dropped"]) == ("info", True, True)
     assert await bench.plant("heater_enabled") == 0
@@ -123,9 +123,9 @@ async def test_a_board_that_is_suited_passes_the_test_of_its_timer(bench: Bench)
 )
 async def test_a_board_that_is_not_suited_is_refused_with_the_reason(bench: Bench, name: str, reason: str):
     await bench.fault(name, True)
-    await bench.assembly.stand.withdraw_permits()
+    await bench.assembly.stand.chamber.permits.withdraw_left_on()
     with pytest.raises(DeviceFault, match=reason):
-        await bench.assembly.stand.test_dead_man()
+        await bench.assembly.stand.chamber.test_dead_man()
     assert await bench.plant("heater_enabled") == 0
     (told,) = [event for event in bench.events if event.kind == "dead_man_tested"]
     assert told.level == "error"
@@ -146,7 +146,7 @@ def with_exchanged_relays(bench: Bench) -> Assembly:
     exchanged = {**relays.channels, "heater_enable": 2, "camera_power": 0}
     config = bench.order.config.model_copy(update={"relays": relays.model_copy(update={"channels": exchanged})})
     theirs = assemble(config, Hub(), bench.clock)
-    theirs.stand.devices = replace(theirs.devices, camera=SilentCamera())
+    theirs.stand.imaging.supply.opening = CameraOpening(SilentCamera(), theirs.hub, bench.clock, lambda: False, list)
     return theirs
 
 
@@ -154,7 +154,7 @@ async def test_relays_exchanged_in_the_configuration_leave_the_heaters_relay_off
     """Taken for the camera's it is only held for some seconds at a time, and switched off when no camera answers."""
     theirs = with_exchanged_relays(bench)
     await theirs.bus.open()
-    powering = asyncio.create_task(theirs.stand.power_camera(on=True))
+    powering = asyncio.create_task(theirs.stand.imaging.supply.switch_on())
     await bench.wait(4.5)
     assert await bench.plant("heater_enabled") == 1
     with pytest.raises(Unreachable):
@@ -166,7 +166,7 @@ async def test_relays_exchanged_in_the_configuration_leave_the_heaters_relay_off
 async def test_a_program_that_dies_while_it_powers_an_exchanged_relay_leaves_it_to_the_boards_timer(bench: Bench):
     theirs = with_exchanged_relays(bench)
     await theirs.bus.open()
-    powering = asyncio.create_task(theirs.stand.power_camera(on=True))
+    powering = asyncio.create_task(theirs.stand.imaging.supply.switch_on())
     await bench.wait(4.5)
     await theirs.bus.close()  # as for a dead program, nothing goes out any more
     assert await seconds_until(bench, "heater_enabled", 0, 30) <= 15

@@ -20,11 +20,14 @@ from foundation.clock import Clock, WallClock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, Refused, Superseded, Unreachable
 from foundation.hub import Hub
 from foundation.readings import Quality
+from stand.chamber.chamber import ChamberLimits
 from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import CompressorConfig, packaged
 from stand.gate import INTERLOCK
-from stand.stand import Devices, Interlocked, Limits, Stand
+from stand.imaging.camera_supply import SupplyLimits
+from stand.interlock import Interlocked
+from stand.stand import Devices, Stand
 
 from .flap_bench import SETTINGS as FLAP
 from .stage_bench import SERIAL_NUMBER, Bench, Tap, running_bench
@@ -325,8 +328,9 @@ def stand_with(axis: Axis, clock: Clock) -> Stand:
     camera = Camera("camera", CameraSettings("127.0.0.1"), clock)
     thermometers = Thermometers("thermometers", bus, maps[0], {}, clock)
     compressor = CompressorLimits(**CompressorConfig().model_dump(exclude={"state_file"}))
-    limits = Limits((-10.0, 60.0), PermitLimits(15.0, 3.0, compressor), 5.0, 1.0)
-    return Stand(Devices(regulator, relays, thermometers, {"linear": axis}, flap, camera), limits, Hub(), clock)
+    chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, compressor), 5.0)
+    devices = Devices(regulator, relays, thermometers, {"linear": axis}, flap, camera)
+    return Stand(devices, chamber, SupplyLimits(1.0, 15.0), Hub(), clock)
 
 
 async def test_a_trip_while_homed_is_answered_lets_no_move_of_the_plan_begin(bench: Bench) -> None:
@@ -335,13 +339,13 @@ async def test_a_trip_while_homed_is_answered_lets_no_move_of_the_plan_begin(ben
     stand, before = stand_with(axis, WallClock()), bench.tap.count("move")
     trip = Trip(bench, axis, b"gets", hold=lambda: stand.gate.hold(INTERLOCK))
     with pytest.raises(Interlocked):
-        await stand.move_to("linear", 5.0)
+        await stand.table.move_to("linear", 5.0)
     await trip.made_safe[0]
     assert bench.tap.count("move") == before
     with pytest.raises(Superseded):  # whoever does not ask the stand
         await axis.move_to(5.0)
     stand.gate.clear(INTERLOCK)
-    move = asyncio.create_task(stand.move_to("linear", 25.0))
+    move = asyncio.create_task(stand.table.move_to("linear", 25.0))
     while bench.tap.count("move") == before:
         await asyncio.sleep(0.01)
     move.cancel()

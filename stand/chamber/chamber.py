@@ -1,0 +1,101 @@
+"""The chamber's verbs: start, set-point, stop, and the test of the relay that guards the heat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.devices.regulator import Regulator
+from drivers.devices.relays import Relays
+from foundation.clock import Clock, boot_of, seconds_ns
+from foundation.errors import ConfigError, DeviceFault, Occupied
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.chamber.compressor import restored
+from stand.chamber.compressor_file import CompressorFile
+from stand.chamber.keeper import Keeper
+from stand.chamber.permits import PermitLimits, Permits
+from stand.interlock import Interlock
+
+_OCCUPIED_AGAIN_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class ChamberLimits:
+    """The set-points allowed (lowest, highest), how long a permission to heat or cool lives, how often it is renewed
+    (s), and the file that keeps what the compressor did last for the next daemon."""
+
+    setpoint_degC: tuple[float, float]
+    permits: PermitLimits
+    renew_s: float
+    compressor_file: Path | None = None
+
+
+class Chamber:
+    """Set-point, heat and cold. `permits` owns the permissions to heat and cool, `keeper` renews them; `coils_read` is
+    given what the relays read each time it does."""
+
+    def __init__(
+        self,
+        regulator: Regulator,
+        relays: Relays,
+        limits: ChamberLimits,
+        interlock: Interlock,
+        coils_read: Callable[[Mapping[str, bool]], None],
+        hub: Hub,
+        clock: Clock,
+    ) -> None:
+        self._regulator = regulator
+        self._limits = limits
+        self._interlock = interlock
+        self._hub = hub
+        self._clock = clock
+        self.compressor_file = CompressorFile(limits.compressor_file, hub, clock)
+        compressor = restored(limits.compressor_file, clock.now_ns(), boot_of(clock))
+        self.permits = Permits(relays, limits.permits, compressor, self.compressor_file.note, hub, clock)
+        self.keeper = Keeper(self.permits, regulator, hub, clock, limits.renew_s, coils_read)
+
+    async def start(self, setpoint_degC: float) -> None:
+        """Permit heating and cooling, set the set-point, run the regulator."""
+        await self.set_temperature(setpoint_degC)
+        self._interlock.check()  # after every wait: a fault may have closed it meanwhile
+        self.permits.grant()
+        await self.keeper.beat()
+        self._interlock.check()
+        await self._regulator.run()
+
+    async def set_temperature(self, setpoint_degC: float) -> None:
+        """A new set-point; ConfigError outside the limits. While an operator has the regulator autotune this waits
+        until that ends or the guard holds the stand; event `regulator_occupied`."""
+        is_waiting = False
+        while True:
+            self._interlock.check()
+            low, high = self._limits.setpoint_degC
+            if not low <= setpoint_degC <= high:
+                raise ConfigError(
+                    f"chamber set-point {setpoint_degC} degC is outside limits.chamber_degC {low}..{high}"
+                )
+            try:
+                return await self._regulator.set_temperature(setpoint_degC)
+            except Occupied as error:
+                if not is_waiting:
+                    text = f"{error}; the run waits"
+                    self._hub.publish(Event(self._clock.now_ns(), "warning", "regulator_occupied", text))
+                is_waiting = True
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_OCCUPIED_AGAIN_S))
+
+    async def stop(self) -> None:
+        """Stop the regulator; heating and cooling lose their permission at once."""
+        self.permits.revoke()
+        await self._regulator.stop()
+        await self.permits.make_safe()
+
+    async def test_dead_man(self) -> None:
+        """Test the relay board's timer on the heater's relay while the regulator is stopped; DeviceFault when the
+        regulator gives heat all the same, or the board cannot be relied upon."""
+        output = {reading.channel: reading.value for reading in await self._regulator.read()}
+        name = self._regulator.name
+        if not output.get(f"{name}.mv_heat", 0.0) <= 0:
+            raise DeviceFault(name, f"is stopped and yet gives {output[f'{name}.mv_heat']:g} % heat; look at the unit")
+        await self.permits.test_dead_man()

@@ -1,0 +1,153 @@
+"""The camera's supply: on and off by the plan, restored after a loss, and what each means for its equilibrium."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from drivers.devices.camera import Camera
+from drivers.devices.relays import CAMERA_POWER, Relays
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError, Unreachable
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.tasks import cancelled
+from stand.gate import CAMERA_LOST, Gate
+from stand.imaging.camera_cooling import Cooling, cool_down, last_word
+from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
+from stand.imaging.equilibrium import CameraEquilibrium, EquilibriumLimits
+from stand.interlock import Interlock
+
+_BOOT_LIMIT_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class SupplyLimits:
+    """How long the camera takes to boot (s), for how long its relay is held at a time until it has answered (s), and
+    when it counts as being in equilibrium."""
+
+    boot_s: float
+    hold_s: float
+    equilibrium: EquilibriumLimits = field(default_factory=EquilibriumLimits)
+
+
+class CameraSupply:
+    """The relay of one camera, and an actuator that is safe when it is off.
+
+    is_on: the supply is on and the camera has been opened since, as far as is known. was_on: what the relay read before
+    this daemon switched it on; None before that. last: the camera's temperature when it was switched off.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        relays: Relays,
+        limits: SupplyLimits,
+        interlock: Interlock,
+        gate: Gate,
+        hub: Hub,
+        clock: Clock,
+    ) -> None:
+        self.name = f"{relays.name}.{CAMERA_POWER}"
+        self.is_on = False
+        self.was_on: bool | None = None
+        self.last: Cooling | None = None
+        self._camera = camera
+        self._relays = relays
+        self._limits = limits
+        self._interlock = interlock
+        self._gate = gate
+        self._hub = hub
+        self._clock = clock
+        self.equilibrium = CameraEquilibrium(limits.equilibrium, hub, clock)
+        self.opening = CameraOpening(camera, hub, clock, lambda: self.is_on, self.equilibrium.lose)
+
+    async def switch_on(self) -> None:
+        """Return when the camera is open and configured."""
+        self._interlock.check()
+        self.last = None
+        await self._supply()
+        self.is_on = True
+        self.equilibrium.begin()
+
+    async def switch_off(self) -> None:
+        """Close the camera, then switch it off."""
+        self._interlock.check()
+        # A camera that was off already has no newer temperature.
+        self.last = last_word(self._hub.known("camera.temperature")) or self.last
+        self.is_on = False
+        await self._camera.close()
+        await self._relays.switch(CAMERA_POWER, on=False)
+
+    async def cool_down(self, band_K: float, time_constant_s: float, max_s: float) -> None:
+        """Wait until the camera, which is off, should be within `band_K` of the air near it."""
+        self._interlock.check()
+        await cool_down(self.last, band_K, time_constant_s, max_s, self._hub, self._clock)
+
+    async def restore(self) -> None:
+        """After the equilibrium was lost: the supply on, should it be off, and the camera open; tried for 30 min, the
+        gate being held."""
+        if self.is_on:
+            return
+        deadline_ns = self._clock.now_ns() + seconds_ns(LOST_LIMIT_S)
+        self._gate.hold(CAMERA_LOST)
+        try:
+            while not self.is_on:
+                try:
+                    await self.switch_on()
+                except Unreachable:
+                    if self._clock.now_ns() >= deadline_ns:
+                        raise
+        finally:
+            self._gate.clear(CAMERA_LOST)
+
+    async def make_safe(self) -> None:
+        """Off, confirmed."""
+        self.is_on = False
+        await self._relays.switch(CAMERA_POWER, on=False)
+
+    def compare(self, coils: Mapping[str, bool]) -> None:
+        """What the relays read, by channel: a supply that is off though it was switched on has lost the camera's
+        equilibrium; event `camera_supply_off`."""
+        if self.is_on and not coils.get(CAMERA_POWER, True):
+            self.is_on = False
+            text = (
+                "the camera's supply is off though it was switched on: a brown-out of the relay board, or somebody else"
+            )
+            self._hub.publish(Event(self._clock.now_ns(), "error", "camera_supply_off", text))
+            self.equilibrium.lose(text)
+
+    async def _supply(self) -> None:
+        """Supply on and the camera open. A relay that reads off is only held for some seconds at a time until the
+        camera has answered: it might be another one than the configuration says, such as the heater's."""
+        relays, hold_s = self._relays, self._limits.hold_s
+        is_on = any(reading.channel == self.name and reading.value == 1 for reading in await relays.read())
+        self.was_on = is_on if self.was_on is None else self.was_on
+        holding: asyncio.Task[None] | None = None
+        if is_on:
+            await relays.switch(CAMERA_POWER, on=True)  # for good, should it have been timed
+        else:
+            await relays.hold_on(CAMERA_POWER, hold_s)
+            holding = asyncio.create_task(self._hold(hold_s))
+        try:
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.boot_s))
+            deadline_ns = self._clock.now_ns() + seconds_ns(_BOOT_LIMIT_S)
+            await self.opening.until_open(self._interlock.check, deadline_ns, RETRY_S)
+        except BaseException:
+            if holding is not None:
+                await cancelled([holding])
+                await relays.switch(CAMERA_POWER, on=False)
+            raise
+        if holding is not None:
+            await cancelled([holding])
+            self._interlock.check()
+            await relays.switch(CAMERA_POWER, on=True)
+
+    async def _hold(self, hold_s: float) -> None:
+        """Arm the supply again until cancelled; a lost command is made up for by the next one."""
+        while True:
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(hold_s / 3))
+            with suppress(DeviceError):
+                await self._relays.hold_on(CAMERA_POWER, hold_s)

@@ -1,0 +1,114 @@
+"""Frames through the flap, and how long a lost camera is waited for."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+
+from drivers.devices.camera import Camera
+from drivers.devices.flap import Flap
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import Unreachable
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.readings import Frame
+from stand.gate import CAMERA_LOST, Gate
+from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
+from stand.imaging.camera_supply import CameraSupply
+from stand.interlock import Interlock
+from stand.motions import Motions
+
+
+class Imaging:
+    """Flap and camera; `supply` is the camera's."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        flap: Flap,
+        supply: CameraSupply,
+        interlock: Interlock,
+        gate: Gate,
+        motions: Motions,
+        hub: Hub,
+        clock: Clock,
+    ) -> None:
+        self.supply = supply
+        self._camera = camera
+        self._flap = flap
+        self._interlock = interlock
+        self._gate = gate
+        self._motions = motions
+        self._hub = hub
+        self._clock = clock
+        self._moving_flap = asyncio.Lock()  # one command after the other; making safe waits for none
+        self._without_camera_ns = 0  # how long a lost camera was waited for since its last frame
+
+    @property
+    def flap_open(self) -> bool:
+        """Whether the flap has not been confirmed shut since it was last opened."""
+        return not self._flap.is_shut
+
+    async def open_flap(self) -> None:
+        """Open the flap and confirm it."""
+        async with self._moving_flap:
+            self._interlock.check()
+            with self._motions.under_way("flap", "opening"):
+                await self._flap.move_open()
+
+    async def close_flap(self) -> None:
+        """Close the flap and confirm it; allowed after a trip too."""
+        async with self._moving_flap:
+            with self._motions.under_way("flap", "closing"):
+                await self._flap.move_closed()
+
+    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0) -> bool:
+        """One frame of the step, published; exposed at `due_ns` when that is still ahead. False when the camera was
+        lost: see `_regain`; the flap may have been shut meanwhile."""
+        self._interlock.check()
+        try:
+            self._publish(await self._camera.grab(exposure_s, due_ns), step_id)
+        except Unreachable as error:
+            await self._regain(error)
+            return False
+        return True
+
+    async def look(self, exposure_s: float, step_id: str) -> Frame | None:
+        """One frame of the step through the flap, which is open for it only; published. None when the camera was lost:
+        see `_regain`."""
+        await self.open_flap()
+        try:
+            return self._publish(await self._camera.grab(exposure_s), step_id)
+        except Unreachable as error:
+            lost = error
+        finally:
+            await self.close_flap()
+        await self._regain(lost)
+        return None
+
+    def _publish(self, frame: Frame, step_id: str) -> Frame:
+        self._without_camera_ns = 0
+        frame = replace(frame, step_id=step_id)
+        self._hub.publish(frame)
+        return frame
+
+    async def _regain(self, lost: Unreachable) -> None:
+        """Hold the gate until the camera, lost for that reason, is open again, or is found to be without supply; `lost`
+        when there was no frame for 30 min of such waiting."""
+        begin_ns, limit_ns = self._clock.now_ns(), seconds_ns(LOST_LIMIT_S)
+        if self._without_camera_ns >= limit_ns:
+            raise lost
+        self._hub.publish(Event(begin_ns, "warning", "camera_lost", str(lost)))
+        self._gate.hold(CAMERA_LOST)
+        deadline_ns = begin_ns + limit_ns - self._without_camera_ns
+        supply = self.supply
+        try:
+            is_open = await supply.opening.until_open(
+                self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on
+            )
+        finally:
+            self._gate.clear(CAMERA_LOST)
+            # One that opens at once and never gives a frame does not go on for ever either.
+            self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
+        if is_open:
+            self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))

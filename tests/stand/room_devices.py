@@ -1,0 +1,196 @@
+"""Devices in memory for a stand in virtual time: each command takes a second and is noted in `calls`."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+
+from drivers.devices.relays import CAMERA_POWER
+from foundation.clock import VirtualClock, seconds_ns
+from foundation.errors import StandError
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from foundation.readings import Frame, Quality, Reading
+from stand.chamber.chamber import ChamberLimits
+from stand.chamber.compressor import CompressorLimits
+from stand.chamber.permits import COMPRESSOR, HEATER, PermitLimits
+from stand.imaging.camera_supply import SupplyLimits
+from stand.stand import Devices, Stand
+
+COMPRESSOR_LIMITS = CompressorLimits(300, 180, 6, 20, 60)
+
+
+@dataclass
+class Device:
+    """`failures` are raised by the next commands, one each."""
+
+    name: str
+    clock: VirtualClock
+    calls: list[str]
+    failures: list[StandError] = field(default_factory=list)
+
+    async def act(self, call: str) -> None:
+        self.calls.append(f"{self.name} {call}")
+        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(1))
+        if self.failures:
+            raise self.failures.pop(0)
+
+    async def make_safe(self) -> None:
+        await self.act("make_safe")
+
+    def allow(self) -> None:
+        pass
+
+
+@dataclass
+class Regulator(Device):
+    mv_heat: float = 0.0
+
+    async def read(self):
+        now_ns = self.clock.now_ns()
+        return tuple(Reading(f"regulator.{name}", self.mv_heat, "%", now_ns) for name in ("mv_heat", "running"))
+
+    async def set_temperature(self, degC: float) -> None:
+        await self.act(f"sp {degC:g}")
+
+    async def run(self) -> None:
+        await self.act("run")
+
+    async def stop(self) -> None:
+        await self.act("stop")
+
+
+@dataclass
+class Relays(Device):
+    """What was held on stays on until it is switched."""
+
+    on: set[str] = field(default_factory=set)
+
+    async def read(self):
+        names = (HEATER, COMPRESSOR, CAMERA_POWER)
+        return tuple(Reading(f"relays.{name}", float(name in self.on), "1", self.clock.now_ns()) for name in names)
+
+    async def switch(self, channel: str, on: bool) -> None:
+        await self.act(f"{channel} {'on' if on else 'off'}")
+        (self.on.add if on else self.on.discard)(channel)
+
+    async def hold_on(self, channel: str, duration_s: float) -> None:
+        await self.act(f"{channel} held")
+        self.on.add(channel)
+
+    async def make_safe(self) -> None:
+        await super().make_safe()
+        self.on -= {HEATER, COMPRESSOR}
+
+
+@dataclass
+class Flap(Device):
+    is_shut: bool = True
+
+    async def move_open(self) -> None:
+        self.is_shut = False
+        await self.act("open")
+
+    async def move_closed(self) -> None:
+        await self.act("closed")
+        self.is_shut = True
+
+
+@dataclass
+class Camera(Device):
+    restarted: str = ""
+    is_usable: bool = True
+    frames: int = 0
+
+    async def open(self) -> None:
+        await self.act("open")
+
+    async def close(self) -> None:
+        await self.act("close")
+
+    async def grab(self, exposure_s: float | None = None, due_ns: int = 0) -> Frame:
+        await self.act("grab")
+        self.frames += 1
+        image = np.zeros((2, 3), np.uint8)
+        return Frame("camera.image", image, self.clock.now_ns(), exposure_s or 0.0, 0.0, 40.0, self.frames, 0)
+
+
+@dataclass
+class StageProfile:
+    unit: str = "mm"
+    unit_per_step: float = 0.0025
+    home_from: float | None = None
+
+
+@dataclass
+class Stage(Device):
+    profile: StageProfile = field(default_factory=StageProfile)
+    has_scale: bool = True
+    position: float = 0.0
+    reason: str = ""
+
+    async def homed(self) -> bool:
+        return self.has_scale
+
+    async def home(self) -> float:
+        await self.act("home")
+        self.has_scale, self.position = True, 0.0
+        return 0.001
+
+    async def move_to(self, position: float) -> None:
+        await self.act(f"to {position:g}")
+        self.position = position
+
+    async def read(self):
+        quality = Quality.STALE if self.reason else Quality.GOOD
+        return (Reading(f"{self.name}.position", self.position, "mm", self.clock.now_ns(), quality, self.reason),)
+
+
+class Rooms:
+    """A stand of these devices, and what it published."""
+
+    def __init__(self) -> None:
+        self.clock, self.hub = VirtualClock(0), Hub()
+        self.calls: list[str] = []
+        self.items: list[Item] = []
+        self.hub.subscribe(self.items.append)
+        here = self.clock, self.calls
+        self.regulator, self.relays = Regulator("regulator", *here), Relays("relays", *here)
+        self.flap, self.camera, self.linear = Flap("flap", *here), Camera("camera", *here), Stage("linear", *here)
+        # Duck-typed on purpose: the stand takes the drivers' classes, and these speak to no wire.
+        parts = cast(
+            "dict[str, Any]", {each.name: each for each in (self.regulator, self.relays, self.flap, self.camera)}
+        )
+        devices = Devices(thermometers=cast("Any", None), axes={"linear": cast("Any", self.linear)}, **parts)
+        chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, COMPRESSOR_LIMITS), 5.0)
+        self.stand = Stand(devices, chamber, SupplyLimits(2.0, 15.0), self.hub, self.clock)
+
+    @property
+    def events(self) -> list[Event]:
+        return [item for item in self.items if isinstance(item, Event)]
+
+    @property
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.events]
+
+    @property
+    def frames(self) -> list[Frame]:
+        return [item for item in self.items if isinstance(item, Frame)]
+
+    async def passes(self, duration_s: float) -> None:
+        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+
+
+@asynccontextmanager
+async def rooms() -> AsyncIterator[Rooms]:
+    """The stand, with its time going on while inside."""
+    here = Rooms()
+    time = asyncio.create_task(here.clock.run())
+    try:
+        yield here
+    finally:
+        await here.stand.safety.close()
+        time.cancel()

@@ -1,0 +1,77 @@
+"""The chamber's verbs over devices in memory: order of commands, permissions, limits; time is virtual."""
+
+import asyncio
+
+import pytest
+
+from foundation.errors import ConfigError, DeviceFault, Occupied, StandTripped
+from stand.chamber.permits import HEATER
+from stand.fault import Fault
+from stand.gate import INTERLOCK
+from stand.interlock import Interlocked
+from tests.stand.room_devices import rooms
+
+
+async def test_heat_is_permitted_after_the_set_point_and_before_the_regulator_runs():
+    async with rooms() as here:
+        await here.stand.chamber.start(45.0)
+        assert here.calls == ["regulator sp 45", f"relays {HEATER} held", "regulator run"]
+        assert here.stand.chamber.permits.granted
+        await here.stand.chamber.stop()
+        assert here.calls[3:] == ["regulator stop", "relays make_safe"]
+        assert not here.stand.chamber.permits.granted
+
+
+@pytest.mark.parametrize("setpoint_degC", [-10.1, 60.1, float("nan")])
+async def test_a_set_point_outside_the_limits_reaches_no_device(setpoint_degC: float):
+    async with rooms() as here:
+        with pytest.raises(ConfigError, match=r"outside limits.chamber_degC -10.0..60.0"):
+            await here.stand.chamber.start(setpoint_degC)
+        assert here.calls == []
+
+
+async def test_a_fault_between_set_point_and_permission_leaves_no_heat():
+    async with rooms() as here:
+        starting = asyncio.create_task(here.stand.chamber.start(45.0))
+        await here.passes(0.5)
+        here.stand.latch(Fault("air_hot", "the air is too hot"))
+        with pytest.raises(StandTripped, match="the air is too hot"):
+            await starting
+        assert here.calls == ["regulator sp 45"]
+        assert here.relays.on == set()
+
+
+async def test_an_interlock_while_the_relay_is_armed_keeps_the_regulator_from_running():
+    async with rooms() as here:
+        starting = asyncio.create_task(here.stand.chamber.start(45.0))
+        await here.passes(1.5)
+        here.stand.gate.hold(INTERLOCK)
+        here.stand.safety.demand()
+        with pytest.raises(Interlocked):
+            await starting
+        assert "regulator run" not in here.calls
+
+
+async def test_a_regulator_that_is_autotuned_is_waited_for_and_that_is_an_event():
+    async with rooms() as here:
+        here.regulator.failures += [Occupied("regulator", "autotuning is active")] * 2
+        await here.stand.chamber.set_temperature(30.0)
+        assert here.clock.now_ns() / 1e9 == pytest.approx(3 + 2 * 5)
+        assert here.kinds == ["regulator_occupied"]
+
+
+async def test_a_stopped_regulator_that_gives_heat_fails_the_dead_mans_test():
+    async with rooms() as here:
+        here.regulator.mv_heat = 12.0
+        with pytest.raises(DeviceFault, match="is stopped and yet gives 12 % heat"):
+            await here.stand.chamber.test_dead_man()
+        assert here.calls == []
+
+
+async def test_each_beat_shows_the_relays_to_who_watches_the_camera():
+    async with rooms() as here:
+        await here.stand.imaging.supply.switch_on()
+        here.relays.on.clear()
+        await here.stand.chamber.keeper.beat()
+        assert here.kinds == ["camera_supply_off", "camera_equilibrium_lost"]
+        assert not here.stand.imaging.supply.is_on
