@@ -32,17 +32,18 @@ def export(model: DriftModel, folder: Path) -> tuple[Path, Path]:
 def runtime_model(model: DriftModel) -> dict[str, object]:
     """What drift_runtime.Drift takes, as JSON values: no covariance; discrepancy_px is one standard deviation of the
     correction inside the calibrated range."""
+    facts = model.facts
     common: dict[str, object] = {
         "format": "thermostand drift runtime",
         "version": 1,
         "form": model.form,
-        "camera_serial": model.camera_serial,
-        "software_version": model.software_version,
-        "image_size_px": model.image_size,
-        "camera_range_degC": model.camera_range_degC,
-        "reference_degC": model.reference_degC,
+        "camera_serial": facts.camera_serial,
+        "software_version": facts.software_version,
+        "image_size_px": facts.image_size,
+        "camera_range_degC": facts.camera_range_degC,
+        "reference_degC": facts.reference_degC,
         "discrepancy_px": model.discrepancy_px.tolist(),
-        "hull_px": model.hull_px.tolist(),
+        "hull_px": facts.hull_px.tolist(),
     }
     match model:
         case PaperModel():
@@ -61,7 +62,7 @@ def _thermal(model: ThermalModel) -> dict[str, object]:
         "taus_s": memory.taus_s,
         "plays_K": memory.plays_K,
         "self_heating_K": memory.self_heating_K,
-        "reference_ambient_degC": model.origin.ambient_degC,
+        "reference_ambient_degC": model.reference_ambient_degC,
         "reference_features": model.reference_features.tolist(),
         "coefficients_px": model.coefficients.tolist(),
         "ambient_range_degC": valid.ambient_degC,

@@ -24,10 +24,9 @@ def corrected_image(image: Image, model: DriftModel, states: States) -> NDArray[
     """The grey image (height, width) at the reference, float32, for one thermal state; SessionError when it is not of
     the model's size, or when the state does not tell the drift."""
     height, width = image.shape
-    if (width, height) != model.image_size:
-        raise SessionError(
-            f"the image has {width} x {height} pixels, the model is of {model.image_size[0]} x {model.image_size[1]}"
-        )
+    own_width, own_height = model.facts.image_size
+    if (width, height) != (own_width, own_height):
+        raise SessionError(f"the image has {width} x {height} pixels, the model is of {own_width} x {own_height}")
 
     def shift(xy_px: Float) -> Float:
         return model.shift(xy_px, states)
@@ -42,7 +41,7 @@ def corrected_image(image: Image, model: DriftModel, states: States) -> NDArray[
 
 def middle_flags(model: DriftModel, states: States) -> int:
     """Why the correction at the middle of the image is an extrapolation (Outside), 0 when it is not."""
-    width, height = model.image_size
+    width, height = model.facts.image_size
     return int(model.flags(np.array([[(width - 1) / 2, (height - 1) / 2]]), states)[0])
 
 

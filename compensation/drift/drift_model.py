@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.candidates import Candidate, Pair
+from compensation.drift.facts import ModelFacts
 from compensation.drift.hull import MARGIN_PX, distances_px
 from compensation.history.lags import Float
 from compensation.history.states import Memory, States
@@ -57,13 +58,8 @@ class DriftModel(Protocol):
         ...
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """(width, height), px."""
-        ...
-
-    @property
-    def camera_range_degC(self) -> Pair:
-        """The calibrated interval of the camera's temperature."""
+    def facts(self) -> ModelFacts:
+        """What it was fitted to."""
         ...
 
     @property
@@ -72,48 +68,8 @@ class DriftModel(Protocol):
         ...
 
     @property
-    def hull_px(self) -> Float:
-        """(H, 2): convex hull of the training markers."""
-        ...
-
-    @property
-    def reference_degC(self) -> float:
-        """The camera's temperature at the reference."""
-        ...
-
-    @property
-    def reference_chamber_degC(self) -> float:
-        """The set-point of the reference."""
-        ...
-
-    @property
-    def reference_centres_px(self) -> Float:
-        """(N, 2): NaN for a marker never seen."""
-        ...
-
-    @property
     def candidates(self) -> tuple[Candidate, ...]:
         """The table of choice."""
-        ...
-
-    @property
-    def target_name(self) -> str:
-        """Of the target it was fitted to."""
-        ...
-
-    @property
-    def camera_serial(self) -> str:
-        """Of the camera it is of."""
-        ...
-
-    @property
-    def session_ids(self) -> tuple[str, ...]:
-        """What it was fitted to."""
-        ...
-
-    @property
-    def software_version(self) -> str:
-        """What it was fitted by."""
         ...
 
     def shift(self, xy_px: Float, state: Situation) -> Float:

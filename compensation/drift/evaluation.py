@@ -101,11 +101,11 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
 
 
 def _check_same(model: DriftModel, observations: Observations) -> None:
-    serial = observations.sessions[0].camera_serial
-    if serial != model.camera_serial:
-        raise SessionError(f"the model is of camera {model.camera_serial}, the session of camera {serial}")
-    if observations.image_size != model.image_size:
-        raise SessionError(f"the model is of images of {model.image_size} px, the session of {observations.image_size}")
+    facts, serial = model.facts, observations.sessions[0].camera_serial
+    if serial != facts.camera_serial:
+        raise SessionError(f"the model is of camera {facts.camera_serial}, the session of camera {serial}")
+    if observations.image_size != facts.image_size:
+        raise SessionError(f"the model is of images of {facts.image_size} px, the session of {observations.image_size}")
 
 
 def _left_out(model: DriftModel, observations: Observations) -> tuple[Displacements, Float]:

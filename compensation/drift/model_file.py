@@ -15,10 +15,11 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from compensation.drift.candidates import Candidate, Pair
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.facts import ModelFacts
 from compensation.drift.hull import is_area
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
-from compensation.drift.polynomial import Scaling, exponents
-from compensation.drift.terms import MOTIONS, Kind, Origin, Term
+from compensation.drift.polynomial import exponents
+from compensation.drift.terms import MOTIONS, Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
 from compensation.history.lags import Float
 from foundation.documents import Document
@@ -121,23 +122,24 @@ def _model(file: PaperFile | ThermalFile) -> DriftModel:
     if other.other is not None:
         raise ValueError("other: has another form itself")
     for name in ("camera_serial", "session_ids", "target_name", "image_size"):
-        if getattr(other, name) != getattr(model, name):
-            raise ValueError(f"other: its {name} is {getattr(other, name)}, not {getattr(model, name)}")
+        if getattr(other.facts, name) != getattr(model.facts, name):
+            raise ValueError(f"other: its {name} is {getattr(other.facts, name)}, not {getattr(model.facts, name)}")
     return replace(model, other=other)
 
 
 def _document(model: DriftModel) -> PaperFile | ThermalFile:
+    facts = model.facts
     common = {
-        "software_version": model.software_version,
-        "camera_serial": model.camera_serial,
-        "session_ids": model.session_ids,
-        "target_name": model.target_name,
-        "image_size_px": model.image_size,
-        "camera_range_degC": model.camera_range_degC,
-        "reference_degC": model.reference_degC,
-        "reference_chamber_degC": model.reference_chamber_degC,
-        "reference_centres_px": [None if math.isnan(x) else (x, y) for x, y in model.reference_centres_px.tolist()],
-        "hull_px": model.hull_px.tolist(),
+        "software_version": facts.software_version,
+        "camera_serial": facts.camera_serial,
+        "session_ids": facts.session_ids,
+        "target_name": facts.target_name,
+        "image_size_px": facts.image_size,
+        "camera_range_degC": facts.camera_range_degC,
+        "reference_degC": facts.reference_degC,
+        "reference_chamber_degC": facts.reference_chamber_degC,
+        "reference_centres_px": [None if math.isnan(x) else (x, y) for x, y in facts.reference_centres_px.tolist()],
+        "hull_px": facts.hull_px.tolist(),
         "discrepancy_px": model.discrepancy_px.tolist(),
         "candidates": model.candidates,
         "other": None if model.other is None else _document(model.other),
@@ -164,7 +166,7 @@ def _paper_fields(model: PaperModel) -> dict[str, object]:
 def _thermal_fields(model: ThermalModel) -> dict[str, object]:
     return {
         "terms": [{"kind": term.kind, "parameter": term.parameter} for term in model.terms],
-        "reference_ambient_degC": model.origin.ambient_degC,
+        "reference_ambient_degC": model.reference_ambient_degC,
         "reference_features": model.reference_features.tolist(),
         "self_heating_K": model.self_heating_K,
         "has_warm_up": model.has_warm_up,
@@ -183,35 +185,26 @@ def _paper(file: PaperFile) -> PaperModel:
         raise ValueError(f"terms_abc: not the {count} terms of degree {file.degree}, in order")
     if file.degree not in {score.degree for score in file.scores}:
         raise ValueError(f"scores: none for degree {file.degree}")
-    _check(file)
     return PaperModel(
+        facts=_facts(file),
         degree=file.degree,
-        scaling=Scaling(file.image_size_px, file.camera_range_degC),
         coefficients=_shaped("coefficients_px", file.coefficients_px, (2, count)),
         coefficient_covariance=_shaped(
             "coefficient_covariance_px2", file.coefficient_covariance_px2, (2, count, count)
         ),
         discrepancy_px=np.array(file.discrepancy_px),
-        hull_px=np.array(file.hull_px),
-        reference_degC=file.reference_degC,
-        reference_chamber_degC=file.reference_chamber_degC,
-        reference_centres_px=_centres(file),
         scores=file.scores,
         candidates=file.candidates,
-        target_name=file.target_name,
-        camera_serial=file.camera_serial,
-        session_ids=file.session_ids,
-        software_version=file.software_version,
     )
 
 
 def _thermal(file: ThermalFile) -> ThermalModel:
     """The model of a file; ValueError when its parts do not fit together."""
     count = len(file.terms)
-    _check(file)
     return ThermalModel(
+        facts=_facts(file),
         terms=tuple(Term(term.kind, term.parameter) for term in file.terms),
-        origin=Origin(file.reference_degC, file.reference_ambient_degC),
+        reference_ambient_degC=file.reference_ambient_degC,
         self_heating_K=file.self_heating_K,
         reference_features=_shaped("reference_features", file.reference_features, (count,)),
         coefficients=_shaped("coefficients_px", file.coefficients_px, (MOTIONS, count)),
@@ -220,33 +213,33 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         ),
         discrepancy_px=np.array(file.discrepancy_px),
         valid=ThermalRange(
-            camera_degC=file.camera_range_degC,
             ambient_degC=file.ambient_range_degC,
             rate_K_per_h=file.rate_range_K_per_h,
             least_on_s=math.inf if file.least_on_s is None else file.least_on_s,
         ),
         has_warm_up=file.has_warm_up,
-        image_size=file.image_size_px,
-        hull_px=np.array(file.hull_px),
-        reference_chamber_degC=file.reference_chamber_degC,
-        reference_centres_px=_centres(file),
         candidates=file.candidates,
+    )
+
+
+def _facts(file: PaperFile | ThermalFile) -> ModelFacts:
+    if not file.camera_range_degC[0] < file.camera_range_degC[1]:
+        raise ValueError("camera_range_degC: not low, high")
+    hull_px = np.array(file.hull_px)
+    if not is_area(hull_px):
+        raise ValueError("hull_px: not the corners of a convex area, in order")
+    return ModelFacts(
+        image_size=file.image_size_px,
+        camera_range_degC=file.camera_range_degC,
+        hull_px=hull_px,
+        reference_degC=file.reference_degC,
+        reference_chamber_degC=file.reference_chamber_degC,
+        reference_centres_px=np.array([centre or (math.nan, math.nan) for centre in file.reference_centres_px]),
         target_name=file.target_name,
         camera_serial=file.camera_serial,
         session_ids=file.session_ids,
         software_version=file.software_version,
     )
-
-
-def _check(file: PaperFile | ThermalFile) -> None:
-    if not file.camera_range_degC[0] < file.camera_range_degC[1]:
-        raise ValueError("camera_range_degC: not low, high")
-    if not is_area(np.array(file.hull_px)):
-        raise ValueError("hull_px: not the corners of a convex area, in order")
-
-
-def _centres(file: PaperFile | ThermalFile) -> Float:
-    return np.array([centre or (math.nan, math.nan) for centre in file.reference_centres_px])
 
 
 def _shaped(name: str, values: object, shape: tuple[int, ...]) -> Float:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means
-from compensation.drift.displacements import Displacements, displacements, reference_centres
-from compensation.drift.hull import convex_hull, is_area
+from compensation.drift.displacements import Displacements, displacements
+from compensation.drift.facts import facts_of
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from compensation.observations import Mask, Observations, Role
@@ -33,36 +32,16 @@ def fit_paper(observations: Observations, degree: int | None = None) -> PaperMod
     chosen = choose(scores) if degree is None else _given(scores, degree)
     solutions = _solutions(_condensed(rows, chosen, scaling))
     held_out = left_out(rows, chosen, scaling)
-    reference = observations.of(Role.REFERENCE)
-    centres, _ = reference_centres(observations)
-    hull_px = convex_hull(rows.measured_px)
-    if not is_area(hull_px):
-        raise SessionError("the markers lie in one line; a model of the image needs an area of them")
+    reference_degC = float(observations.camera_degC[observations.of(Role.REFERENCE)].mean())
     return PaperModel(
+        facts=facts_of(observations, rows, scaling.camera_degC, reference_degC),
         degree=chosen,
-        scaling=scaling,
         coefficients=np.array([solution.coefficients for solution in solutions]),
         coefficient_covariance=np.array([solution.covariance for solution in solutions]),
         discrepancy_px=discrepancy_px(rows, held_out),
-        hull_px=hull_px,
-        reference_degC=float(observations.camera_degC[reference].mean()),
-        reference_chamber_degC=reference_chamber_degC(observations),
-        reference_centres_px=centres[observations.session[reference][0]],
         scores=scores,
         candidates=candidates_of(scores, chosen),
-        target_name=observations.target.name,
-        camera_serial=observations.sessions[0].camera_serial,
-        session_ids=tuple(facts.session_id for facts in observations.sessions),
-        software_version=importlib.metadata.version("thermostand"),
     )
-
-
-def reference_chamber_degC(observations: Observations) -> float:
-    """The set-point of the reference frames; displacements from two different ones cannot be mixed."""
-    set_points = np.unique(observations.chamber_degC[observations.of(Role.REFERENCE)])
-    if len(set_points) != 1:
-        raise SessionError(f"the sessions have different reference temperatures: {_listed(set_points)} degC")
-    return float(set_points[0])
 
 
 def check_degree(degree: int | None) -> None:

@@ -24,6 +24,7 @@ from compensation.drift.drift_model import (
     range_flags,
     states_of,
 )
+from compensation.drift.facts import ModelFacts
 from compensation.drift.polynomial import Float, Scaling, design
 from compensation.history.states import Memory
 from foundation.documents import Document
@@ -51,29 +52,19 @@ class DegreeScore(Document):
 class PaperModel:
     """Maps measured positions of one camera to those at the reference temperature.
 
-    degree: n. scaling: image and calibrated temperature range. coefficients (2, K) px and their covariance (2, K, K)
-    px^2, rows I and J, terms in the order of polynomial.exponents. discrepancy_px (2,): what the form leaves
-    unexplained at temperatures not fitted, one standard deviation, marker noise taken off. hull_px (H, 2): convex hull
-    of the training markers. reference_degC: the camera's temperature at the reference, reference_chamber_degC the
-    set-point. reference_centres_px (N, 2): of the first session with reference frames, NaN for a marker never seen.
-    scores: of every degree tried. candidates: the table of choice, of every form tried. other: as in DriftModel.
+    degree: n. coefficients (2, K) px and their covariance (2, K, K) px^2, rows I and J, terms in the order of
+    polynomial.exponents. discrepancy_px (2,): what the form leaves unexplained at temperatures not fitted, one standard
+    deviation, marker noise taken off. scores: of every degree tried. candidates: the table of choice, of every form
+    tried. other: as in DriftModel.
     """
 
+    facts: ModelFacts
     degree: int
-    scaling: Scaling
     coefficients: Float
     coefficient_covariance: Float
     discrepancy_px: Float
-    hull_px: Float
-    reference_degC: float
-    reference_chamber_degC: float
-    reference_centres_px: Float
     scores: tuple[DegreeScore, ...]
     candidates: tuple[Candidate, ...]
-    target_name: str
-    camera_serial: str
-    session_ids: tuple[str, ...]
-    software_version: str
     other: DriftModel | None = None
 
     @property
@@ -87,14 +78,9 @@ class PaperModel:
         return Memory()
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """(width, height), px."""
-        return self.scaling.image_size
-
-    @property
-    def camera_range_degC(self) -> Pair:
-        """The calibrated interval of the camera's temperature."""
-        return self.scaling.camera_degC
+    def scaling(self) -> Scaling:
+        """Of image and calibrated temperature range."""
+        return Scaling(self.facts.image_size, self.facts.camera_range_degC)
 
     @property
     def title(self) -> str:
@@ -119,7 +105,8 @@ class PaperModel:
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside: PLACE and CAMERA."""
         camera_degC = states_of(state, len(xy_px), self.memory).camera_degC
-        return place_flags(xy_px, self.hull_px) | range_flags(camera_degC, self.scaling.camera_degC, Outside.CAMERA)
+        found = place_flags(xy_px, self.facts.hull_px)
+        return found | range_flags(camera_degC, self.facts.camera_range_degC, Outside.CAMERA)
 
     def inside(self, xy_px: Float, state: Situation) -> Mask:
         """(N,): whether points and states are in the calibrated range: no flag."""

@@ -5,17 +5,15 @@ In use is the simplest family within one standard error of the best; of two as s
 
 from __future__ import annotations
 
-import importlib.metadata
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means
-from compensation.drift.displacements import Displacements, reference_centres
+from compensation.drift.displacements import Displacements
+from compensation.drift.facts import facts_of
 from compensation.drift.families import PLAYS_K, TAUS_S, Family, Terms, all_terms, families
-from compensation.drift.hull import convex_hull, is_area
-from compensation.drift.paper_fit import reference_chamber_degC
 from compensation.drift.terms import MOTIONS, Kind, motions
 from compensation.drift.thermal_fit import RIDGE, RIDGE_WITH_PLAYS, Equations, equations, solve_thermal
 from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
@@ -155,14 +153,12 @@ def _model(problem: _Problem, one: _Tried, heating_K: float, candidates: tuple[C
     observations = trained.observations
     columns = problem.columns(one.terms)
     solution = solve_thermal(problem.whole, columns, one.ridge)
-    reference = observations.of(Role.REFERENCE)
-    hull_px = convex_hull(trained.fold_rows.measured_px)
-    if not is_area(hull_px):
-        raise SessionError("the markers lie in one line; a model of the image needs an area of them")
     count = MOTIONS * len(columns)
+    camera_degC = _extent(trained.states.camera_degC[np.unique(trained.rows.frame)])
     return ThermalModel(
+        facts=facts_of(observations, trained.fold_rows, camera_degC, trained.origin.camera_degC),
         terms=one.terms,
-        origin=trained.origin,
+        reference_ambient_degC=trained.origin.ambient_degC,
         self_heating_K=heating_K,
         reference_features=trained.reference_features[columns],
         coefficients=solution.coefficients,
@@ -170,15 +166,7 @@ def _model(problem: _Problem, one: _Tried, heating_K: float, candidates: tuple[C
         discrepancy_px=_discrepancy_px(trained, one.held_out),
         valid=_range(trained, one.terms),
         has_warm_up=any(term.kind is Kind.POWER_LAG for term in trained.terms),
-        image_size=observations.image_size,
-        hull_px=hull_px,
-        reference_chamber_degC=reference_chamber_degC(observations),
-        reference_centres_px=reference_centres(observations)[0][observations.session[reference][0]],
         candidates=candidates,
-        target_name=observations.target.name,
-        camera_serial=observations.sessions[0].camera_serial,
-        session_ids=tuple(facts.session_id for facts in observations.sessions),
-        software_version=importlib.metadata.version("thermostand"),
     )
 
 
@@ -196,7 +184,6 @@ def _range(trained: Training, terms: Terms) -> ThermalRange:
     taus = [term.parameter for term in terms if term.parameter > 0 and term.kind is not Kind.PLAY]
     slowest = states.memory.taus_s.index(max(taus)) if taus else 0
     return ThermalRange(
-        camera_degC=_extent(states.camera_degC),
         ambient_degC=_extent(states.ambient_lag_degC[:, slowest]),
         rate_K_per_h=_extent(states.rate_K_per_h),
         least_on_s=float(states.on_s.min()),

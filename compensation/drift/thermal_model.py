@@ -22,6 +22,7 @@ from compensation.drift.drift_model import (
     range_flags,
     states_of,
 )
+from compensation.drift.facts import ModelFacts
 from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
 from compensation.history.lags import Float
 from compensation.history.states import SETTLED_TAUS, Memory, States
@@ -32,10 +33,9 @@ _MARGIN = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThermalRange:
-    """What the calibration covered: the camera's temperature, the slowest lag of the ambient, how fast the ambient
-    changed, K/h, and the shortest time since the camera was switched on, s."""
+    """What the calibration covered besides the camera's temperature: the slowest lag of the ambient, how fast the
+    ambient changed, K/h, and the shortest time since the camera was switched on, s."""
 
-    camera_degC: Pair
     ambient_degC: Pair
     rate_K_per_h: Pair
     least_on_s: float
@@ -46,14 +46,15 @@ class ThermalModel:
     """Maps measured positions of one camera to those at the reference temperature.
 
     terms: H features of the thermal state. coefficients (8, H) px, covariance (8 H, 8 H) px^2, in row order.
-    reference_features (H,): subtracted, so that the shift at the reference is about 0. discrepancy_px (2,): what the
-    form leaves unexplained at temperatures not fitted, one standard deviation, marker noise taken off. has_warm_up:
-    whether a warm-up was among the training frames; without one there are no lags of the power. hull_px,
-    reference_..., candidates, other: as in PaperModel.
+    reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
+    the shift at the reference is about 0. discrepancy_px (2,): what the form leaves unexplained at temperatures not
+    fitted, one standard deviation, marker noise taken off. has_warm_up: whether a warm-up was among the training
+    frames; without one there are no lags of the power. candidates, other: as in PaperModel.
     """
 
+    facts: ModelFacts
     terms: tuple[Term, ...]
-    origin: Origin
+    reference_ambient_degC: float
     self_heating_K: float
     reference_features: Float
     coefficients: Float
@@ -61,15 +62,7 @@ class ThermalModel:
     discrepancy_px: Float
     valid: ThermalRange
     has_warm_up: bool
-    image_size: tuple[int, int]
-    hull_px: Float
-    reference_chamber_degC: float
-    reference_centres_px: Float
     candidates: tuple[Candidate, ...]
-    target_name: str
-    camera_serial: str
-    session_ids: tuple[str, ...]
-    software_version: str
     other: DriftModel | None = None
 
     @property
@@ -88,21 +81,11 @@ class ThermalModel:
         """What has to be remembered for it."""
         return memory_of(self.terms, self.self_heating_K)
 
-    @property
-    def camera_range_degC(self) -> Pair:
-        """The calibrated interval of the camera's temperature."""
-        return self.valid.camera_degC
-
-    @property
-    def reference_degC(self) -> float:
-        """The camera's temperature at the reference."""
-        return self.origin.camera_degC
-
     def shift(self, xy_px: Float, state: Situation) -> Float:
         """Displacement (N, 2), px, to the reference of points (N, 2) measured in these states. Outside the valid range
         it extrapolates: ask `flags`. NaN in, and an unknown state, NaN out."""
         amounts = self._features(state, len(xy_px)) @ self.coefficients.T
-        return np.einsum("nak,nk->na", motions(xy_px, self.image_size), amounts)
+        return np.einsum("nak,nk->na", motions(xy_px, self.facts.image_size), amounts)
 
     def correct(self, xy_px: Float, state: Situation) -> Float:
         """Where the points (N, 2), px, would be at the reference."""
@@ -111,7 +94,7 @@ class ThermalModel:
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself."""
         found = self._features(state, len(xy_px))
-        terms = motions(xy_px, self.image_size)[:, :, :, None] * found[:, None, None, :]
+        terms = motions(xy_px, self.facts.image_size)[:, :, :, None] * found[:, None, None, :]
         terms = terms.reshape(len(xy_px), 2, -1)
         of_coefficients = (terms @ self.coefficient_covariance) @ terms.transpose(0, 2, 1)
         return of_coefficients + np.diag(self.discrepancy_px**2)
@@ -119,7 +102,7 @@ class ThermalModel:
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside."""
         states = states_of(state, len(xy_px), self.memory)
-        return place_flags(xy_px, self.hull_px) | self._state_flags(states)
+        return place_flags(xy_px, self.facts.hull_px) | self._state_flags(states)
 
     def inside(self, xy_px: Float, state: Situation) -> Mask:
         """(N,): whether points and states are in the calibrated range: no flag."""
@@ -127,11 +110,12 @@ class ThermalModel:
 
     def _features(self, state: Situation, count: int) -> Float:
         states = states_of(state, count, self.memory)
-        return features(states, self.terms, self.origin) - self.reference_features
+        origin = Origin(self.facts.reference_degC, self.reference_ambient_degC)
+        return features(states, self.terms, origin) - self.reference_features
 
     def _state_flags(self, states: States) -> Flags:
         valid = self.valid
-        found = range_flags(states.camera_degC, _widened(valid.camera_degC), Outside.CAMERA)
+        found = range_flags(states.camera_degC, _widened(self.facts.camera_range_degC), Outside.CAMERA)
         found |= range_flags(states.rate_K_per_h, _widened(valid.rate_K_per_h, 1.0), Outside.AMBIENT)
         found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
         if self.memory.taus_s:

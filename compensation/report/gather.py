@@ -180,16 +180,17 @@ def _hysteresis(found: tuple[Hysteresis, ...]) -> tuple[HysteresisNumbers, ...]:
 
 
 def _model(model: DriftModel) -> ModelNumbers:
+    facts = model.facts
     i, j = model.discrepancy_px.tolist()
     return ModelNumbers(
         form=model.form,
         title=model.title,
-        reference_degC=model.reference_degC,
-        reference_chamber_degC=model.reference_chamber_degC,
-        camera_range_degC=model.camera_range_degC,
-        hull_px=tuple((x, y) for x, y in model.hull_px.tolist()),
+        reference_degC=facts.reference_degC,
+        reference_chamber_degC=facts.reference_chamber_degC,
+        camera_range_degC=facts.camera_range_degC,
+        hull_px=tuple((x, y) for x, y in facts.hull_px.tolist()),
         discrepancy_px=(i, j),
-        session_ids=model.session_ids,
-        software_version=model.software_version,
+        session_ids=facts.session_ids,
+        software_version=facts.software_version,
         candidates=model.candidates,
     )

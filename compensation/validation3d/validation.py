@@ -80,7 +80,7 @@ def check_same(observations: Observations, file: CameraFile, model: DriftModel) 
     here = (facts.camera_serial, observations.target.name, observations.image_size)
     others = {
         "camera file": (file.camera_serial, file.target_name, file.image_size_px),
-        "drift model": (model.camera_serial, model.target_name, model.image_size),
+        "drift model": (model.facts.camera_serial, model.facts.target_name, model.facts.image_size),
     }
     for name, other in others.items():
         if other != here:

@@ -18,10 +18,11 @@ from compensation.apply.drift_runtime import Drift
 from compensation.apply.export import export, runtime_model
 from compensation.cli import app
 from compensation.drift.drift_model import DriftModel, Outside
+from compensation.drift.facts import ModelFacts
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import DegreeScore, PaperModel
-from compensation.drift.polynomial import Scaling, exponents
-from compensation.drift.terms import Kind, Origin, Term
+from compensation.drift.polynomial import exponents
+from compensation.drift.terms import Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
 from compensation.history.history import recorded_history, states_at
 from compensation.history.states import States, ThermalState
@@ -34,11 +35,12 @@ from .conftest import Recorded
 
 SIZE = (640, 480)
 HULL = np.array([[50.0, 40.0], [600.0, 40.0], [600.0, 440.0], [50.0, 440.0]])
-COMMON = {
+FACTS = {
+    "image_size": SIZE,
     "hull_px": HULL,
+    "reference_degC": 44.0,
     "reference_chamber_degC": 24.0,
     "reference_centres_px": np.array([[100.0, 90.0], [np.nan, np.nan]]),
-    "candidates": (),
     "target_name": "small",
     "camera_serial": "TS-0001",
     "session_ids": ("night",),
@@ -52,14 +54,13 @@ def paper(degree: int = 3) -> PaperModel:
         degree=degree, terms=count, condition=9.0, rms_px=(0.1, 0.1), fold_chamber_degC=(), fold_rms_px=()
     )
     return PaperModel(
+        facts=ModelFacts(camera_range_degC=(30.0, 72.0), **FACTS),
         degree=degree,
-        scaling=Scaling(SIZE, (30.0, 72.0)),
         coefficients=rng.normal(0, 0.2, (2, count)),
         coefficient_covariance=np.array([1e-6 * np.eye(count)] * 2),
         discrepancy_px=np.array([0.02, 0.03]),
-        reference_degC=44.0,
         scores=(score,),
-        **COMMON,
+        candidates=(),
     )
 
 
@@ -74,17 +75,17 @@ def thermal(*, warmed: bool = True) -> ThermalModel:
     )
     rng = np.random.default_rng(7)
     return ThermalModel(
+        facts=ModelFacts(camera_range_degC=(25.0, 72.0), **FACTS),
         terms=terms,
-        origin=Origin(44.0, 24.0),
+        reference_ambient_degC=24.0,
         self_heating_K=17.0,
         reference_features=rng.normal(0, 0.1, len(terms)),
         coefficients=rng.normal(0, 0.2, (8, len(terms))),
         coefficient_covariance=1e-6 * np.eye(8 * len(terms)),
         discrepancy_px=np.array([0.003, 0.004]),
-        valid=ThermalRange((25.0, 72.0), (10.0, 52.0), (-9.0, 9.0), 120.0 if warmed else np.inf),
+        valid=ThermalRange((10.0, 52.0), (-9.0, 9.0), 120.0 if warmed else np.inf),
         has_warm_up=True,
-        image_size=SIZE,
-        **COMMON,
+        candidates=(),
     )
 
 

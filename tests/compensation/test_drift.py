@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from compensation.drift.displacements import displacements
+from compensation.drift.facts import ModelFacts
 from compensation.drift.hull import convex_hull
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_fit import choose, fit_paper
@@ -148,17 +149,19 @@ def test_nan_in_is_nan_out(model: PaperModel):
 
 
 def test_the_reference_is_the_mean_of_the_reference_frames(noisy: Observations, model: PaperModel):
-    np.testing.assert_allclose(model.reference_centres_px, noisy.centres_px[:8].mean(axis=0), rtol=0, atol=1e-9)
-    assert (model.reference_degC, model.reference_chamber_degC) == (39.0, 24.0)
+    np.testing.assert_allclose(model.facts.reference_centres_px, noisy.centres_px[:8].mean(axis=0), rtol=0, atol=1e-9)
+    assert (model.facts.reference_degC, model.facts.reference_chamber_degC) == (39.0, 24.0)
 
 
 def test_a_model_is_read_back_number_for_number(model: PaperModel, tmp_path: Path):
-    centres = model.reference_centres_px.copy()
+    centres = model.facts.reference_centres_px.copy()
     centres[3] = np.nan
-    saved = replace(model, reference_centres_px=centres)
+    saved = replace(model, facts=replace(model.facts, reference_centres_px=centres))
     save_model(saved, tmp_path / "model.json")
     loaded = load_model(tmp_path / "model.json")
-    for name in PaperModel.__slots__:
+    for name in ModelFacts.__slots__:
+        np.testing.assert_equal(getattr(loaded.facts, name), getattr(saved.facts, name), err_msg=name)
+    for name in set(PaperModel.__slots__) - {"facts"}:
         np.testing.assert_equal(getattr(loaded, name), getattr(saved, name), err_msg=name)
     assert [path.name for path in tmp_path.iterdir()] == ["model.json"]
 
@@ -242,8 +245,8 @@ def test_a_warm_up_session_beside_it_changes_nothing(noisy: Observations, model:
     warm_up = replace(warm_up, role=np.array(["warm_up"] * len(warm_up.frame)))
     both = fit_paper(concatenate([warm_up, noisy]))
     np.testing.assert_array_equal(both.coefficients, model.coefficients)
-    np.testing.assert_array_equal(both.reference_centres_px, model.reference_centres_px)
-    assert both.session_ids == ("warm-up", "night-1")
+    np.testing.assert_array_equal(both.facts.reference_centres_px, model.facts.reference_centres_px)
+    assert both.facts.session_ids == ("warm-up", "night-1")
 
 
 def test_two_nights_with_the_target_moved_between_them_are_one_fit(noisy: Observations):

@@ -90,7 +90,7 @@ def check_reported(ended: subprocess.CompletedProcess[str]) -> Path:
     directory = Path(session)
     assert verify(directory).is_sound
     assert lines[-2:] == [f"model    {directory / MODEL_NAME}", f"report   {directory / REPORT_NAME}"]
-    assert load_model(directory / MODEL_NAME).session_ids == (directory.name,)
+    assert load_model(directory / MODEL_NAME).facts.session_ids == (directory.name,)
     assert directory.name in (directory / REPORT_NAME).read_text(encoding="utf-8")
     return directory
 
