@@ -1,13 +1,17 @@
-"""What both commands share: every error in one line, a wrong argument as well."""
+"""What both command lines share: every error in one line, and commands that are imported when they are given."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import importlib
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
+
+_INTERRUPTED = 130  # exit_codes.INTERRUPTED, which imports this module
 
 # The base of what typer raises for wrong arguments; it exports only this descendant.
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
@@ -27,6 +31,43 @@ class OneLineUsage(TyperGroup):
         """Parse and run the subcommand."""
         with _usage_in_one_line():
             return super().invoke(ctx)
+
+
+class Lazy(NamedTuple):
+    """Where a command is: the module whose `app` holds it, or is it, and its line in the list of commands."""
+
+    module: str
+    help: str
+
+
+def lazy_app(help_text: str, commands: Mapping[str, Lazy]) -> typer.Typer:
+    """A command line whose commands are listed without being imported: their libraries take seconds."""
+
+    class Commands(OneLineUsage):
+        """Imports the command that is given."""
+
+        def __init__(self, **attrs: Any) -> None:
+            super().__init__(**attrs)
+            self.commands.update({name: TyperCommand(name, help=lazy.help) for name, lazy in commands.items()})
+
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            if args and args[0] in commands:
+                self.commands[args[0]] = _imported(commands[args[0]].module, args[0])
+            return super().resolve_command(ctx, args)
+
+    app = typer.Typer(cls=Commands, no_args_is_help=True, add_completion=False, help=help_text)
+    app.callback()(lambda: None)  # typer refuses an application with neither commands nor a callback
+    return app
+
+
+def _imported(module: str, name: str) -> Any:
+    """The command of that name; the whole group when the module has none of that name."""
+    try:
+        group = get_group(importlib.import_module(module).app)
+    except KeyboardInterrupt as error:
+        typer.echo("interrupted; nothing was begun", err=True)
+        raise typer.Exit(_INTERRUPTED) from error
+    return group.commands.get(name, group)
 
 
 @contextmanager

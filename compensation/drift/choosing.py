@@ -15,7 +15,7 @@ from compensation.drift.paper_model import PaperModel
 from compensation.drift.thermal_choice import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.observations import Observations
-from foundation.errors import SessionError
+from foundation.errors import ConfigError, SessionError
 
 Form = Literal["paper", "thermal"]
 FORMS: tuple[Form, ...] = ("paper", "thermal")
@@ -51,10 +51,10 @@ def _or_none(fitted: Callable[[], Fitted]) -> Fitted | None:
 
 
 def check_request(degree: int | None, form: Form | None) -> None:
-    """SessionError when there is no such degree, or a degree is asked for of the thermal form."""
+    """ConfigError when there is no such degree, or a degree is asked for of the thermal form."""
     check_degree(degree)
     if degree is not None and form == "thermal":
-        raise SessionError("the thermal form has no degree; leave out --degree, or ask for --form paper")
+        raise ConfigError("the thermal form has no degree; leave out --degree, or ask for --form paper")
 
 
 def _better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:

@@ -13,7 +13,7 @@ from compensation.drift.facts import facts_of
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
 from compensation.observations import Mask, Observations, Role
-from foundation.errors import SessionError
+from foundation.errors import ConfigError, SessionError
 
 _LEAST_TEMPERATURES = 3
 _LEAST_RANGE_K = 1.0
@@ -45,9 +45,9 @@ def fit_paper(observations: Observations, degree: int | None = None) -> PaperMod
 
 
 def check_degree(degree: int | None) -> None:
-    """SessionError when there is no model of this degree; None, the choice by cross-validation, is fine."""
+    """ConfigError when there is no model of this degree; None, the choice by cross-validation, is fine."""
     if degree is not None and not 1 <= degree <= MAX_DEGREE:
-        raise SessionError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
+        raise ConfigError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
 
 
 def degrees_for(rows: Displacements, degree: int | None) -> range:

@@ -1,107 +1,29 @@
-"""The `stand` command line: plan, simulate, and what the other modules add to it."""
+"""The `stand` command line: which commands there are, and where."""
 
 from __future__ import annotations
 
-import json
-import signal
-from datetime import UTC, datetime, timedelta
-from typing import Annotated
+from foundation.usage import Lazy, lazy_app
 
-import typer
+_PLAN, _RUN, _CONTROL = "stand.commands.plan_cli", "stand.commands.run_cli", "stand.commands.control_cli"
 
-from experiments.steps import kind_of, parameters_of
-from foundation.clock import NS_PER_S, WallClock
-from foundation.ending import Ending
-from foundation.exit_codes import one_line_errors
-from foundation.usage import OneLineUsage
-from stand.commands import control_cli, queue_cli, run_cli, session_cli
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.estimate import PricedStep, price
-from stand.estimating.follow import parameters_text
-from stand.estimating.learned import load_learned
-from stand.running.order_files import load_order
-from stand.simulator import Simulator, laboratory_of
 
-app = typer.Typer(
-    cls=OneLineUsage,
-    no_args_is_help=True,
-    add_completion=False,
-    help="Drive the thermal test stand: plan, run, simulate.\n\n"
-    "Example: stand run thermal-cycle --config my-stand.yaml",
+app = lazy_app(
+    "Drive the thermal test stand: plan, run, simulate.\n\nExample: stand run thermal-cycle --config my-stand.yaml",
+    {
+        "plan": Lazy(_PLAN, "The steps of a recipe with durations, frames, bytes and end time, without running it."),
+        "simulate": Lazy(_PLAN, "The simulated laboratory in real time, until interrupted."),
+        "demo": Lazy(_RUN, "Run a simulated thermal cycle, fit the drift, and print what compensation gains."),
+        "run": Lazy(_RUN, "Run a recipe and record it."),
+        "resume": Lazy(_RUN, "Go on with a run that was killed or interrupted, in its session."),
+        "status": Lazy(_CONTROL, "What the running session is doing."),
+        "pause": Lazy(_CONTROL, "Hold the run before its next action."),
+        "continue": Lazy(_CONTROL, "End a pause."),
+        "clear": Lazy(_CONTROL, "Let a run that an interlock holds go on, after you have seen to the cause."),
+        "stop": Lazy(_CONTROL, "Make the stand safe and end the run, as Ctrl-C does."),
+        "queue": Lazy("stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
+        "session": Lazy(
+            "stand.commands.session_cli",
+            "Recorded sessions: list, look at, verify, salvage, replay, export, trim.",
+        ),
+    },
 )
-
-app.add_typer(run_cli.app)
-app.add_typer(control_cli.app)
-app.add_typer(queue_cli.app, name="queue")
-app.add_typer(session_cli.app, name="session")
-
-_ENDING = {signal.SIGINT, signal.SIGTERM}
-
-
-@app.command()
-def plan(
-    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
-    config: Annotated[
-        str, typer.Option("--config", help="A configuration file, or the name of an installed one.")
-    ] = "simulated",
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
-) -> None:
-    """The steps of a recipe with durations, frames, bytes and end time, without running anything.
-
-    Example: stand plan thermal-cycle --json
-    """
-    with one_line_errors():
-        order = load_order(recipe, config)
-        learned = load_learned(order.config.recording.directory)
-        steps = price(order.recipe.plan(), order.config, learned)
-        total_s = sum(step.duration_s for step in steps)
-        now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
-        end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
-        totals = {
-            "duration_s": total_s,
-            "frames": sum(step.frames for step in steps),
-            "bytes": round(sum(step.size_bytes for step in steps)),
-            "end": end,
-        }
-        if as_json:
-            typer.echo(json.dumps({"steps": [step.as_json() for step in steps], **totals}, indent=2))
-            return
-        for step in steps:
-            typer.echo(_line(step))
-        typer.echo(
-            f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
-            f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
-        )
-        typer.echo(str(learned))
-
-
-@app.command()
-def simulate(
-    config: Annotated[str, typer.Argument(help="A configuration with a `simulation` section.")] = "simulated",
-) -> None:
-    """The simulated laboratory in real time, until interrupted: every device answers at its configured address.
-
-    Example: stand simulate & stand run demo
-    """
-    with one_line_errors():
-        stand_config = load_config(packaged("", config))
-        laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
-        simulator = Simulator(laboratory)
-        typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
-        ending.wait()
-        simulator.stop()
-
-
-def _line(step: PricedStep) -> str:
-    planned = step.planned
-    return (
-        f"{planned.index:4d}  {planned.step_id}  {kind_of(planned.step):<16s}"
-        f"{parameters_text(parameters_of(planned.step)):<72s}{_hours(step.duration_s):>12s}"
-        + (f"{step.frames:6d} frames {step.size_bytes / 1e6:8.1f} MB" if step.frames else "")
-        + (f"   in band after {_hours(step.in_band_after_s)}" if step.in_band_after_s else "")
-        + (f"   {step.warning}" if step.warning else "")
-    )
-
-
-def _hours(duration_s: float) -> str:
-    return str(timedelta(seconds=round(duration_s)))

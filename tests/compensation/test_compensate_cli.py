@@ -52,9 +52,9 @@ def image(tmp_path: Path) -> Path:
     return path
 
 
-def assert_refused(result: Result, sentence: str, out: Path):
-    """Status 2, one line that has the sentence, and nothing written."""
-    assert result.exit_code == 2, result.output
+def assert_refused(result: Result, sentence: str, out: Path, status: int = 1):
+    """One line that has the sentence, and nothing written. status: 2 for bad arguments and configurations."""
+    assert result.exit_code == status, result.output
     lines = [line for line in result.stderr.splitlines() if not line.startswith("find markers")]
     assert len(lines) == 1
     assert lines[0].startswith("error: ")
@@ -125,7 +125,7 @@ def test_the_degree_can_be_given(recorded: Recorded, tmp_path: Path):
 def test_a_degree_that_does_not_exist_is_refused_before_the_long_work(recorded: Recorded, tmp_path: Path, degree: str):
     out = tmp_path / "model.json"
     result = run("fit", recorded.path, "-o", out, "--degree", degree)
-    assert_refused(result, f"the degree is 1 to 5, not {degree}", out)
+    assert_refused(result, f"the degree is 1 to 5, not {degree}", out, 2)
     assert "find markers" not in result.stderr
 
 
@@ -141,7 +141,7 @@ def test_a_degree_that_does_not_exist_is_refused_before_the_long_work(recorded: 
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(arguments: list[str], sentence: str, tmp_path: Path):
-    assert_refused(run(*arguments), sentence, tmp_path / "out")
+    assert_refused(run(*arguments), sentence, tmp_path / "out", 2)
 
 
 def test_no_arguments_ask_for_help():
@@ -155,7 +155,7 @@ def test_what_is_not_a_file_is_refused_before_the_work_and_stays(recorded: Recor
     os.mkfifo(pipe)
     for command in ("detect", "fit", "report"):
         result = run(command, recorded.path, "-o", pipe)
-        assert result.exit_code == 2
+        assert result.exit_code == 1
         assert result.stderr == f"error: {pipe}: cannot be written (it is not a regular file)\n"
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
@@ -164,7 +164,7 @@ def test_what_is_not_a_file_is_refused_before_the_work_and_stays(recorded: Recor
 def test_a_name_with_line_ends_or_no_text_at_all_stays_in_one_line(image: Path, target: Path, tmp_path: Path):
     out = tmp_path / "markers.csv"
     odd = tmp_path / os.fsdecode(b"two\nlines\r\xff.png")
-    assert_refused(run("detect", odd, "-o", out), r"two\nlines\r\udcff.png: no such file or folder", out)
+    assert_refused(run("detect", odd, "-o", out), r"two\nlines\r\udcff.png: no such file or folder", out, 2)
     shutil.copy(image, odd)
     blank = tmp_path / "blank\n.png"
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((480, 640), 128, np.uint8))
@@ -182,12 +182,12 @@ def test_bad_input_to_detect_is_refused_with_a_sentence(image: Path, recorded: R
     cv2.imwrite(str(blank), np.full((480, 640), 128, np.uint8))
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert_refused(run("detect", tmp_path / "none.png", "-o", out), "none.png: no such file or folder", out)
+    assert_refused(run("detect", tmp_path / "none.png", "-o", out), "none.png: no such file or folder", out, 2)
     assert_refused(run("detect", image, text, "-o", out), "notes.png: not an image", out)
     assert_refused(run("detect", blank, "-o", out), "blank.png: ", out)
     assert_refused(run("detect", empty, "-o", out), "empty: not a session", out)
-    assert_refused(run("detect", image, "--target", "dots", "-o", out), "installed targets: paper-9x6", out)
-    assert_refused(run("detect", image, "--target", text, "-o", out), "notes.png: ", out)
+    assert_refused(run("detect", image, "--target", "dots", "-o", out), "installed targets: paper-9x6", out, 2)
+    assert_refused(run("detect", image, "--target", text, "-o", out), "notes.png: ", out, 2)
     nowhere = tmp_path / "none" / "markers.csv"
     assert_refused(run("detect", recorded.path, "-o", nowhere), "cannot be written", nowhere)
 
@@ -215,7 +215,7 @@ def test_an_interrupted_command_leaves_older_files_as_they_were(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("compensation.finding.piece.detect", interrupted)
-    monkeypatch.setattr("compensation.cli.detect", interrupted)
+    monkeypatch.setattr("compensation.commands.detect_cli.detect", interrupted)
     for command in ("detect", "fit", "report"):
         out = tmp_path / command
         out.write_text("older")

@@ -33,7 +33,7 @@ def ask(*arguments: object) -> tuple[int, str]:
 def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path, tmp_path: Path):
     out = tmp_path / "markers.csv"
     status, said = ask("detect", holed, "-o", out)
-    assert status == 2
+    assert status == 1
     assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in said
     assert "frames that are described); with --incomplete what is there is used" in said
     assert not out.exists()
@@ -55,7 +55,7 @@ def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path
 def test_each_command_refuses_it_with_the_same_sentence(holed: Path, tmp_path: Path, command: tuple[str, ...]):
     out = tmp_path / "out.html"
     status, said = ask(*(text.format(session=holed, out=out) for text in command))
-    assert status == 2
+    assert status == 1
     assert said.startswith(f"error: {holed}: is incomplete; missing: frames/0000.mcap (to ")
     assert said.endswith("with --incomplete what is there is used")
     assert not out.exists()
@@ -71,7 +71,7 @@ def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded,
     for source in ((holed,), (points, "--session", holed)):
         out = tmp_path / "out"
         status, said = ask("apply", model, *source, "-o", out)
-        assert status == 2
+        assert status == 1
         assert said.endswith("with --incomplete what is there is used")
         assert not out.exists()
     status, said = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")

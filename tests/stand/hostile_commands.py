@@ -70,8 +70,8 @@ def answer(words: list[str]) -> dict[str, object]:
 
 
 def main() -> None:
-    import compensation.cli  # noqa: F401 - once for all
-    import stand.commands.commands  # noqa: F401 - once for all
+    import compensation.commands.fit_cli  # noqa: F401 - once for all
+    import stand.commands.session_cli  # noqa: F401 - once for all
 
     answers = os.fdopen(os.dup(1), "w")
     for line in sys.stdin:

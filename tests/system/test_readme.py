@@ -84,7 +84,7 @@ def test_a_command_in_the_text_exists(command: str):
 
 @pytest.mark.parametrize("option", sorted(set(re.findall(r"`(--[a-z-]+)", README))))
 def test_an_option_in_the_text_exists(option: str):
-    sources = [*ROOT.glob("stand/commands/*.py"), *ROOT.glob("compensation/*.py")]
+    sources = [*ROOT.glob("stand/commands/*.py"), *ROOT.glob("compensation/commands/*.py")]
     names = {option, option.removeprefix("--").replace("-", "_")}
     assert any(f'"{option}"' in text or f"{name}: " in text for name in names for text in map(Path.read_text, sources))
 

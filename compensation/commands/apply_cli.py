@@ -14,18 +14,21 @@ import typer
 from compensation.apply.export import export
 from compensation.apply.images import Form, corrected_image, middle_flags, write_image
 from compensation.apply.points import CAMERA, X, Y, numbers, outside_text, read_points, times, write_corrected
-from compensation.command_line import Incomplete, one_line_errors, said_if
+from compensation.commands.options import Incomplete, said_if
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
 from compensation.history.history import recorded_history, states_at
 from compensation.history.states import States
 from foundation.errors import ConfigError, SessionError
+from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, whole_file
 from foundation.progress import progress
 from markers.image_file import read_image
 from recording.reading.session import Session
 from recording.reading.using import open_whole
+
+app = typer.Typer(add_completion=False)
 
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")]
 CameraOption = Annotated[
@@ -34,6 +37,7 @@ CameraOption = Annotated[
 INDEX_COLUMNS = ("image", "frame", "time_ns", "camera_degC", "outside")
 
 
+@app.command("apply")
 def apply_model(
     model: ModelArgument,
     source: Annotated[Path, typer.Argument(metavar="POINTS.csv|IMAGE|SESSION", help="What is to be corrected.")],
@@ -79,6 +83,7 @@ def apply_model(
             _warn(middle_flags(used, states))
 
 
+@app.command("export")
 def export_model(
     model: ModelArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder for drift.json and drift_runtime.py.")],

@@ -1,17 +1,16 @@
-"""What the commands of `compensate` share: errors in one line, and the target they are told to use."""
+"""What the commands of `compensate` share: options, and the target they are given."""
 
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from foundation.errors import ConfigError, StandError
-from foundation.usage import one_line, tell
+from foundation.errors import ConfigError
+from foundation.usage import one_line
 from markers.target import Target, load_target
 
 TargetOption = Annotated[
@@ -53,19 +52,3 @@ def named_target(name: str | None) -> Target | None:
 def said_if(incomplete: bool) -> Callable[[str], None] | None:
     """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
     return (lambda text: typer.echo(one_line(f"warning: {text}"), err=True)) if incomplete else None
-
-
-@contextmanager
-def one_line_errors() -> Generator[None]:
-    """Bad input ends with status 2, a machine that fails with 1, an interrupted run with 130; each with a sentence."""
-    try:
-        yield
-    except StandError as error:
-        tell(error)
-        raise typer.Exit(2) from error
-    except OSError as error:
-        tell(error)
-        raise typer.Exit(1) from error
-    except KeyboardInterrupt as error:
-        typer.echo("interrupted; nothing was written", err=True)
-        raise typer.Exit(130) from error

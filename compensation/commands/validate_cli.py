@@ -9,7 +9,7 @@ import typer
 
 from compensation.budget.geometry import load_geometry
 from compensation.calibration.camera_file import CameraFile
-from compensation.command_line import (
+from compensation.commands.options import (
     AcrossGap,
     Cache,
     Cluster,
@@ -17,7 +17,6 @@ from compensation.command_line import (
     TargetOption,
     Workers,
     named_target,
-    one_line_errors,
     said_if,
 )
 from compensation.drift.model_file import load_model
@@ -30,11 +29,15 @@ from compensation.validation3d.stand_part import StandPart, stand_part
 from compensation.validation3d.summary import summary
 from compensation.validation3d.validation import LensModel, camera_of, check_same, validate
 from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, write_whole
 from foundation.progress import progress
 from recording.reading.session import Session
 
+app = typer.Typer(add_completion=False)
 
+
+@app.command("validate")
 def validate_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a session of the validation recipe.")],
     camera: Annotated[Path, typer.Option(help="The camera file of `compensate calibrate`.")],

@@ -10,13 +10,17 @@ import typer
 
 from compensation.budget.budget import Budget, budget, table
 from compensation.budget.geometry import load_geometry
-from compensation.command_line import Incomplete, TargetOption, named_target, one_line_errors, said_if
+from compensation.commands.options import Incomplete, TargetOption, named_target, said_if
 from compensation.observations import session_target
+from foundation.exit_codes import one_line_errors
 from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
+app = typer.Typer(add_completion=False)
 
+
+@app.command("budget")
 def budget_of_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded session.")],
     geometry: Annotated[str, typer.Option(help="The stand's geometry: a file, or the installed `paper`.")] = "paper",

@@ -14,17 +14,21 @@ from compensation.calibration.exports import EXPORTS, refit_radtan, write_export
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.positions import observe_positions
 from compensation.calibration.stages import TableSigma
-from compensation.command_line import Incomplete, TargetOption, named_target, one_line_errors, said_if
+from compensation.commands.options import Incomplete, TargetOption, named_target, said_if
 from compensation.observations import session_target
 from compensation.report.calibration_report import report_page
+from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable, check_writable, write_whole
 from foundation.progress import progress
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
+app = typer.Typer(add_completion=False)
+
 _TABLE = TableSigma()
 
 
+@app.command("calibrate")
 def calibrate_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded calibration.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The camera file (JSON) to write.")],

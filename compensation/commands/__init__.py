@@ -1,0 +1,1 @@
+"""The `compensate` command line: a module a command; each is imported when it is given."""

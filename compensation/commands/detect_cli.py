@@ -1,0 +1,130 @@
+"""`compensate detect`: the markers of recorded sessions and of photographs, as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.commands.options import (
+    Incomplete,
+    TargetOption,
+    installed_target,
+    said_if,
+)
+from compensation.observations import read_frames, session_target
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.files import check_writable
+from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from foundation.progress import Report, late_progress
+from foundation.usage import one_line
+from markers.detection import Detection, DetectionError, Image, detect, nothing_found
+from markers.image_file import read_image
+from markers.table import CENTRES, DetectedImage, write_detections
+from markers.target import Target
+from recording.reading.session import Session
+from recording.reading.using import open_whole
+
+app = typer.Typer(add_completion=False)
+
+MegapixelsOption = Annotated[
+    float, typer.Option("--max-megapixels", min=0.001, max=2000.0, help="Larger images are refused, unread.")
+]
+
+_DEFAULT_TARGET = "paper-9x6"
+
+
+@app.command("detect")
+def detect_images(
+    sources: Annotated[list[Path], typer.Argument(metavar="SESSION|IMAGE...", help="Sessions and image files.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")],
+    target: TargetOption = None,
+    max_megapixels: MegapixelsOption = GREATEST_MEGAPIXELS,
+    incomplete: Incomplete = False,
+) -> None:
+    """Find the target's markers: a CSV row per marker and image, with covariance and flags.
+
+    x_px, y_px is the centre of the marker's outline in the image; disc_x_px, disc_y_px the image of the disc's centre,
+    by the homography of the target: use it for positions in space, or where the target is tilted.
+
+    Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
+    """
+    with one_line_errors(), images_up_to(max_megapixels):
+        check_writable(out)
+        opened = [_open(path, incomplete) for path in sources]
+        chosen = _detection_target(opened, target)
+        failures: list[str] = []
+        with late_progress("find markers", sum(_count(source) for source in opened)) as report:
+            write_detections(out, chosen, _detections(opened, chosen, failures, report))
+        typer.echo(CENTRES)
+        for failure in failures:
+            typer.echo(f"not found in {one_line(failure)}", err=True)
+
+
+def _open(path: Path, incomplete: bool) -> Session | Path:
+    """A folder is a session, a file is an image."""
+    if path.is_dir():
+        return open_whole(path, said_if(incomplete))
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file or folder")
+    return path
+
+
+def _detection_target(sources: Sequence[Session | Path], name: str | None) -> Target:
+    """The named target, else the one attached to all the sessions, else the paper's; one table has one target."""
+    if name is not None:
+        return installed_target(name)
+    attached = [session_target(source) for source in sources if isinstance(source, Session)]
+    if any(target != attached[0] for target in attached):
+        raise ConfigError("the sessions have different targets; write a table for each")
+    return attached[0] if attached else installed_target(_DEFAULT_TARGET)
+
+
+def _count(source: Session | Path) -> int:
+    return source.frame_count if isinstance(source, Session) else 1
+
+
+def _detections(
+    sources: Sequence[Session | Path], target: Target, failures: list[str], report: Report
+) -> Iterator[DetectedImage]:
+    """Every image in turn; where the target is not found all its markers are missing, and `failures` grows by a line.
+
+    DetectionError when it is found nowhere.
+    """
+    several = len(sources) > 1
+    images = 0
+    for source in sources:
+        previous: Detection | None = None
+        for name, time_ns, image in _images(source, several):
+            watch = partial(_report_part, report, images, name)
+            images += 1
+            try:
+                # Photographs need not be of one pose: only frames of a session are tracked.
+                found = detect(image, target, previous, watch=watch)
+                previous = found if isinstance(source, Session) else None
+            except DetectionError as error:
+                failures.append(f"{name}: {error}")
+                found = nothing_found(target)
+            report(images, name)
+            yield DetectedImage(name, time_ns, found)
+    if len(failures) == images:
+        raise DetectionError(f"{failures[0] if failures else 'there are no images'}")
+
+
+def _report_part(report: Report, done: int, name: str, part: float) -> None:
+    """Part of one image, behind those before it."""
+    report(done + part, name)
+
+
+def _images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | None, Image]]:
+    """Name (escaped), time and pixels of each image of a source."""
+    if not isinstance(source, Session):
+        yield one_line(source.name), None, read_image(source)
+        return
+    prefix = f"{one_line(source.path.name)}/" if several else ""
+    for index, frame in enumerate(read_frames(source)):
+        yield f"{prefix}{index}", frame.time_ns, frame.image

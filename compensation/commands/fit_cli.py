@@ -1,0 +1,126 @@
+"""`compensate fit` and `compensate report`: the drift of sessions of one camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.commands.budget_cli import budgets_of_sessions
+from compensation.commands.options import (
+    AcrossGap,
+    Cache,
+    Cluster,
+    Incomplete,
+    TargetOption,
+    Workers,
+    named_target,
+    said_if,
+)
+from compensation.drift.choosing import Form, check_request
+from compensation.drift.choosing import fit as fit_model
+from compensation.drift.evaluation import evaluate, table
+from compensation.drift.model_file import load_model, save_model
+from compensation.drift.paper_model import MAX_DEGREE
+from compensation.finding.found import finder
+from compensation.observations import observe_sessions
+from compensation.report.extras import Extras
+from compensation.report.report import can_be_fitted, check_report_writable, write_report
+from compensation.report.table_positions import table_positions
+from compensation.validation3d.reading import load_validation
+from foundation.exit_codes import one_line_errors
+from foundation.files import check_writable
+from foundation.progress import progress
+from recording.reading.session import Session
+
+app = typer.Typer(add_completion=False)
+
+Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of recorded sessions.")]
+DegreeOption = Annotated[
+    int | None,
+    typer.Option(help=f"Degree of the paper's polynomial, 1 to {MAX_DEGREE}; else chosen by cross-validation."),
+]
+FormOption = Annotated[
+    Form | None, typer.Option(help="The paper's polynomial or the thermal form; else chosen by cross-validation.")
+]
+
+
+@app.command()
+def fit(
+    sessions: Sessions,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
+    form: FormOption = None,
+    degree: DegreeOption = None,
+    target: TargetOption = None,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    cache: Cache = True,
+    across_gap: AcrossGap = False,
+    incomplete: Incomplete = False,
+) -> None:
+    """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
+
+    Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
+    """
+    with one_line_errors():
+        check_request(degree, form)
+        check_writable(out)
+        found_by = finder(workers, cluster, use_cache=cache)
+        observations = observe_sessions(
+            sessions,
+            progress,
+            named_target(target),
+            found_by,
+            across_gap=across_gap,
+            incomplete=said_if(incomplete),
+        )
+        model = fit_model(observations, degree, form)
+        evaluation = evaluate(model, observations)
+        save_model(model, out)
+        typer.echo(f"{model.form}: {model.title}")
+        typer.echo(table(evaluation))
+
+
+@app.command()
+def report(
+    sessions: Sessions,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write.")],
+    model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="With the stand's budget, by its geometry: a file, or the installed `paper`.")
+    ] = None,
+    validation: Annotated[
+        Path | None, typer.Option(help="With the result of `compensate validate`: the JSON file beside its page.")
+    ] = None,
+    target: TargetOption = None,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    cache: Cache = True,
+    across_gap: AcrossGap = False,
+    incomplete: Incomplete = False,
+) -> None:
+    """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
+
+    Its numbers are in a JSON file of the same name beside it. Sessions without a thermal cycle have their drift alone.
+
+    Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
+    """
+    with one_line_errors():
+        check_report_writable(out, model, validation)
+        found_by = finder(workers, cluster, use_cache=cache)
+        given = None if model is None else load_model(model)
+        wanted = named_target(target)
+        extras = Extras(
+            budgets={} if budget is None else budgets_of_sessions(sessions, budget, wanted),
+            positions=table_positions([Session.open(path).steps() for path in sessions]),
+            validation=None if validation is None else load_validation(validation),
+        )
+        observations = observe_sessions(
+            sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said_if(incomplete)
+        )
+        has_cycle = can_be_fitted(observations)
+        used = fit_model(observations) if given is None and has_cycle else given
+        evaluation = None if used is None or not has_cycle else evaluate(used, observations)
+        write_report(out, observations, used, evaluation, extras)
+        typer.echo("no thermal cycle: no model, drift alone" if evaluation is None else table(evaluation))

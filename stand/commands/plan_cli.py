@@ -1,0 +1,94 @@
+"""The commands that need no stand: plan, simulate."""
+
+from __future__ import annotations
+
+import json
+import signal
+from datetime import UTC, datetime, timedelta
+from typing import Annotated
+
+import typer
+
+from experiments.steps import kind_of, parameters_of
+from foundation.clock import NS_PER_S, WallClock
+from foundation.ending import Ending
+from foundation.exit_codes import one_line_errors
+from stand.config.stand_config import load_config, packaged
+from stand.estimating.estimate import PricedStep, price
+from stand.estimating.follow import parameters_text
+from stand.estimating.learned import load_learned
+from stand.running.order_files import load_order
+from stand.simulator import Simulator, laboratory_of
+
+app = typer.Typer(add_completion=False)
+
+_ENDING = {signal.SIGINT, signal.SIGTERM}
+
+
+@app.command()
+def plan(
+    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
+    config: Annotated[
+        str, typer.Option("--config", help="A configuration file, or the name of an installed one.")
+    ] = "simulated",
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
+) -> None:
+    """The steps of a recipe with durations, frames, bytes and end time, without running anything.
+
+    Example: stand plan thermal-cycle --json
+    """
+    with one_line_errors():
+        order = load_order(recipe, config)
+        learned = load_learned(order.config.recording.directory)
+        steps = price(order.recipe.plan(), order.config, learned)
+        total_s = sum(step.duration_s for step in steps)
+        now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
+        end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
+        totals = {
+            "duration_s": total_s,
+            "frames": sum(step.frames for step in steps),
+            "bytes": round(sum(step.size_bytes for step in steps)),
+            "end": end,
+        }
+        if as_json:
+            typer.echo(json.dumps({"steps": [step.as_json() for step in steps], **totals}, indent=2))
+            return
+        for step in steps:
+            typer.echo(_line(step))
+        typer.echo(
+            f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
+            f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
+        )
+        typer.echo(str(learned))
+
+
+@app.command()
+def simulate(
+    config: Annotated[str, typer.Argument(help="A configuration with a `simulation` section.")] = "simulated",
+) -> None:
+    """The simulated laboratory in real time, until interrupted: every device answers at its configured address.
+
+    Example: stand simulate & stand run demo
+    """
+    with one_line_errors():
+        stand_config = load_config(packaged("", config))
+        laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
+        simulator = Simulator(laboratory)
+        typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
+        ending.wait()
+        simulator.stop()
+
+
+def _line(step: PricedStep) -> str:
+    planned = step.planned
+    return (
+        f"{planned.index:4d}  {planned.step_id}  {kind_of(planned.step):<16s}"
+        f"{parameters_text(parameters_of(planned.step)):<72s}{_hours(step.duration_s):>12s}"
+        + (f"{step.frames:6d} frames {step.size_bytes / 1e6:8.1f} MB" if step.frames else "")
+        + (f"   in band after {_hours(step.in_band_after_s)}" if step.in_band_after_s else "")
+        + (f"   {step.warning}" if step.warning else "")
+    )
+
+
+def _hours(duration_s: float) -> str:
+    return str(timedelta(seconds=round(duration_s)))

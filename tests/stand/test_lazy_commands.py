@@ -1,0 +1,55 @@
+"""Commands are listed without being imported; each is where its line says."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from compensation.cli import app as compensate
+from foundation.usage import Lazy, lazy_app
+from stand.commands.commands import app as stand
+
+APPS = {"stand": stand, "compensate": compensate}
+EACH = [(name, command) for name, app in APPS.items() for command in get_command(app).commands]
+
+
+@pytest.mark.parametrize(("name", "command"), EACH)
+def test_each_command_of_the_list_is_there(name: str, command: str):
+    shown = CliRunner().invoke(APPS[name], [command, "--help"], prog_name=name)
+    assert shown.exit_code == 0
+    assert f"Usage: {name} {command} " in shown.output
+    assert "Example: " in shown.output or command in ("continue", "clear", "stop", "simulate")
+
+
+def test_the_list_says_what_each_does():
+    shown = CliRunner().invoke(stand, ["--help"])
+    assert "session   Recorded sessions: list, look at, verify" in shown.output
+    assert len(EACH) == 20
+
+
+def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):
+    (tmp_path / "slow.py").write_text(
+        "import signal\nprint('importing', flush=True)\nwhile True:\n    signal.pause()\n"
+    )
+    code = "from foundation.usage import *; lazy_app('x', {'go': Lazy('slow', 'go')})(['go'])"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "importing\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+        assert process.stderr.read() == "interrupted; nothing was begun\n"
+
+
+def test_an_unknown_command_is_told_with_the_nearest_one():
+    app = lazy_app("x", {"go": Lazy("nowhere", "go")})
+    result = CliRunner().invoke(app, ["goo"])
+    assert (result.exit_code, "Did you mean 'go'?" in result.stderr) == (2, True)

@@ -1,0 +1,38 @@
+"""What is imported when: help and the public names come at once, the libraries of the long work when it is begun."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("numba", "scipy", "cv2", "matplotlib")
+
+WORK = {
+    "stand": "import sys; sys.argv = ['stand', '--help']; from stand.cli import app",
+    "compensate": "import sys; sys.argv = ['compensate', '--help']; from compensation.cli import app",
+}
+
+
+def loaded(code: str) -> set[str]:
+    """Which of the heavy libraries a new interpreter has loaded at the end of the code."""
+    tail = f"\nimport sys\nsys.stderr.write('loaded ' + ' '.join({{*{HEAVY}}} & {{*sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", code + tail], capture_output=True, text=True, check=True)
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("loaded")
+    return set(last.split()[1:])
+
+
+@pytest.mark.parametrize("command", sorted(WORK))
+def test_help_loads_no_heavy_library(command: str):
+    assert loaded(f"{WORK[command]}\ntry:\n    app()\nexcept SystemExit as end:\n    assert not end.code") == set()
+
+
+@pytest.mark.parametrize("module", ["foundation.clock", "recording", "markers", "compensation", "experiments", "stand"])
+def test_a_package_loads_no_heavy_library(module: str):
+    assert loaded(f"import {module}") == set()
+
+
+def test_a_heavy_library_would_be_found():
+    assert loaded("import markers.detection") >= {"numba", "cv2"}
