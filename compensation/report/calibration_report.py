@@ -6,7 +6,7 @@ from compensation.calibration.calibrate import Calibration
 from compensation.calibration.camera_file import CameraFile
 from compensation.report import calibration_figures as figures
 from compensation.report.figures import as_svg
-from compensation.report.page import facts, figure, heading, page, paragraph, table
+from compensation.report.page import Drawing, Facts, Heading, Paragraph, Table, page
 
 _FIGURES = (
     (
@@ -38,34 +38,34 @@ _FIGURES = (
 
 def report_page(file: CameraFile, calibration: Calibration) -> str:
     """The report as HTML text; the same data give the same text."""
-    drawn = [figure(as_svg(draw(calibration), name), caption) for draw, name, caption in _FIGURES]
+    drawn = [Drawing(as_svg(draw(calibration), name), caption) for draw, name, caption in _FIGURES]
     title = f"Calibration of camera {file.camera_serial}"
     parts = [
-        heading(title, 1),
-        paragraph(f"From {', '.join(file.session_ids)}, target {file.target_name}.", aside=True),
-        heading("Camera"),
+        Heading(title, 1),
+        Paragraph(f"From {', '.join(file.session_ids)}, target {file.target_name}.", aside=True),
+        Heading("Camera"),
         _camera(file),
         _facts(file),
-        heading("Held-out positions"),
+        Heading("Held-out positions"),
         _scores(file),
-        heading("Figures"),
+        Heading("Figures"),
         *drawn,
     ]
     return page(title, parts)
 
 
-def _camera(file: CameraFile) -> str:
+def _camera(file: CameraFile) -> Table:
     sigma = [file.covariance[index][index] ** 0.5 for index in range(len(file.vector))]
     rows = [
         [name, f"{value:.7g}", f"{uncertainty:.2g}"]
         for name, value, uncertainty in zip(file.names, file.vector, sigma, strict=True)
     ]
-    return table([file.model, "value", "standard uncertainty"], rows)
+    return Table([file.model, "value", "standard uncertainty"], rows)
 
 
-def _facts(file: CameraFile) -> str:
+def _facts(file: CameraFile) -> Facts:
     fit = file.fit
-    return facts(
+    return Facts(
         [
             ("Residual", f"{1e3 * fit.rms_px:.2f} mpx per coordinate, {fit.ratio:.3f} x the detection sigma"),
             ("Detection sigma", f"{1e3 * fit.detection_sigma_px:.2f} mpx per coordinate, mean of a position's frames"),
@@ -77,10 +77,10 @@ def _facts(file: CameraFile) -> str:
     )
 
 
-def _scores(file: CameraFile) -> str:
+def _scores(file: CameraFile) -> Table:
     rows = [
         [score.model, f"{1e3 * score.rms_px:.3f}", f"{1e3 * score.sigma_px:.3f}", str(score.positions)]
         for score in file.scores
     ]
     chosen = next((index for index, score in enumerate(file.scores) if score.model == file.model), None)
-    return table(["model", "RMS per coordinate (mpx)", "standard error (mpx)", "positions"], rows, chosen)
+    return Table(["model", "RMS per coordinate (mpx)", "standard error (mpx)", "positions"], rows, chosen)

@@ -12,7 +12,7 @@ from compensation.observations import Observations
 from compensation.report import fit_figures as figures
 from compensation.report.figures import as_svg
 from compensation.report.numbers import ModelNumbers, Numbers, ScoreNumbers
-from compensation.report.page import facts, figure, heading, paragraph, table
+from compensation.report.page import Drawing, Facts, Heading, Paragraph, Part, Table
 from compensation.report.path_figures import EXAGGERATION
 
 _FORMS = {
@@ -24,11 +24,11 @@ _COMMON = "homography x (1, T, T^2), "
 """Of every thermal form, said once."""
 
 
-def compensation_section(observations: Observations, evaluation: Evaluation, score: ScoreNumbers) -> Iterator[str]:
+def compensation_section(observations: Observations, evaluation: Evaluation, score: ScoreNumbers) -> Iterator[Part]:
     """Before and after."""
     method = score.method
-    yield heading("Before and after compensation")
-    yield figure(
+    yield Heading("Before and after compensation")
+    yield Drawing(
         as_svg(figures.compensated_paths(observations, evaluation), "compensated"),
         f"Drift of each marker, enlarged {EXAGGERATION} times, before and after compensation; {method}.",
     )
@@ -51,8 +51,8 @@ def compensation_section(observations: Observations, evaluation: Evaluation, sco
         ("temperature", figures.against_temperature, "RMS deviation at each chamber temperature"),
     )
     for name, draw, caption in of_evaluation:
-        yield figure(as_svg(draw(evaluation), name), f"{caption}; {method}.")
-    yield table(
+        yield Drawing(as_svg(draw(evaluation), name), f"{caption}; {method}.")
+    yield Table(
         ("chamber, °C", "camera, °C", "frames", "I before, px", "I after, mpx", "J before, px", "J after, mpx"),
         [
             (
@@ -69,12 +69,12 @@ def compensation_section(observations: Observations, evaluation: Evaluation, sco
     )
 
 
-def model_section(model: ModelNumbers) -> Iterator[str]:
+def model_section(model: ModelNumbers) -> Iterator[Part]:
     """The form in use, where it holds, and what else was tried."""
     low, high = model.camera_range_degC
     columns, rows = zip(*model.hull_px, strict=True)
-    yield heading("Model")
-    yield facts(
+    yield Heading("Model")
+    yield Facts(
         [
             ("Form", f"{model.form}: {_FORMS[model.form]}"),
             ("In use", model.title),
@@ -88,7 +88,7 @@ def model_section(model: ModelNumbers) -> Iterator[str]:
             ("Fitted by", f"thermostand {model.software_version}"),
         ]
     )
-    yield paragraph(
+    yield Paragraph(
         "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is "
         "the simplest of each form within one standard error of the best, or the one asked for; the thermal form takes "
         "the paper's place when it is better by more than one standard error. Every thermal form is a homography times "
@@ -96,10 +96,10 @@ def model_section(model: ModelNumbers) -> Iterator[str]:
         aside=True,
     )
     yield from _candidates(model)
-    yield paragraph(_why(model))
+    yield Paragraph(_why(model))
 
 
-def _candidates(model: ModelNumbers) -> Iterator[str]:
+def _candidates(model: ModelNumbers) -> Iterator[Part]:
     """All of the paper's form, and the best of the others; the one in use is bold."""
     paper = [one for one in model.candidates if one.form == "paper"]
     others = [one for one in model.candidates if one.form != "paper"]
@@ -107,9 +107,9 @@ def _candidates(model: ModelNumbers) -> Iterator[str]:
     rows = [*paper, *others[:_MOST_THERMAL]]
     chosen = next((index for index, one in enumerate(rows) if one.chosen), None)
     heads = ("candidate", "coefficients", "held-out RMS I, mpx", "J", "BIC")
-    yield table(heads, [_candidate(one) for one in rows], chosen=chosen)
+    yield Table(heads, [_candidate(one) for one in rows], chosen=chosen)
     if len(others) > _MOST_THERMAL:
-        yield paragraph(f"{len(others) - _MOST_THERMAL} more are in the file beside this page.", aside=True)
+        yield Paragraph(f"{len(others) - _MOST_THERMAL} more are in the file beside this page.", aside=True)
 
 
 def _why(model: ModelNumbers) -> str:
@@ -131,13 +131,13 @@ def _candidate(one: Candidate) -> tuple[str, ...]:
     return (name, str(one.terms), *rms, "" if one.bic is None else f"{one.bic:.0f}")
 
 
-def uncertainty_section(numbers: Numbers) -> Iterator[str]:
+def uncertainty_section(numbers: Numbers) -> Iterator[Part]:
     """Of a compensated centre, and whether the claim held."""
     model, score = numbers.model, numbers.score
     if model is None or score is None:
         return
-    yield heading("Uncertainty")
-    yield table(
+    yield Heading("Uncertainty")
+    yield Table(
         ("standard uncertainty, mpx", "I", "J"),
         [
             ("measured deviation of a centre (markers)", *_mpx(score.marker_sigma_px)),

@@ -6,20 +6,20 @@ import math
 from collections.abc import Iterator
 
 from compensation.report.numbers import Numbers, SessionNumbers, UnusableFrames
-from compensation.report.page import facts, heading, paragraph, table
+from compensation.report.page import Facts, Heading, Paragraph, Part, Table
 
 _LISTED_REASONS, _LISTED_FRAMES = 30, 8
 
 
-def data_section(numbers: Numbers) -> Iterator[str]:
+def data_section(numbers: Numbers) -> Iterator[Part]:
     """Sessions, flags, frames left out, versions."""
-    yield heading("Recorded data")
+    yield Heading("Recorded data")
     for session in numbers.sessions:
-        yield facts(_session(session, numbers))
+        yield Facts(_session(session, numbers))
     if numbers.unusable:
         yield from _unusable(numbers.unusable)
     made_by = ", ".join(f"{name} {version}" for name, version in numbers.versions.items())
-    yield paragraph(f"Made by {made_by}.", aside=True)
+    yield Paragraph(f"Made by {made_by}.", aside=True)
 
 
 def _session(session: SessionNumbers, numbers: Numbers) -> list[tuple[str, str]]:
@@ -57,12 +57,12 @@ def _markers(session: SessionNumbers, numbers: Numbers) -> str:
     return text + (f" ({listed})" if listed else "")
 
 
-def _unusable(unusable: tuple[UnusableFrames, ...]) -> Iterator[str]:
-    yield heading("Frames left out")
+def _unusable(unusable: tuple[UnusableFrames, ...]) -> Iterator[Part]:
+    yield Heading("Frames left out")
     rows = [(one.reason, one.session_id, str(len(one.frames)), _places(one.frames)) for one in unusable]
-    yield table(("reason", "session", "how many", "frames, from 0"), rows[:_LISTED_REASONS])
+    yield Table(("reason", "session", "how many", "frames, from 0"), rows[:_LISTED_REASONS])
     if len(rows) > _LISTED_REASONS:
-        yield paragraph(
+        yield Paragraph(
             f"and {len(rows) - _LISTED_REASONS} more reasons; all are in the file beside this page.", aside=True
         )
 

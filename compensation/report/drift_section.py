@@ -11,7 +11,7 @@ from compensation.observations import Observations, Role
 from compensation.report import drift_figures as figures
 from compensation.report.figures import as_svg
 from compensation.report.numbers import HysteresisNumbers, Numbers
-from compensation.report.page import figure, heading, paragraph, table
+from compensation.report.page import Drawing, Heading, Paragraph, Part, Table
 from compensation.report.path_figures import EXAGGERATION, Paths, trajectories
 from compensation.report.result_section import ours
 from compensation.report.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
@@ -21,14 +21,14 @@ _MOST_PANELS = 4
 _S_PER_MIN = 60.0
 
 
-def drift_section(observations: Observations, numbers: Numbers) -> Iterator[str]:
+def drift_section(observations: Observations, numbers: Numbers) -> Iterator[Part]:
     """Warm-up, cycle and the whole recording; what was not recorded has no figure."""
     if not np.isfinite(moved_px(observations)).any():
         return
     yield from _warm_ups(observations, numbers)
-    yield heading("Drift over temperature" if numbers.hysteresis_before else "Drift over time")
+    yield Heading("Drift over temperature" if numbers.hysteresis_before else "Drift over time")
     yield from _cycles(observations, numbers)
-    yield figure(as_svg(figures.against_time(observations), "time"), _time_caption(observations))
+    yield Drawing(as_svg(figures.against_time(observations), "time"), _time_caption(observations))
 
 
 def _time_caption(observations: Observations) -> str:
@@ -48,28 +48,28 @@ def _is_dense(observations: Observations) -> bool:
     return len(observations.frame) > figures.CURVE_POINTS
 
 
-def _warm_ups(observations: Observations, numbers: Numbers) -> Iterator[str]:
+def _warm_ups(observations: Observations, numbers: Numbers) -> Iterator[Part]:
     found = warm_ups(observations)
     if not found:
         return
-    yield heading("Warm-up")
+    yield Heading("Warm-up")
     shown = found[:_MOST_PANELS]
     titles = _titles(shown)
-    yield figure(
+    yield Drawing(
         as_svg(figures.warm_up_curves(observations, shown, titles), "warm-up-curves"),
         "Mean drift of the markers since the first frame while the camera warms itself, and its own temperature.",
     )
     panels = [_panel(observations, one.track, title) for one, title in zip(shown, titles, strict=True)]
-    yield figure(
+    yield Drawing(
         as_svg(trajectories(observations, panels), "warm-up-paths"),
         f"Drift of each marker from its first place (grey disc), enlarged {EXAGGERATION} times. Colour is the camera's "
         "own temperature.",
     )
     if len(found) > len(shown):
-        yield paragraph(f"Of {len(found)} warm-ups the first {len(shown)} are drawn.", aside=True)
+        yield Paragraph(f"Of {len(found)} warm-ups the first {len(shown)} are drawn.", aside=True)
     yield _warm_up_table(numbers, len(found) > 1)
     if numbers.model is not None:
-        yield paragraph(
+        yield Paragraph(
             "Left: RMS of what the model leaves of the deviations from the reference during the warm-up. The thermal "
             "form may have been fitted to these frames, the paper's form was not.",
             aside=True,
@@ -93,7 +93,7 @@ def _panel(observations: Observations, track: Track, title: str) -> Paths:
     return Paths(title, track.start_px, track.moved_px, observations.camera_degC[track.frames])
 
 
-def _warm_up_table(numbers: Numbers, several: bool) -> str:
+def _warm_up_table(numbers: Numbers, several: bool) -> Table:
     i, j = numbers.paper["warm_up_px"]
     rows: list[tuple[str, ...]] = [
         ("paper (measured), camera not modified", "", "", "", f"{i:.1f}", f"{j:.1f}", "", "")
@@ -115,10 +115,10 @@ def _warm_up_table(numbers: Numbers, several: bool) -> str:
                 *(_mpx(value) for value in one.left_px),
             )
         )
-    return table(("warm-up", "frames", "minutes", "camera, °C", "mean drift I, px", "J", "left I, mpx", "J"), rows)
+    return Table(("warm-up", "frames", "minutes", "camera, °C", "mean drift I, px", "J", "left I, mpx", "J"), rows)
 
 
-def _cycles(observations: Observations, numbers: Numbers) -> Iterator[str]:
+def _cycles(observations: Observations, numbers: Numbers) -> Iterator[Part]:
     several = len(observations.sessions) > 1
     before, after = (
         {one.session_id: one.gaps for one in found} for found in (numbers.hysteresis_before, numbers.hysteresis_after)
@@ -128,21 +128,21 @@ def _cycles(observations: Observations, numbers: Numbers) -> Iterator[str]:
         if track is None:
             continue
         of_session = f" Session {facts.session_id}." if several else ""
-        yield figure(
+        yield Drawing(
             as_svg(trajectories(observations, [_panel(observations, track, "")]), f"cycle-{index}"),
             f"Drift of each marker over the thermal cycle, enlarged {EXAGGERATION} times from its place at the "
             f"reference temperature (grey disc). Colour is the camera's own temperature.{of_session}",
         )
         own = visits(observations, track)
         name = facts.session_id
-        yield figure(
+        yield Drawing(
             as_svg(figures.branches(own, before[name], after.get(name, ())), f"branches-{index}"),
             "Above: mean drift at each set-point, reached by heating (filled) or by cooling (open). Below: what the "
             f"way there makes of it, with twice its standard uncertainty.{of_session}",
         )
     if any(one.gaps for one in numbers.hysteresis_before):
         yield _hysteresis_table(numbers, several)
-        yield paragraph(
+        yield Paragraph(
             "Heating minus cooling, of the mean over the markers, at set-points reached from both sides; lag and "
             "hysteresis both open the branches. Closure: last visit of the reference set-point minus the first. "
             "Repeatability: standard deviation of visits of the same set-point from the same side.",
@@ -150,7 +150,7 @@ def _cycles(observations: Observations, numbers: Numbers) -> Iterator[str]:
         )
 
 
-def _hysteresis_table(numbers: Numbers, several: bool) -> str:
+def _hysteresis_table(numbers: Numbers, several: bool) -> Table:
     heads = ("mpx", "range", "largest gap", "of the drift", "RMS gap", "area, mpx K", "closure", "repeatability")
     after = {one.session_id: one for one in numbers.hysteresis_after}
     rows: list[tuple[str, ...]] = []
@@ -164,7 +164,7 @@ def _hysteresis_table(numbers: Numbers, several: bool) -> str:
                 for when, one in both
                 if one is not None
             ]
-    return table(heads, rows)
+    return Table(heads, rows)
 
 
 def _hysteresis_cells(one: HysteresisNumbers, axis: int, whole_px: float) -> Iterator[str]:

@@ -1,69 +1,74 @@
-"""The few HTML parts a report is made of: a page that needs no other file, tables, figures. Texts are escaped here."""
+"""The parts a report is made of, and the page of them: one HTML file that needs no other (page.html.jinja).
+
+Sections say what is in a part; how it looks is in the template alone, which escapes every text.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
+from dataclasses import dataclass
+from functools import cache
 
-_CSS = """
-body {
-  font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
-  max-width: 56rem; margin: 2rem auto; padding: 0 1.2rem;
-}
-h1 { font-size: 1.6rem; line-height: 1.2; margin-bottom: .2rem }
-h2 { font-size: 1.15rem; margin-top: 2.2rem }
-p.aside { color: #555; margin-top: 0 }
-table { border-collapse: collapse; margin: .6rem 0 }
-th, td { padding: .2rem .9rem .2rem 0; text-align: right; font-variant-numeric: tabular-nums }
-th:first-child, td:first-child { text-align: left }
-td:not(:first-child) { white-space: nowrap }
-thead th { border-bottom: 1px solid #999 }
-table.facts td { text-align: left; vertical-align: top; white-space: normal }
-table.facts td:first-child { white-space: nowrap; color: #555 }
-tr.chosen td { font-weight: 600 }
-figure { margin: 1.2rem 0 }
-figure svg { width: 100%; height: auto; display: block }
-figcaption { color: #555; font-size: .92rem }
-"""
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 
-def page(title: str, parts: Sequence[str]) -> str:
-    """A whole HTML page of finished parts."""
-    body = "\n".join(parts)
-    return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
-        f'<meta name="viewport" content="width=device-width">\n<style>{_CSS}</style>\n</head>\n<body>\n{body}\n'
-        "</body>\n</html>\n"
-    )
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """A heading; 1 is the page's own."""
+
+    text: str
+    level: int = 2
 
 
-def heading(text: str, level: int = 2) -> str:
-    """A heading."""
-    return f"<h{level}>{escape(text)}</h{level}>"
-
-
-def paragraph(text: str, *, aside: bool = False) -> str:
+@dataclass(frozen=True, slots=True)
+class Paragraph:
     """A paragraph; an aside is grey."""
-    return f"<p{' class=aside' if aside else ''}>{escape(text)}</p>"
+
+    text: str
+    aside: bool = False
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]], chosen: int | None = None) -> str:
+@dataclass(frozen=True, slots=True)
+class Table:
     """A table of numbers, texts already formatted; row `chosen` is bold."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "\n".join(_row(row, index == chosen) for index, row in enumerate(rows))
-    return f"<table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    chosen: int | None = None
 
 
-def _row(cells: Sequence[str], chosen: bool) -> str:
-    return f"<tr{' class=chosen' if chosen else ''}>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
-
-
-def facts(rows: Sequence[tuple[str, str]]) -> str:
+@dataclass(frozen=True, slots=True)
+class Facts:
     """Names and what belongs to them, a line each."""
-    lines = (f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
-    return '<table class="facts">' + "\n".join(lines) + "</table>"
+
+    rows: Sequence[tuple[str, str]]
 
 
-def figure(svg: str, caption: str) -> str:
+@dataclass(frozen=True, slots=True)
+class Drawing:
     """An SVG element with its caption."""
-    return f"<figure>\n{svg}<figcaption>{escape(caption)}</figcaption>\n</figure>"
+
+    svg: str
+    caption: str
+
+
+Part = Heading | Paragraph | Table | Facts | Drawing
+
+
+def page(title: str, parts: Sequence[Part]) -> str:
+    """A whole HTML page."""
+    return _template().render(title=title, parts=[(type(part).__name__, part) for part in parts])
+
+
+@cache
+def _template() -> Template:
+    loader = PackageLoader("compensation", "report")
+    made = Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return made.get_template("page.html.jinja")

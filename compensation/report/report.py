@@ -19,7 +19,7 @@ from compensation.report.drift_section import drift_section
 from compensation.report.extras import Extras
 from compensation.report.gather import numbers_of
 from compensation.report.numbers import Numbers, as_json
-from compensation.report.page import heading, page, paragraph
+from compensation.report.page import Heading, Paragraph, Part, page
 from compensation.report.result_section import result_section
 from compensation.report.space_section import space_section
 from compensation.report.stand_section import stand_section
@@ -103,7 +103,7 @@ def report_page(
 def _page(observations: Observations, evaluation: Evaluation | None, numbers: Numbers, extras: Extras) -> str:
     subject = "Thermal drift" if numbers.model is None else "Thermal compensation"
     title = f"{subject} of camera {numbers.camera}"
-    parts = [heading(title, 1), paragraph(_lead(numbers), aside=True), *result_section(numbers, extras.validation)]
+    parts = [Heading(title, 1), Paragraph(_lead(numbers), aside=True), *result_section(numbers, extras.validation)]
     parts += drift_section(observations, numbers)
     parts += _compensation(observations, evaluation, numbers)
     parts += space_section(extras.positions, observations.target, extras.validation)
@@ -112,7 +112,7 @@ def _page(observations: Observations, evaluation: Evaluation | None, numbers: Nu
     return page(title, parts)
 
 
-def _compensation(observations: Observations, evaluation: Evaluation | None, numbers: Numbers) -> Iterator[str]:
+def _compensation(observations: Observations, evaluation: Evaluation | None, numbers: Numbers) -> Iterator[Part]:
     if evaluation is not None and numbers.score is not None:
         yield from compensation_section(observations, evaluation, numbers.score)
     if numbers.model is not None:

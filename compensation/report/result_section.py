@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from compensation.drift.evaluation import improvement_percent
 from compensation.report.numbers import Numbers, Pair, ScoreNumbers
-from compensation.report.page import heading, paragraph, table
+from compensation.report.page import Heading, Paragraph, Part, Table
 from compensation.report.validation_report import gains_table
 from compensation.validation3d.validation import Validation
 
@@ -17,22 +17,22 @@ PAPER = (
 _LEAST_COVERAGE = 0.9
 
 
-def result_section(numbers: Numbers, validation: Validation | None = None) -> Iterator[str]:
+def result_section(numbers: Numbers, validation: Validation | None = None) -> Iterator[Part]:
     """The table and what to know of it; without a model, that there is none."""
-    yield heading("Result")
+    yield Heading("Result")
     if numbers.score is None:
-        yield paragraph(
+        yield Paragraph(
             "These sessions have no frames over a thermal cycle that a model could be fitted to: this report shows the "
             "drift alone."
         )
     else:
         yield from _gain(numbers, numbers.score)
     if validation is not None:
-        yield paragraph(
+        yield Paragraph(
             "In space, the mean absolute deviation of the target from its place at the reference temperature:"
         )
         yield gains_table(validation, ours(numbers))
-    yield paragraph(PAPER, aside=True)
+    yield Paragraph(PAPER, aside=True)
 
 
 def ours(numbers: Numbers) -> str:
@@ -40,14 +40,14 @@ def ours(numbers: Numbers) -> str:
     return "this report (simulated)" if numbers.simulated else "this report"
 
 
-def _gain(numbers: Numbers, score: ScoreNumbers) -> Iterator[str]:
+def _gain(numbers: Numbers, score: ScoreNumbers) -> Iterator[Part]:
     heads = ("RMS deviation, px", "I before", "I after", "gain", "J before", "J after", "gain")
     paper = (numbers.paper["before_px"], numbers.paper["after_px"])
     rows = [
         ("paper (measured)", *_gains(*paper)),
         (ours(numbers), *_gains(score.before_px, score.after_px)),
     ]
-    yield table(heads, rows, chosen=1)
+    yield Table(heads, rows, chosen=1)
     i, j = score.coverage_95
     note = (
         f"{score.frames} frames; {score.method}. The deviation is the distance of a marker centre from its place at "
@@ -62,7 +62,7 @@ def _gain(numbers: Numbers, score: ScoreNumbers) -> Iterator[str]:
         )
     if score.outside:
         note += f" {score.outside:.1%} of the centres are outside the model's valid range."
-    yield paragraph(note)
+    yield Paragraph(note)
 
 
 def _gains(before: Pair, after: Pair) -> Iterator[str]:

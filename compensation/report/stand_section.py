@@ -7,22 +7,22 @@ from collections.abc import Iterator
 
 from compensation.budget.budget import Budget, Contribution
 from compensation.report.numbers import Numbers
-from compensation.report.page import heading, paragraph, table
+from compensation.report.page import Heading, Paragraph, Part, Table
 
 
-def stand_section(numbers: Numbers) -> Iterator[str]:
+def stand_section(numbers: Numbers) -> Iterator[Part]:
     """A table for each session whose budget was asked for."""
     if not numbers.budgets:
         return
-    yield heading("The stand's budget")
-    yield paragraph(
+    yield Heading("The stand's budget")
+    yield Paragraph(
         "What the stand itself does to the image, at its largest over the session's captures, with standard "
         "uncertainties; a line without one is a scatter. It is part of the drift above unless it was corrected."
     )
     for session_id, budget in numbers.budgets.items():
-        yield paragraph(f"{session_id}: {_state(budget)}", aside=True)
+        yield Paragraph(f"{session_id}: {_state(budget)}", aside=True)
         heads = ("contribution", "µm", "± µm", "mpx", "± mpx", "at", "correctable")
-        yield table(heads, [_line(one) for one in budget.contributions])
+        yield Table(heads, [_line(one) for one in budget.contributions])
 
 
 def _state(budget: Budget) -> str:

@@ -12,7 +12,7 @@ from compensation.drift.evaluation import improvement_percent
 from compensation.observations import Float
 from compensation.report import validation_figures as figures
 from compensation.report.figures import as_svg
-from compensation.report.page import facts, figure, heading, page, paragraph, table
+from compensation.report.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
 from compensation.validation3d.summary import flagged, reason_names
 from compensation.validation3d.validation import Validation
@@ -23,51 +23,52 @@ _HEADS = ("Temp.", "Pos.", *(f"{axis} {when}" for when in ("before", "after") fo
 def validation_page(validation: Validation) -> str:
     """The report as HTML text; the same validation gives the same text."""
     title = f"Validation of {validation.session_id} in three dimensions"
-    simulated = paragraph("The laboratory was simulated.", aside=True) if validation.simulated else ""
-    return page(title, [heading(title, 1), simulated, *validation_parts(validation)])
+    simulated = [Paragraph("The laboratory was simulated.", aside=True)] if validation.simulated else []
+    return page(title, [Heading(title, 1), *simulated, *validation_parts(validation)])
 
 
-def validation_parts(validation: Validation, level: int = 2) -> list[str]:
+def validation_parts(validation: Validation, level: int = 2) -> list[Part]:
     """What a page says of the validation, under headings of this level."""
     return [
-        heading("Result", level),
-        _means(validation),
-        paragraph(_method(validation)),
-        heading("Deviations by temperature", level),
-        figure(
+        Heading("Result", level),
+        gains_table(validation),
+        _uncertainties(validation),
+        Paragraph(_method(validation)),
+        Heading("Deviations by temperature", level),
+        Drawing(
             as_svg(figures.bars(validation), "bars"),
             "Mean absolute deviation of the positions at each temperature but the reference, before (blue) and after "
             "(orange) compensation, in the form of the paper's figure 15; dashed are the paper's means.",
         ),
         *_by_position(validation),
-        heading("Table in the form of the paper's Table 1", level),
-        table(_HEADS, list(_rows(validation))),
-        paragraph("Translation deviation, mm; Temp. is the camera's own temperature, °C. * outside the valid range."),
-        paragraph(flagged(validation) + "."),
-        heading("The paper's Table 1", level),
-        table(_HEADS, list(_paper_rows())),
-        heading("Rotation, table and uncertainty", level),
+        Heading("Table in the form of the paper's Table 1", level),
+        Table(_HEADS, list(_rows(validation))),
+        Paragraph("Translation deviation, mm; Temp. is the camera's own temperature, °C. * outside the valid range."),
+        Paragraph(flagged(validation) + "."),
+        Heading("The paper's Table 1", level),
+        Table(_HEADS, list(_paper_rows())),
+        Heading("Rotation, table and uncertainty", level),
         _other(validation),
-        facts(_facts(validation)),
+        Facts(_facts(validation)),
     ]
 
 
-def gains_table(validation: Validation, ours: str = "this session") -> str:
+def gains_table(validation: Validation, ours: str = "this session") -> Table:
     """Mean absolute deviations before and after, beside the paper's."""
     rows = [
         ["paper", *_gains([1e3 * mm for mm in BEFORE_mm], [1e3 * mm for mm in AFTER_mm])],
         [ours, *_gains(validation.before.mean_um.tolist(), validation.after.mean_um.tolist())],
     ]
     heads = [cell for axis in figures.AXES for cell in (f"{axis} before", "after", "gain")]
-    return table(["mean |deviation|, µm", *heads], rows, 1)
+    return Table(["mean |deviation|, µm", *heads], rows, 1)
 
 
-def _means(validation: Validation) -> str:
+def _uncertainties(validation: Validation) -> Table:
     uncertain = [
         [one.name, *(f"{value:.2f} ± {u:.2f}" for value, u in zip(one.mean_um, one.u_mean_um, strict=True))]
         for one in validation.variants
     ]
-    return gains_table(validation) + table(["with standard uncertainty, µm", *figures.AXES], uncertain)
+    return Table(["with standard uncertainty, µm", *figures.AXES], uncertain)
 
 
 def _gains(before_um: Sequence[float], after_um: Sequence[float]) -> Iterator[str]:
@@ -96,10 +97,10 @@ def _method(validation: Validation) -> str:
     )
 
 
-def _by_position(validation: Validation) -> Iterator[str]:
+def _by_position(validation: Validation) -> Iterator[Part]:
     for number, one in enumerate(variant for variant in (validation.after, validation.with_stand) if variant):
         drawn = as_svg(figures.by_position(validation, one), f"positions-{number}")
-        yield figure(drawn, f"Deviations {one.name}; lines are standard uncertainties.")
+        yield Drawing(drawn, f"Deviations {one.name}; lines are standard uncertainties.")
 
 
 def _rows(validation: Validation) -> Iterator[list[str]]:
@@ -128,7 +129,7 @@ def _degC(value: float) -> str:
     return f"{value:.2f}"
 
 
-def _other(validation: Validation) -> str:
+def _other(validation: Validation) -> Table:
     before, after = validation.before, validation.after
     lines = [
         ["mean |rotation| before, mrad", *_numbers(before.mean_rotation_mrad, 4)],
@@ -138,7 +139,7 @@ def _other(validation: Validation) -> str:
         ["u by the markers' noise, µm", *_numbers(np.nanmean(after.noise_um[1:], axis=(0, 1)), 2)],
         ["u by the drift model, µm", *_numbers(np.nanmean(after.model_um[1:], axis=(0, 1)), 2)],
     ]
-    return table(["", *figures.AXES], lines)
+    return Table(["", *figures.AXES], lines)
 
 
 def _numbers(values: Float, digits: int) -> list[str]:
