@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from dataclasses import replace
@@ -91,7 +92,7 @@ def warm_up_only(frames: int = 12, roles: tuple[str, ...] = ("warm_up",)) -> Obs
 
 
 def headings(page: str) -> list[str]:
-    return [text.replace("&#x27;", "'") for text in re.findall("<h2>(.*?)</h2>", page)]
+    return [html.unescape(text) for text in re.findall("<h2>(.*?)</h2>", page)]
 
 
 def test_it_needs_no_other_file(page: str):
