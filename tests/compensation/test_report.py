@@ -22,6 +22,7 @@ from compensation.report.compensation_section import uncertainty_section
 from compensation.report.extras import Extras
 from compensation.report.gather import numbers_of
 from compensation.report.numbers import Numbers, as_json
+from compensation.report.page import page as page_of
 from compensation.report.report import can_be_fitted, check_report_writable, report_page, write_report
 from compensation.report.result_section import result_section
 from foundation.errors import SessionError
@@ -181,14 +182,14 @@ def test_the_uncertainty_is_what_noise_and_model_make(numbers: Numbers):
     assert score is not None
     np.testing.assert_allclose(score.marker_sigma_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=1e-6)
     assert (np.array(score.claimed_sigma_px) >= score.marker_sigma_px).all()
-    assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in "".join(uncertainty_section(numbers))
+    assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in page_of("", list(uncertainty_section(numbers)))
 
 
 def test_an_interval_that_claims_too_much_is_told(numbers: Numbers):
     assert numbers.score is not None
     too_few = replace(numbers, score=replace(numbers.score, coverage_95=(0.96, 0.34)))
-    assert "thermal lag, hysteresis" not in "".join(result_section(numbers))
-    assert "thermal lag, hysteresis" in "".join(result_section(too_few))
+    assert "thermal lag, hysteresis" not in page_of("", list(result_section(numbers)))
+    assert "thermal lag, hysteresis" in page_of("", list(result_section(too_few)))
 
 
 def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):

@@ -12,6 +12,7 @@ import pytest
 
 from compensation.report.extras import Extras
 from compensation.report.gather import numbers_of
+from compensation.report.page import page as page_of
 from compensation.report.report import report_page
 from compensation.report.space_section import space_section
 from compensation.report.table_positions import TablePositions, table_positions
@@ -147,7 +148,7 @@ def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validat
 
 def test_a_target_that_never_moved_has_no_such_section():
     assert not list(space_section(TablePositions(), TARGET, None))
-    drawn = "".join(space_section(TablePositions(poses=PLACES), TARGET, None))
+    drawn = page_of("", list(space_section(TablePositions(poses=PLACES), TARGET, None)))
     assert drawn.count("<svg") == 1
     assert "Table 1" not in drawn
 
