@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,7 +16,6 @@ from markers.target import Target
 from recording.reading.session import Session
 
 _HOME_KINDS = ("home_residual", "home_residual_large")
-_HOME_TEXT = re.compile(r"(?P<axis>\S+): home was at (?P<residual>-?\d+(\.\d+)?(e-?\d+)?) (?P<unit>mm|deg)\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +29,8 @@ class Repeatability:
 
 def home_residuals(events: Sequence[Event], unit: str) -> Repeatability:
     """Where the axes that move in `unit` (mm or deg) found their homes, against where they expected them."""
-    matches = [_HOME_TEXT.match(event.text) for event in events if event.kind in _HOME_KINDS]
-    found = [float(match["residual"]) for match in matches if match is not None and match["unit"] == unit]
+    told = [event.data for event in events if event.kind in _HOME_KINDS and event.data.get("unit") == unit]
+    found = [float(residual) for data in told if isinstance(residual := data.get("residual"), int | float)]
     return Repeatability(_rms(np.array(found)), unit, len(found))
 
 

@@ -163,6 +163,7 @@ class Axis:
             now_ns,
             Quality.STALE if doubt else Quality.GOOD,
             doubt,
+            "alarm" if status.alarm else "",
         )
         return (
             position,

@@ -34,7 +34,7 @@ from foundation.readings import Reading
 from recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
 from recording.exporting.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format
 from recording.format import messages
-from recording.format.damage import naming
+from recording.format.damage import FileDamaged, naming
 from recording.format.images import decode_image
 from recording.format.png import SIGNATURE, encode_png
 from recording.format.records import Message, telemetry_messages
@@ -266,7 +266,7 @@ def _png(image: RecordedImage) -> bytes:
         try:
             data = CompressedImage.FromString(image.data).data
         except DecodeError as error:
-            raise SessionError(f"{image.path}: an image message cannot be read ({error})") from error
+            raise FileDamaged(f"{image.path}: an image message cannot be read ({error})") from error
         if data.startswith(SIGNATURE):
             return data
     with naming(image.path):

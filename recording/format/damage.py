@@ -26,9 +26,13 @@ DAMAGE = (
 )
 
 
+class FileDamaged(SessionError):
+    """A file of a session is damaged or not what it should be: a salvage recovers what is sound."""
+
+
 @contextmanager
 def reading(path: Path) -> Generator[None]:
-    """Whatever damage raises inside becomes a SessionError that names the file; one at once for a pipe or a device,
+    """Whatever damage raises inside becomes a FileDamaged that names the file; one at once for a pipe or a device,
     which nobody may ever write to."""
     if path.exists() and not path.is_file():
         raise SessionError(f"{path}: is no file; no session has a folder, a pipe or a device of that name")
@@ -36,13 +40,13 @@ def reading(path: Path) -> Generator[None]:
         yield
     except DAMAGE as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())
-        raise SessionError(f"{path}: damaged or not readable ({text})") from error
+        raise FileDamaged(f"{path}: damaged or not readable ({text})") from error
 
 
 @contextmanager
 def naming(path: Path) -> Generator[None]:
-    """A SessionError from inside gets the file's name in front."""
+    """A SessionError from inside becomes a FileDamaged, with the file's name in front."""
     try:
         yield
     except SessionError as error:
-        raise SessionError(f"{path}: {error}") from error
+        raise FileDamaged(f"{path}: {error}") from error

@@ -31,6 +31,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from foundation.errors import SessionError
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Cause, Frame, Quality, Reading
+from recording.format.old_sentences import data_of_sentence
 
 CAMERA_META = "/camera/meta"
 TABLE_POSE = "/table/pose"
@@ -197,7 +198,7 @@ CLASSES: Mapping[str, type[Message]] = {
     LOG: Log,
 }
 
-CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device"}
+CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "alarm"}
 LOG_LEVEL = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 
@@ -356,10 +357,12 @@ def encode_event(event: Event) -> bytes:
 
 
 def decode_event(data: bytes, time_ns: int) -> Event:
-    """The inverse of encode_event; SessionError when it is not one. Events recorded before there was data have none."""
+    """The inverse of encode_event; SessionError when it is not one. Events recorded before there was data get that of
+    their sentence."""
     message = _parse(EVENT, data)
-    fields = _json_object(_get(message, "data_json") or "{}", "event")
-    return Event(time_ns, _get(message, "level"), _get(message, "kind"), _get(message, "text"), fields)
+    kind, text = _get(message, "kind"), _get(message, "text")
+    fields = _json_object(_get(message, "data_json") or "{}", "event") or data_of_sentence(kind, text)
+    return Event(time_ns, _get(message, "level"), kind, text, fields)
 
 
 def encode_log(event: Event) -> bytes:

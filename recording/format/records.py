@@ -19,7 +19,7 @@ from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from foundation.errors import SessionError
-from recording.format.damage import reading
+from recording.format.damage import FileDamaged, reading
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
 from recording.format.layout import SALVAGE_METADATA, SEGMENT_METADATA, SESSION_METADATA, contradicts
 from recording.format.messages import CLASSES
@@ -106,11 +106,11 @@ def read_head(path: Path) -> Head:
 def _open(path: Path, file: BinaryIO) -> Summary:
     """The summary of a finished segment; the file is left behind the magic bytes at its begin."""
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise SessionError(f"{path}: not an MCAP file")
+        raise FileDamaged(f"{path}: not an MCAP file")
     size = path.stat().st_size
     file.seek(max(len(MCAP0_MAGIC), size - len(MCAP0_MAGIC)))
     if file.read() != MCAP0_MAGIC:
-        raise SessionError(f"{path}: ends in the middle")
+        raise FileDamaged(f"{path}: ends in the middle")
     summary = read_summary(file, size)
     file.seek(len(MCAP0_MAGIC))
     return summary

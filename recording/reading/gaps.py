@@ -10,9 +10,9 @@ some (its events `frames_dropped` say which), and where an image or its descript
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,8 @@ from recording.format.utc_offsets import UtcOffsets
 FRAMES_DROPPED = "frames_dropped"  # kind of the recorder's events
 SHORTEST_NS = 5 * NS_PER_S
 MEDIANS = 3
+_LAST_BLOCK = 2**62
 _RHYTHM = 3  # readings; with fewer there is no spacing to compare with
-# As recording/writing/losses.py says it: `block 3`, `blocks 12 to 14, 17`.
-_BLOCKS = re.compile(r"\bblocks? (\d+(?: to \d+)?(?:, \d+(?: to \d+)?)*)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +118,17 @@ def _names(hole: _Hole, channels: frozenset[str]) -> list[str]:
 
 
 def told_blocks(events: Iterable[Event]) -> list[range]:
-    """The block ids of frames that the recorder itself said it lost."""
-    texts = [event.text for event in events if event.kind == FRAMES_DROPPED]
-    runs = [run.split(" to ") for text in texts for found in _BLOCKS.findall(text) for run in found.split(", ")]
-    return [range(int(run[0]), int(run[-1]) + 1) for run in runs]
+    """The block ids of frames that the recorder itself said it lost: `blocks` of the events' data, pairs of the first
+    and the last. What is no such pair is left out: a session may be from anybody."""
+    told = [event.data.get("blocks") for event in events if event.kind == FRAMES_DROPPED]
+    pairs = [pair for blocks in told if isinstance(blocks, list) for pair in cast("list[object]", blocks)]
+    return [range(first, last + 1) for first, last in map(_pair, pairs) if 0 <= first <= last <= _LAST_BLOCK]
+
+
+def _pair(found: object) -> tuple[int, int]:
+    """Two whole numbers; (0, -1) when it is something else."""
+    match found:
+        case [int(first), int(last)]:
+            return first, last
+        case _:
+            return 0, -1

@@ -25,7 +25,7 @@ from foundation.items import Event, Item, StepMark
 from foundation.readings import Frame
 from recording.format import messages
 from recording.format.chain import Link, misplaced
-from recording.format.damage import naming
+from recording.format.damage import FileDamaged, naming
 from recording.format.holes import Hole, holes_in
 from recording.format.inventory import State, inventory
 from recording.format.items import (
@@ -295,10 +295,8 @@ class Session:
         for path in self._telemetry:
             self._check(path)
             for message in telemetry_messages(path, wanted):
-                try:
+                with naming(path):
                     item = decode(message)
-                except SessionError as error:
-                    raise SessionError(f"{path}: {error}") from error
                 yield item
 
     @cached_property
@@ -356,7 +354,7 @@ class Session:
         self._salvaged[segment] = bool(head.salvaged)
 
 
-class _Unreadable(SessionError):
+class _Unreadable(FileDamaged):
     """The head of a segment cannot be read."""
 
 

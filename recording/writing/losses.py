@@ -34,14 +34,21 @@ class Losses:
         """The capture was begun anew: what it lost before that instant is missing nowhere."""
         self._begins_ns[step_id] = time_ns
 
-    def take(self) -> list[str]:
-        """A sentence for each reason since the last time, which names every block."""
+    def take(self) -> list[Notice]:
+        """An event for each reason since the last time, which names every block: `blocks` in its data are pairs of the
+        first and the last."""
         reasons: dict[str, dict[str, list[int]]] = {}
         while self._new:
             reason, step_id, block_id = self._new.popleft()
             reasons.setdefault(reason, {}).setdefault(step_id, []).append(block_id)
             self._told += 1
-        return [f"frames lost: {_by_step(steps)}, {self._told} in all; {reason}" for reason, steps in reasons.items()]
+        return [self._notice(reason, steps) for reason, steps in reasons.items()]
+
+    def _notice(self, reason: str, steps: dict[str, list[int]]) -> Notice:
+        blocks = [run for blocks in steps.values() for run in runs(blocks)]
+        data = {"blocks": blocks, "steps": list(steps), "total": self._told, "reason": reason}
+        text = f"frames lost: {_by_step(steps)}, {self._told} in all; {reason}"
+        return Notice("error", "frames_dropped", text, data)
 
 
 class DroppedReadings:
@@ -78,14 +85,20 @@ def _by_step(steps: dict[str, list[int]]) -> str:
     return f"{count} ({' and '.join(places)})"
 
 
+def runs(blocks: Iterable[int]) -> list[list[int]]:
+    """The first and the last of each run of neighbours, in the order given."""
+    found: list[list[int]] = []
+    for block in blocks:
+        if found and block == found[-1][1] + 1:
+            found[-1][1] = block
+        else:
+            found.append([block, block])
+    return found
+
+
 def ranges(blocks: Iterable[int]) -> str:
     """`block 3`, `blocks 12 to 14, 17`: every block id in the order given, neighbours as a range."""
-    runs: list[tuple[int, int]] = []
-    for block in blocks:
-        if runs and block == runs[-1][1] + 1:
-            runs[-1] = (runs[-1][0], block)
-        else:
-            runs.append((block, block))
-    texts = [f"{first}" if first == last else f"{first} to {last}" for first, last in runs]
-    is_one = len(runs) == 1 and runs[0][0] == runs[0][1]
+    found = runs(blocks)
+    texts = [f"{first}" if first == last else f"{first} to {last}" for first, last in found]
+    is_one = len(found) == 1 and found[0][0] == found[0][1]
     return f"block{'' if is_one else 's'} {', '.join(texts)}"

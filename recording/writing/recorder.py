@@ -386,7 +386,7 @@ class Recorder:
         for series in (self._image_series, self._telemetry_series):
             while series.troubles:
                 self._notices.append(Notice("warning", "segment_given_up", series.troubles.popleft()))
-        self._notices.extend(Notice("error", "frames_dropped", text) for text in self._losses.take())
+        self._notices.extend(self._losses.take())
         while self._notices:
             notice = self._notices.popleft()
             self._hub.publish(Event(self._clock.now_ns(), notice.level, notice.kind, notice.text, notice.data))

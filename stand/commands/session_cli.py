@@ -27,8 +27,8 @@ from foundation.usage import OneLineUsage, one_line
 from recording.exporting.export import export
 from recording.exporting.replay import ReplayClock, replay, replay_and_record
 from recording.exporting.trim import trim
+from recording.format.damage import FileDamaged
 from recording.format.inventory import State, inventory
-from recording.format.layout import FRAMES, TELEMETRY
 from recording.reading.glance import Glance, glance
 from recording.reading.overview import overview
 from recording.reading.run_word import Files, Run
@@ -149,10 +149,8 @@ def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
         session = Session.open(directory)
         check_whole(session, _warn if incomplete else None)
         yield session
-    except SessionError as error:
-        if str(error).startswith((str(directory / TELEMETRY), str(directory / FRAMES))):
-            raise SessionError(f"{error}; {help_text} recovers what is sound") from error
-        raise
+    except FileDamaged as error:
+        raise SessionError(f"{error}; {help_text} recovers what is sound") from error
 
 
 def _warn(text: str) -> None:

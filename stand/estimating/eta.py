@@ -41,7 +41,7 @@ class Eta:
         self._seen_s = {work: deque([usual_s], _REMEMBERED) for work, usual_s in self._overhead_s.items()}
         self._running: PricedStep | None = None
         self._begun_ns = 0
-        self._reasons: set[str] = set()
+        self._reasons: set[object] = set()
         self._held_since_ns: int | None = None
         self._held_ns = 0  # of the running step
 
@@ -62,9 +62,9 @@ class Eta:
         """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further."""
         if event.kind == "held":
             self._held_since_ns = event.time_ns if self._held_since_ns is None else self._held_since_ns
-            self._reasons.add(event.text)
+            self._reasons.add(event.data.get("reason"))
         elif event.kind == "released":
-            self._reasons.discard(event.text)
+            self._reasons.discard(event.data.get("reason"))
             if self._held_since_ns is not None and not self._reasons:
                 self._held_ns += event.time_ns - self._held_since_ns
                 self._held_since_ns = None

@@ -12,7 +12,6 @@ from foundation.readings import Quality
 from stand.fault import Action, Fault, Readings, value_of
 
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
-_AXIS_ALARM = "controller alarm"  # how drivers.devices.stage begins the reason of a position in an alarm
 
 
 Rule = Callable[[Readings, int], Fault | None]
@@ -150,7 +149,7 @@ def stage_alarm(position: str) -> Rule:
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         reading = readings.known(position)
-        if reading is not None and reading.reason.startswith(_AXIS_ALARM):
+        if reading is not None and reading.cause == "alarm":
             return Fault("stage_alarm", f"{position}: {reading.reason}")
         return None
 

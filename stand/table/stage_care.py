@@ -35,18 +35,19 @@ async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HO
     if not await axis.homed():
         await axis.home()
         text = f"{axis.name} had lost its scale and was homed; captures since its last home are suspect"
-        hub.publish(Event(clock.now_ns(), "warning", "homed", text))
+        hub.publish(Event(clock.now_ns(), "warning", "homed", text, {"axis": axis.name}))
         return float("nan")
     if profile.home_from is not None:
         await axis.move_to(profile.home_from)
     residual = await axis.home()
     steps = residual / profile.unit_per_step
     text = f"{axis.name}: home was at {residual:.5f} {profile.unit} ({steps:.2f} steps)"
+    data = {"axis": axis.name, "residual": round(residual, 5), "unit": profile.unit, "steps": round(steps, 2)}
     if abs(steps) > limit_steps:
         text += f", more than {limit_steps:g} steps; captures since its last good home are suspect"
-        hub.publish(Event(clock.now_ns(), "warning", "home_residual_large", text))
+        hub.publish(Event(clock.now_ns(), "warning", "home_residual_large", text, data))
     else:
-        hub.publish(Event(clock.now_ns(), "info", "home_residual", text))
+        hub.publish(Event(clock.now_ns(), "info", "home_residual", text, data))
     return residual
 
 
@@ -67,4 +68,5 @@ async def ready(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: H
             reason = f"stands at {reading.value:.4f} {reading.unit}"
         await approach(axis, position)
         text = f"{name}: {reason}; approached {position:g} {reading.unit} again"
-        hub.publish(Event(clock.now_ns(), "info", "re-approached", text))
+        data = {"axis": name, "position": position, "unit": reading.unit, "reason": reason}
+        hub.publish(Event(clock.now_ns(), "info", "re-approached", text, data))

@@ -139,13 +139,13 @@ def test_a_wrong_geometry_gets_a_sentence(line: str, message: str, tmp_path: Pat
 
 
 def test_home_checks_are_read_from_the_recorded_events():
-    texts = [
-        ("home_residual", "linear: home was at 0.00300 mm (0.24 steps)"),
-        ("home_residual_large", "linear: home was at -0.00400 mm (-3.20 steps)"),
-        ("home_residual", "rotary: home was at 0.00500 deg (0.50 steps)"),
-        ("homed", "linear: homed"),
+    found = [
+        ("home_residual", {"axis": "linear", "residual": 0.003, "unit": "mm"}),
+        ("home_residual_large", {"axis": "linear", "residual": -0.004, "unit": "mm"}),
+        ("home_residual", {"axis": "rotary", "residual": 0.005, "unit": "deg"}),
+        ("homed", {"axis": "linear"}),
     ]
-    events = [Event(0, "info", kind, text) for kind, text in texts]
+    events = [Event(0, "info", kind, "as its data say", data) for kind, data in found]
     linear, rotary = home_residuals(events, "mm"), home_residuals(events, "deg")
     assert (linear.count, rotary.count) == (2, 1)
     assert linear.rms == pytest.approx(math.sqrt((9 + 16) / 2) * 1e-3)

@@ -1,7 +1,6 @@
 """A recording on a disk of 64 MB: what was acknowledged is readable, what was not is told, and telemetry goes on."""
 
 import asyncio
-import re
 from contextlib import suppress
 
 import numpy as np
@@ -14,6 +13,7 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.readings import Frame
 from recording.format.images import decode_image
+from recording.reading.gaps import told_blocks
 from recording.reading.session import Session
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import tmpfs
@@ -82,11 +82,10 @@ def readable_blocks(directory):
             yield message.sequence
 
 
-def lost_blocks(texts):
+def lost_blocks(night):
     """The block ids that the events name."""
-    for text in texts:
-        for first, last in re.findall(r"(\d+)(?: to (\d+))?", re.search(r"blocks? ([\d, to]+) of step", text)[1]):
-            yield from range(int(first), int(last or first) + 1)
+    for blocks in told_blocks(night.events):
+        yield from blocks
 
 
 async def test_a_full_disk_loses_no_frame_it_has_acknowledged_and_no_telemetry(disk):
@@ -107,7 +106,7 @@ async def test_a_full_disk_loses_no_frame_it_has_acknowledged_and_no_telemetry(d
     assert [path.name for path in session.incomplete] == [f"{full.frames // 8:04d}.mcap.part"]
     assert len(session.events()) == len(night.events)
     assert night.told("note") == [f"second {k}" for k in range(85)]
-    assert list(lost_blocks(night.told("frames_dropped"))) == list(range(full.frames, 80))
+    assert list(lost_blocks(night)) == list(range(full.frames, 80))
     assert all("No space left on device" in text for text in night.told("frames_dropped"))
     assert night.told("telemetry_not_saved") == []
     assert night.recorder.frames_lost == 80 - full.frames
@@ -135,7 +134,7 @@ async def test_frames_leave_the_end_of_the_disk_to_the_telemetry_and_come_back(d
     ):
         (told,) = night.told(kind)
         assert told.endswith(text)
-    lost = list(lost_blocks(night.told("frames_dropped")))
+    lost = list(lost_blocks(night))
     assert len(lost) == night.recorder.frames_lost == 45 - night.recorder.saved.frames
     assert lost == list(range(lost[0], lost[-1] + 1))
     assert all(text.endswith("less than 0.0 GB free on the disk") for text in night.told("frames_dropped"))

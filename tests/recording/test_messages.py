@@ -130,7 +130,7 @@ def test_a_step_survives_the_round_trip(parameters, state):
 
 @given(st.text(), st.sampled_from(["info", "warning", "error"]))
 def test_an_event_survives_the_round_trip(text, level):
-    event = Event(TIME_NS, level, "frames_dropped", text)
+    event = Event(TIME_NS, level, "device_lost", text)
     assert messages.decode_event(messages.encode_event(event), TIME_NS) == event
 
 

@@ -423,9 +423,9 @@ def test_losses_are_told_by_reason_and_step():
     for block_id, step_id, reason in [(1, "a", "slow"), (2, "a", "slow"), (4, "b", "slow"), (5, "", "full")]:
         losses.count(replace(frame(START_NS, block_id), step_id=step_id), reason)
     assert losses.total == 4
-    assert losses.take() == [
-        "frames lost: 3 (blocks 1 to 2 of step a and block 4 of step b), 4 in all; slow",
-        "frames lost: 1 (block 5), 4 in all; full",
-    ]
+    slow, full = losses.take()
+    assert slow.text == "frames lost: 3 (blocks 1 to 2 of step a and block 4 of step b), 4 in all; slow"
+    assert slow.data == {"blocks": [[1, 2], [4, 4]], "steps": ["a", "b"], "total": 4, "reason": "slow"}
+    assert full.text == "frames lost: 1 (block 5), 4 in all; full"
     assert losses.take() == []
     assert losses.total == 4

@@ -243,11 +243,11 @@ def test_within_a_step_the_time_left_falls_with_the_clock_but_not_in_a_pause(con
     assert eta.left_s(BEGIN_NS) == 900.0
     eta.mark(marks(plan, [600.0, 300.0])[0])
     assert eta.left_s(BEGIN_NS + 100 * NS_PER_S) == 800.0
-    eta.event(Event(BEGIN_NS + 200 * NS_PER_S, "warning", "held", "operator"))
-    eta.event(Event(BEGIN_NS + 300 * NS_PER_S, "warning", "held", "disk_low"))
-    eta.event(Event(BEGIN_NS + 400 * NS_PER_S, "info", "released", "operator"))
+    eta.event(Event(BEGIN_NS + 200 * NS_PER_S, "warning", "held", "operator", {"reason": "operator"}))
+    eta.event(Event(BEGIN_NS + 300 * NS_PER_S, "warning", "held", "disk_low", {"reason": "disk_low"}))
+    eta.event(Event(BEGIN_NS + 400 * NS_PER_S, "info", "released", "operator", {"reason": "operator"}))
     assert eta.left_s(BEGIN_NS + 5000 * NS_PER_S) == 700.0
-    eta.event(Event(BEGIN_NS + 5000 * NS_PER_S, "info", "released", "disk_low"))
+    eta.event(Event(BEGIN_NS + 5000 * NS_PER_S, "info", "released", "disk_low", {"reason": "disk_low"}))
     assert eta.left_s(BEGIN_NS + 5100 * NS_PER_S) == 600.0
     assert eta.left_s(BEGIN_NS + 9000 * NS_PER_S) == 300.0  # late: it may end any moment
 

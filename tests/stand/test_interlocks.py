@@ -187,16 +187,17 @@ def test_regulator_and_permit_belong_together(running: float, permit: float, obj
 
 
 @pytest.mark.parametrize(
-    ("reason", "trips"),
+    ("reason", "cause", "trips"),
     [
-        ("", False),
-        ("not homed", False),
-        ("motor off, the rotor may have moved by up to a step", False),
-        ("controller alarm, flags 0x00000040", True),
+        ("", "", False),
+        ("not homed", "", False),
+        ("motor off, the rotor may have moved by up to a step", "", False),
+        ("controller alarm, flags 0x00000040", "alarm", True),
+        ("in an alarm, by other words", "alarm", True),
     ],
 )
-def test_only_an_alarm_of_a_stage_is_one(reason: str, trips: bool):
-    position = Reading("linear.position", 1.0, "mm", 0, STALE if reason else Quality.GOOD, reason)
+def test_only_an_alarm_of_a_stage_is_one(reason: str, cause: Cause, trips: bool):
+    position = Reading("linear.position", 1.0, "mm", 0, STALE if reason else Quality.GOOD, reason, cause)
     assert (rule_of(stage_alarm("linear.position")(hub_of(position), 0)) == "stage_alarm") is trips
 
 
