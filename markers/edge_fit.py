@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,11 +88,18 @@ def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float) -> Edg
         np.empty(count, np.uint8),
     )
     _fit_all(
-        np.ascontiguousarray(image), parameters, start.scale_px, np.asarray(reach, np.float64),
+        only_read(image), parameters, start.scale_px, np.asarray(reach, np.float64),
         (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
         covariance, quality, flags,
     )  # fmt: skip
     return EdgeFit(EdgeState(parameters, start.scale_px), covariance, quality[:, 0], quality[:, 1], flags)
+
+
+def only_read(image: Image) -> Image:
+    """The same pixels, not to be written: one type for the compiler, whether or not the caller may write them."""
+    view = cast(Image, np.ascontiguousarray(image).view())
+    view.flags.writeable = False
+    return view
 
 
 def room(image: Image, start: EdgeState) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 
 from markers import edge_model, newton, pixels, sectors
 from markers.compiled import compiled, digest, entry
-from markers.edge_fit import room
+from markers.edge_fit import only_read, room
 from markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
 from markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
 from markers.noise import Image, Noise, full_scale_DN
@@ -50,7 +50,7 @@ def refit_edges(image: Image, start: EdgeState, spread: Float, noise: Noise, rea
     parameters = np.ascontiguousarray(start.parameters).copy()
     covariance, chi = np.empty((count, 2, 2)), np.empty(count)
     _refit_all(
-        np.ascontiguousarray(image), parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
+        only_read(image), parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
         (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
         _GREATEST_MISFIT * max(patience, 1.0), covariance, chi,
     )  # fmt: skip

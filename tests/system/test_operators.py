@@ -1,7 +1,6 @@
 """Operators who press everything at any time, several at once, over the control socket of a real run."""
 
 import asyncio
-import os
 import random
 from collections.abc import Callable
 from contextlib import suppress
@@ -31,24 +30,33 @@ def _aravis() -> None:
     require_aravis()
 
 
-async def press(out: Path, run: asyncio.Task[Path], seed: int) -> list[object]:
+async def press(out: Path, run: asyncio.Task[Path], seed: int, news: asyncio.Event) -> list[object]:
     """Any request, from before the run is there on; what came back. Nobody leaves a pause behind."""
     rng, answers = random.Random(seed), list[object]()
     while not run.done() and len(answers) < 150:
+        waiting = asyncio.create_task(news.wait())
+        await asyncio.wait([run, waiting], return_when=asyncio.FIRST_COMPLETED)
+        waiting.cancel()
+        news.clear()
         for directory in out.glob("*/"):
             for do in (rng.choice(["pause", "pause", "clear", "status"]), "status", "continue"):
                 try:
                     answers.append(await asyncio.to_thread(ask, directory, {"do": do}))
                 except SessionError as error:
                     answers.append(str(error))
-        await asyncio.to_thread(os.getpid)  # virtual time stands still as long as somebody has something to do
     return answers
 
 
 async def test_a_night_with_two_restless_operators_is_whole(tmp_path: Path, order: Callable[..., Order]):
     ordered, out = order(NIGHT), tmp_path / "out"
-    run = asyncio.create_task(run_virtual(ordered, out, None, lambda hub: None))
-    answers = await asyncio.gather(press(out, run, 1), press(out, run, 2))
+    news = asyncio.Event(), asyncio.Event()  # virtual time stands still as long as somebody has something to do
+
+    def watch(hub: Hub) -> None:
+        for heard in news:
+            hub.subscribe(lambda item, heard=heard: heard.set())
+
+    run = asyncio.create_task(run_virtual(ordered, out, None, watch))
+    answers = await asyncio.gather(*(press(out, run, seed, heard) for seed, heard in enumerate(news, 1)))
     directory = await run
     check(directory, ordered, [])
     check_soaks(directory, ordered)
