@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
-from compensation.calibration.rotation import matrices, nearest, vector
 from compensation.calibration.stages import Table
 
 _LEAST_TURN_DEG = 5.0
@@ -26,9 +26,9 @@ def table_from_poses(
             f"{_LEAST_TRAVEL_MM:g} mm and {_LEAST_TURN_DEG:g} deg are needed"
         )
     rotary = _axis(rotary_deg, rotations)
-    turns = matrices(np.radians(rotary_deg)[:, None] * rotary)
-    mount = nearest(np.einsum("pji,pjk->ik", turns, rotations))
-    base_mm, linear, offset_mm = _places(linear_mm, turns, translations_mm)
+    turns = Rotation.from_rotvec(rotary_deg[:, None] * rotary, degrees=True)
+    mount = (turns.inv() * Rotation.from_matrix(rotations)).mean().as_matrix()
+    base_mm, linear, offset_mm = _places(linear_mm, turns.as_matrix(), translations_mm)
     # What of o is along the axis is for the wobble to act on, and otherwise the same as a shift of the base.
     along = rotary * (rotary @ (offset_mm + mount @ middle_mm))
     return Table(base_mm + along, linear, rotary, mount, offset_mm - along)
@@ -36,10 +36,7 @@ def table_from_poses(
 
 def _axis(rotary_deg: Float, rotations: Float) -> Float:
     """Unit vector about which the target turns with rising angle: sum of all turns from the first position."""
-    angles = rotary_deg - rotary_deg[0]
-    total = np.zeros(3)
-    for angle, rotation in zip(angles, rotations, strict=True):
-        total += angle * vector(rotation @ rotations[0].T)
+    total = (rotary_deg - rotary_deg[0]) @ Rotation.from_matrix(rotations @ rotations[0].T).as_rotvec()
     return total / np.linalg.norm(total)
 
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.rotation import matrices
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
@@ -51,5 +51,5 @@ def calibrate_opencv(
         raise CalibrationError("OpenCV finds no camera: its fit does not converge")
     frame = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
     lens = Pinhole(np.concatenate([frame, np.ravel(distortion)[: 8 if rational else 5]]), image_size)
-    rotations = matrices(np.array(turns, np.float64).reshape(-1, 3))
+    rotations = Rotation.from_rotvec(np.array(turns, np.float64).reshape(-1, 3)).as_matrix()
     return OpencvCalibration(lens, rotations, np.array(shifts, np.float64).reshape(-1, 3), float(rms))

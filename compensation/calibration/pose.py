@@ -11,12 +11,13 @@ from typing import Protocol
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from compensation.calibration.board import Board
 from compensation.calibration.eccentricity import shifts_by_camera
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float, minimise, whiteners
-from compensation.calibration.rotation import crosses, matrices
+from compensation.calibration.rotation import crosses
 
 _LEAST_MARKERS = 4
 
@@ -118,7 +119,9 @@ def _refined(
         return (whitener @ slopes @ moves).reshape(-1, 6)
 
     def stepped(placed: _Placed, change: Float) -> _Placed:
-        return _Placed(matrices(change[:3]) @ placed.rotation, placed.translation_mm + change[3:])
+        return _Placed(
+            Rotation.from_rotvec(change[:3]).as_matrix() @ placed.rotation, placed.translation_mm + change[3:]
+        )
 
     solution = minimise(start, residuals, jacobian, stepped)
     off = lens.misfit(_seen_points(solution.state, points_mm), pixels)
@@ -138,4 +141,5 @@ def _start(lens: Lens, points_mm: Float, pixels: Float) -> _Placed:
     found, turns, shifts, _ = cv2.solvePnPGeneric(plane, slopes, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
     if not found:
         raise CalibrationError("the markers give no pose")
-    return _Placed(matrices(np.ravel(turns[0]).astype(np.float64)), np.ravel(shifts[0]).astype(np.float64))
+    rotation = Rotation.from_rotvec(np.ravel(turns[0])).as_matrix()
+    return _Placed(rotation, np.ravel(shifts[0]).astype(np.float64))

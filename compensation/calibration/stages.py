@@ -14,9 +14,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from compensation.calibration.least_squares import Float
-from compensation.calibration.rotation import across, crosses, matrices
+from compensation.calibration.rotation import across, crosses
 
 PARAMETERS = 12
 """Of a table's step: c (3), l (2), a (2), R0 (3), o (2)."""
@@ -58,13 +59,13 @@ class Table:
     def poses(self, linear_mm: Float, rotary_deg: Float, errors: Float) -> tuple[Float, Float]:
         """Rotation matrices (P, 3, 3) and translations (P, 3), mm, from target to camera; errors (P, 6)."""
         along, about = _frame(self.linear), _frame(self.rotary)
-        turn = matrices(errors[:, 3:] @ about.T) @ self.turns(rotary_deg)
+        turn = Rotation.from_rotvec(errors[:, 3:] @ about.T).as_matrix() @ self.turns(rotary_deg)
         base = self.base_mm + linear_mm[:, None] * self.linear + errors[:, :3] @ along.T
         return turn @ self.mount, base + turn @ self.offset_mm
 
     def turns(self, rotary_deg: Float) -> Float:
         """Rotation matrices (P, 3, 3) about the rotary axis."""
-        return matrices(np.radians(rotary_deg)[:, None] * self.rotary)
+        return Rotation.from_rotvec(rotary_deg[:, None] * self.rotary, degrees=True).as_matrix()
 
     def jacobian(
         self, points_mm: Float, linear_mm: Float, rotary_deg: Float, errors: Float
@@ -74,7 +75,7 @@ class Table:
         With respect to a step of the table (M, 3, 12), to d and w (M, 3, 6), and to the target points (M, 3, 3). Terms
         of second order in w are left out.
         """
-        turn = matrices(errors[:, 3:] @ _frame(self.rotary).T) @ self.turns(rotary_deg)
+        turn = Rotation.from_rotvec(errors[:, 3:] @ _frame(self.rotary).T).as_matrix() @ self.turns(rotary_deg)
         mounted = points_mm @ self.mount.T
         arm = mounted + self.offset_mm
         sideways = across(self.rotary)
@@ -110,8 +111,8 @@ class Table:
             self,
             base_mm=self.base_mm + change[:3],
             linear=linear / np.linalg.norm(linear),
-            rotary=matrices(sideways @ change[5:7]) @ self.rotary,
-            mount=matrices(change[7:10]) @ self.mount,
+            rotary=Rotation.from_rotvec(sideways @ change[5:7]).apply(self.rotary),
+            mount=Rotation.from_rotvec(change[7:10]).as_matrix() @ self.mount,
             offset_mm=self.offset_mm + sideways @ change[10:12],
         )
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.least_squares import Float
-from compensation.calibration.rotation import nearest
 from compensation.calibration.stages import ERRORS, PARAMETERS
 
 
@@ -109,5 +109,5 @@ def _between(first: Adjustment, second: Adjustment) -> tuple[Float, Float]:
 def _rigid(source: Float, destination: Float) -> tuple[Float, Float]:
     """Rotation and translation of least squares between two clouds (K, 3), by Kabsch."""
     from_mean, to_mean = source.mean(axis=0), destination.mean(axis=0)
-    turn = nearest((destination - to_mean).T @ (source - from_mean))
+    turn = Rotation.align_vectors(destination - to_mean, source - from_mean)[0].as_matrix()
     return turn, to_mean - turn @ from_mean

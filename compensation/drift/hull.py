@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from compensation.history.lags import Float
 
@@ -14,22 +15,13 @@ _LEAST_WIDTH_PX = 5.0
 
 
 def convex_hull(points: Float) -> Float:
-    """The corners (H, 2) of points (M, 2), in the sense that turns x towards y (Andrew's monotone chain)."""
-    ordered = np.unique(points, axis=0).tolist()
-    halves = [_half_hull(ordered), _half_hull(ordered[::-1])]
-    return np.array(halves[0][:-1] + halves[1][:-1])
-
-
-def _half_hull(ordered: list[list[float]]) -> list[list[float]]:
-    chain: list[list[float]] = []
-    for x, y in ordered:
-        while len(chain) > 1:
-            (x0, y0), (x1, y1) = chain[-2:]
-            if (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > 0:
-                break
-            chain.pop()
-        chain.append([x, y])
-    return chain
+    """The corners (H, 2) of points (M, 2), in the sense that turns x towards y, from the leftmost on; points that span
+    no area are their own corners."""
+    try:
+        corners = points[ConvexHull(points).vertices]
+    except QhullError:
+        return np.unique(points, axis=0)
+    return np.roll(corners, -int(np.lexsort(corners.T[::-1])[0]), axis=0)
 
 
 def is_area(hull_px: Float) -> bool:

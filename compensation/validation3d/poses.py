@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from compensation.calibration.averages import MeanCentres
 from compensation.calibration.board import Board
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pose import Lens, Pose, find_pose
-from compensation.calibration.rotation import crosses, vector
+from compensation.calibration.rotation import crosses
 
 _CORRELATED = 1 / 2
 """Of the image's width: over this distance errors of a drift model are taken to be alike."""
@@ -67,7 +68,7 @@ def middle_mm(board: Board) -> Float:
 
 def rotation_mrad(found: Found, reference: Found) -> Float:
     """The rotation vector (3,) from the reference's orientation, about the camera's axes."""
-    return 1e3 * vector(found.rotation @ reference.rotation.T)
+    return 1e3 * Rotation.from_matrix(found.rotation @ reference.rotation.T).as_rotvec()
 
 
 def _about(pose: Pose, point_mm: Float) -> Float:
