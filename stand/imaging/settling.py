@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiments.steps import SoakUntilSettled
 from foundation.clock import NS_PER_S
-from markers.detection import Detection
 from stand.estimating.thermal_model import BAND_K
+
+if TYPE_CHECKING:
+    from markers.detection import Detection
 
 Float = NDArray[np.float64]
 

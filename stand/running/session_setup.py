@@ -14,7 +14,6 @@ from pathlib import Path
 from foundation.clock import NS_PER_S, Clock, VirtualClock
 from foundation.documents import parse_document
 from markers.target import Target
-from markers.windows import marker_windows
 from recording.format.roi import RoiEncoder
 from recording.writing.disk import Disk
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
@@ -100,6 +99,8 @@ def _partial_frames(order: Order) -> RoiEncoder | None:
     if recording.frame_encoding != "roi":
         return None
     target = parse_document(order.target_text, Target, order.config.target)
+    from markers.windows import marker_windows  # scipy takes half a second that other runs need not wait for
+
     return RoiEncoder(partial(marker_windows, target=target), recording.whole_every_s)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,11 +14,13 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.lane import Lane
 from foundation.readings import Frame, Reading
-from markers.detection import Detection, DetectionError, detect
 from markers.target import Target
 from stand.estimating.thermal_model import BAND_K
 from stand.imaging.settling import Float, Seen, digit_K, judge, movement, seconds
 from stand.stand import Stand
+
+if TYPE_CHECKING:
+    from markers.detection import Detection
 
 CHAMBER, CAMERA = "regulator.pv", "camera.temperature"
 _UNKNOWN_S = 60.0
@@ -87,6 +90,8 @@ class SettlingWatch:
 
     def _find(self, frame: Frame) -> None:
         """In the lane: the markers, and how far they have moved since the look before."""
+        from markers.detection import DetectionError, detect  # numba and scipy take a second that few runs need
+
         try:
             found = detect(frame.image, self._target, self._before)
         except DetectionError as error:
