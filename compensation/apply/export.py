@@ -23,7 +23,7 @@ def export(model: DriftModel, folder: Path) -> tuple[Path, Path]:
     """
     make_folder(folder)
     written = folder / MODEL_NAME, folder / MODULE_NAME
-    module = importlib.resources.files("compensation.apply") / MODULE_NAME
+    module = importlib.resources.files("compensation") / MODULE_NAME
     write_whole(written[0], json.dumps(runtime_model(model), indent=1, allow_nan=False) + "\n")
     write_whole(written[1], module.read_text(encoding="utf-8"))
     return written

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from compensation.apply.spline import Image
 from compensation.apply.warp import warp
 from compensation.drift.drift_model import DriftModel
-from compensation.history.lags import Float
-from compensation.history.states import States
+from compensation.history.states import Float, States
 from foundation.errors import SessionError
 from foundation.files import write_whole_bytes
 

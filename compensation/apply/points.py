@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from compensation.drift.drift_model import DriftModel, Outside
-from compensation.history.lags import Float
-from compensation.history.states import States
+from compensation.history.states import Float, States
 from foundation.errors import ConfigError, SessionError
 from foundation.files import whole_file
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from compensation.drift.displacements import Displacements
-from compensation.history.lags import Float
+from compensation.history.states import Float
 from foundation.documents import Document
 
 Pair = tuple[float, float]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from compensation.drift.candidates import Candidate, Pair
 from compensation.drift.facts import ModelFacts
 from compensation.drift.hull import MARGIN_PX, distances_px
-from compensation.history.lags import Float
-from compensation.history.states import Memory, States
+from compensation.history.states import Float, Memory, States
 
 Flags = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -35,7 +34,7 @@ class Outside(IntFlag):
 
 class DriftModel(Protocol):
     """Maps measured positions of one camera to those at the reference temperature; made by choosing.fit, saved and
-    loaded by model_file. `memory` is what has to be remembered: history.states_at and states.ThermalState take it."""
+    loaded by model_file. `memory` is what has to be remembered: history.states_at and states.state_of take it."""
 
     @property
     def form(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from compensation.drift.candidates import Pair
 from compensation.drift.displacements import Displacements, reference_centres
 from compensation.drift.hull import convex_hull, is_area
-from compensation.history.lags import Float
+from compensation.history.states import Float
 from compensation.observations import Observations, Role
 from foundation.errors import SessionError
 

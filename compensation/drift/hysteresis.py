@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.training import frame_states
-from compensation.history.lags import Float
+from compensation.history.states import Float
 from compensation.observations import Mask, Observations, Role
 
 _CYCLE = (Role.REFERENCE, Role.FIT, Role.VALIDATION)

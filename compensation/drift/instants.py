@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from compensation.drift.displacements import Displacements
 from compensation.drift.terms import MOTIONS, motions
-from compensation.history.lags import Float
+from compensation.history.states import Float
 from compensation.observations import Mask, Observations
 from foundation.clock import NS_PER_S
 

@@ -21,7 +21,7 @@ from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import exponents
 from compensation.drift.terms import MOTIONS, Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
-from compensation.history.lags import Float
+from compensation.history.states import Float
 from foundation.documents import Document
 from foundation.errors import SessionError
 from foundation.files import write_whole

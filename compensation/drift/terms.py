@@ -11,8 +11,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from compensation.history.lags import Float
-from compensation.history.states import Memory, States
+from compensation.history.states import Float, Memory, States
 
 MOTIONS = 8
 _SPAN_K = 20.0

@@ -18,8 +18,7 @@ from compensation.drift.terms import MOTIONS, Kind, motions
 from compensation.drift.thermal_fit import RIDGE, RIDGE_WITH_PLAYS, Equations, equations, solve_thermal
 from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
 from compensation.drift.training import Training, self_heating_K, training
-from compensation.history.lags import Float
-from compensation.history.states import Memory
+from compensation.history.states import Float, Memory
 from compensation.observations import Observations, Role
 from foundation.errors import SessionError
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from compensation.drift.instants import Instants
 from compensation.drift.terms import MOTIONS
-from compensation.history.lags import Float
+from compensation.history.states import Float
 
 Columns = NDArray[np.int64]
 

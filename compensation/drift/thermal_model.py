@@ -24,8 +24,8 @@ from compensation.drift.drift_model import (
 )
 from compensation.drift.facts import ModelFacts
 from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
-from compensation.history.lags import Float
-from compensation.history.states import SETTLED_TAUS, Memory, States
+from compensation.drift_runtime import SETTLED_TAUS
+from compensation.history.states import Float, Memory, States
 
 _MARGIN = 0.02
 """Of a calibrated range: it is known to no better than the noise of its ends."""

@@ -10,8 +10,7 @@ from compensation.drift.displacements import Displacements, anchors, displacemen
 from compensation.drift.instants import Instants, condense_instants
 from compensation.drift.terms import Kind, Origin, Term, features
 from compensation.history.history import states_at
-from compensation.history.lags import Float
-from compensation.history.states import Memory, States
+from compensation.history.states import Float, Memory, States
 from compensation.observations import Mask, Observations, Role
 from foundation.errors import SessionError
 

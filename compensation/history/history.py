@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.lags import Float
-from compensation.history.states import Memory, States, ThermalState
+from compensation.history.states import Float, Memory, States, row_of, state_of
 from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
 from foundation.items import StepState
@@ -141,17 +140,18 @@ def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: F
     marks_ns = marks_ns[marks_ns >= begin_ns]
     camera = _camera(history, marks_ns, time_ns, camera_degC)
     inputs = np.column_stack([np.diff(marks_ns) / NS_PER_S, *_means(history, marks_ns), camera[1:]])
-    rows = np.concatenate([unknown.rows[:1] * np.nan, _followed(ThermalState(memory), inputs)])
+    rows = np.concatenate([unknown.rows[:1] * np.nan, _followed(memory, inputs)])
     found = rows[np.clip(np.searchsorted(marks_ns, time_ns), 0, len(rows) - 1)]
     return States.from_rows(memory, np.where(np.isfinite(found[:, :1]), found, unknown.rows))
 
 
-def _followed(state: ThermalState, inputs: Float) -> Float:
+def _followed(memory: Memory, inputs: Float) -> Float:
     """The state's rows after each sample (dt, ambient, power, camera)."""
+    state = state_of(memory)
     rows: list[Float] = []
     for sample in inputs.tolist():
         state.advance(*sample)
-        rows.append(state.row)
+        rows.append(row_of(state))
     return np.array(rows)
 
 

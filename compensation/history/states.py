@@ -1,7 +1,7 @@
-"""What a camera remembers of its thermal past: the recursion that follows it, and its values at many instants.
+"""What a camera remembers of its thermal past, at many instants.
 
-`ThermalState.advance` is fed sample by sample, from a recording (history.py) or live; both give the
-same state.
+The recursion that follows it is that of the runtime (drift_runtime.py): fed sample by sample, from a recording
+(history.py) or live, it gives the same state.
 """
 
 from __future__ import annotations
@@ -12,19 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.lags import Float, lagged, played
+from compensation.drift_runtime import ThermalState
 
-RATE_TAU_S = 600.0
-"""The ambient's rate of change is that of its 10 min lag."""
-
-SETTLED_TAUS = 3.0
-"""After so many time constants a state that began with a guess has forgotten it (5 % are left)."""
-
-_COLD_K = 3.0
-"""A camera this close to the air around it has been off for long: nothing of it is warm."""
-
-_UNPOWERED_TAU_S = 900.0
-"""An unpowered camera tells no temperature; its excess over the air is taken to decay like this until it does again."""
+Float = NDArray[np.float64]
 
 _SINGLES = 4
 
@@ -61,7 +51,7 @@ class States:
 
     @classmethod
     def from_rows(cls, memory: Memory, rows: Float) -> States:
-        """Of rows (F, 4 + 3 K + P) as ThermalState.row gives them."""
+        """Of rows (F, 4 + 3 K + P) as `row_of` gives them."""
         count = len(memory.taus_s)
         singles, ambient, power, camera, plays = np.split(rows, _SINGLES + count * np.arange(4), axis=1)
         return cls(memory, singles[:, 0], ambient, power, camera, plays, singles[:, 1], singles[:, 2], singles[:, 3])
@@ -85,65 +75,13 @@ class States:
         return States.from_rows(self.memory, self.rows[rows])
 
 
-class ThermalState:
-    """The state of one camera, followed from sample to sample.
+def state_of(memory: Memory) -> ThermalState:
+    """A camera's thermal state that remembers this, before its first sample."""
+    return ThermalState(memory.taus_s, memory.plays_K, memory.self_heating_K)
 
-    It begins, and begins again after a gap, in equilibrium: lags of temperatures at these temperatures, lags of the
-    power at the part of its self-heating that the camera shows. Unless the camera is as cold as the air, that is a
-    guess, which is forgotten after about three of the time constants.
-    """
 
-    def __init__(self, memory: Memory) -> None:
-        self._memory = memory
-        self._taus_s = np.array([RATE_TAU_S, *memory.taus_s])
-        self._radii_K = np.array(memory.plays_K, np.float64)
-        self._begun = False
-        self._settled_s = self._on_s = math.nan
-        self._air_degC = self._camera_degC = math.nan
-        self._ambient_lag = self._power_lag = self._camera_lag = np.full(len(self._taus_s), math.nan)
-        self._plays = np.full(len(self._radii_K), math.nan)
-
-    def advance(self, dt_s: float, ambient_degC: float, power_on: float, camera_degC: float) -> None:
-        """dt_s have passed, with this mean ambient temperature and this share of them powered; at their end the camera
-        tells its temperature (NaN: it does not). An ambient of NaN is a gap."""
-        if math.isnan(ambient_degC) or math.isnan(power_on):
-            self._begun = False
-            return
-        if not self._begun:
-            self._begin(ambient_degC, power_on, camera_degC)
-        excess_K = (self._camera_degC - self._air_degC) * math.exp(-dt_s / _UNPOWERED_TAU_S)
-        before_degC, self._air_degC = self._camera_degC, ambient_degC
-        self._camera_degC = ambient_degC + excess_K if math.isnan(camera_degC) else camera_degC
-        self._ambient_lag = lagged(self._ambient_lag, ambient_degC, dt_s, self._taus_s)
-        self._power_lag = lagged(self._power_lag, power_on, dt_s, self._taus_s)
-        self._camera_lag = lagged(self._camera_lag, (before_degC + self._camera_degC) / 2, dt_s, self._taus_s)
-        self._plays = played(self._plays, self._camera_degC, self._radii_K)
-        self._settled_s += dt_s
-        self._on_s = self._on_s + dt_s if power_on == 1 else dt_s * power_on
-
-    @property
-    def row(self) -> Float:
-        """The state now, (4 + 3 K + P,); all NaN in a gap."""
-        rate_K_per_h = 3600 / RATE_TAU_S * (self._air_degC - self._ambient_lag[0])
-        singles = [self._camera_degC, rate_K_per_h, self._on_s, self._settled_s]
-        lags = [self._ambient_lag[1:], self._power_lag[1:], self._camera_lag[1:]]
-        return np.concatenate([singles, *lags, self._plays]) + (0.0 if self._begun else math.nan)
-
-    @property
-    def states(self) -> States:
-        """The state now, as one instant."""
-        return States.from_rows(self._memory, self.row[None])
-
-    def _begin(self, ambient_degC: float, power_on: float, camera_degC: float) -> None:
-        excess_K = 0.0 if math.isnan(camera_degC) else camera_degC - ambient_degC
-        cold = abs(excess_K) < _COLD_K and not math.isnan(camera_degC)
-        warmed = 0.0 if cold else min(max(excess_K / self._memory.self_heating_K, 0.0), 1.0)
-        count = len(self._taus_s)
-        self._begun = True
-        self._settled_s = math.inf if cold else 0.0
-        self._on_s = 0.0 if cold or power_on == 0 else math.inf
-        self._air_degC, self._camera_degC = ambient_degC, ambient_degC + excess_K
-        self._ambient_lag = np.full(count, ambient_degC)
-        self._power_lag = np.full(count, warmed)
-        self._camera_lag = np.full(count, self._camera_degC)
-        self._plays = np.full(len(self._radii_K), self._camera_degC)
+def row_of(state: ThermalState) -> Float:
+    """The state now, (4 + 3 K + P,), as States.from_rows takes it; all NaN in a gap."""
+    singles = [state.camera_degC, state.rate_K_per_h, state.on_s, state.settled_s]
+    lags = [state.ambient_lag[1:], state.power_lag[1:], state.camera_lag[1:]]
+    return np.concatenate([singles, *lags, state.plays]) + (0.0 if state.begun else math.nan)

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.apply.drift_runtime import Drift
 from compensation.apply.export import export, runtime_model
 from compensation.cli import app
 from compensation.drift.drift_model import DriftModel, Outside
@@ -24,8 +23,9 @@ from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import exponents
 from compensation.drift.terms import Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from compensation.drift_runtime import Drift
 from compensation.history.history import recorded_history, states_at
-from compensation.history.states import States, ThermalState
+from compensation.history.states import States, row_of, state_of
 from compensation.observations import session_target
 from foundation.errors import SessionError
 from markers.detection import detect
@@ -107,7 +107,7 @@ LIFE = [
 @pytest.mark.parametrize("model", MODELS)
 def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(model: DriftModel, tmp_path: Path):
     export(model, tmp_path / "new")
-    live, state = Drift.load(tmp_path / "new" / "drift.json"), ThermalState(model.memory)
+    live, state = Drift.load(tmp_path / "new" / "drift.json"), state_of(model.memory)
     assert np.isnan(live.correct(POINTS)).all()
     seen = set()
     for number, sample in enumerate(LIFE):
@@ -115,7 +115,11 @@ def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(mod
         state.advance(*sample)
         if number % 7 and not np.isnan(sample).any():
             continue
-        states = state.states if model.form == "thermal" else States.at_degC(live._camera_degC, 1)
+        states = (
+            States.from_rows(model.memory, row_of(state)[None])
+            if model.form == "thermal"
+            else States.at_degC(live._camera_degC, 1)
+        )
         np.testing.assert_allclose(live.correct(POINTS), model.correct(POINTS, states), atol=1e-12)
         np.testing.assert_array_equal(live.flags(POINTS), model.flags(POINTS, states))
         seen |= set(live.flags(POINTS).tolist())
@@ -138,10 +142,11 @@ def test_the_module_needs_numpy_only_and_runs_where_nothing_else_is(tmp_path: Pa
         "assert not {'compensation', 'stand', 'scipy', 'cv2'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-I", "-c", program], cwd=tmp_path, capture_output=True, check=True)
-    state = ThermalState(thermal().memory)
+    state = state_of(thermal().memory)
     for _ in range(2000):
         state.advance(10, 24.0, 1, 44.0)
-    expected = thermal().correct(np.array([[320.5, 200.25]]), state.states)
+    states = States.from_rows(thermal().memory, row_of(state)[None])
+    expected = thermal().correct(np.array([[320.5, 200.25]]), states)
     np.testing.assert_allclose(json.loads(done.stdout), expected, atol=1e-9)
 
 

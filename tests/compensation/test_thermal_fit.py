@@ -20,9 +20,9 @@ from compensation.drift.thermal_choice import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.history.history import states_at
-from compensation.history.states import States, ThermalState
+from compensation.history.states import States, row_of, state_of
 from compensation.observations import Observations, Role, concatenate
-from foundation.errors import SessionError
+from foundation.errors import ConfigError, SessionError
 
 from .reservoirs import cycle, reference, session, warm_up
 from .synthetic import observations as without_histories
@@ -130,7 +130,7 @@ def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
 def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, thermal: ThermalModel):
     record = night[0].histories[0]
     end = 2000
-    state = ThermalState(thermal.memory)
+    state = state_of(thermal.memory)
     camera_degC = np.interp(record.ambient_ns, record.camera_ns, record.camera_degC)
     off = ~np.isin(record.ambient_ns, record.camera_ns)
     for index in range(1, end):
@@ -140,7 +140,8 @@ def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, ther
     at_ns = record.ambient_ns[end - 1 : end]
     offline = states_at(record, thermal.memory, at_ns, camera_degC[end - 1 : end])
     point = np.array([[1200.0, 1000.0]])
-    np.testing.assert_allclose(thermal.shift(point, state.states), thermal.shift(point, offline), atol=1e-6)
+    live = States.from_rows(thermal.memory, row_of(state)[None])
+    np.testing.assert_allclose(thermal.shift(point, live), thermal.shift(point, offline), atol=1e-6)
 
 
 def test_a_recorded_warm_up_of_its_own_teaches_too(thermal: ThermalModel):
@@ -172,7 +173,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
 def test_what_the_thermal_form_needs_is_told(night: Seen):
     with pytest.raises(SessionError, match="no history of the air"):
         fit(without_histories(quadratic), form="thermal")
-    with pytest.raises(SessionError, match="has no degree"):
+    with pytest.raises(ConfigError, match="has no degree"):
         fit(night[0], degree=3, form="thermal")
     silent = replace(night[0], air_degC=np.full(len(night[0].frame), np.nan))
     with pytest.raises(SessionError, match="no air temperature"):

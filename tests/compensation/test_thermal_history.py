@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from compensation.drift_runtime import ThermalState
 from compensation.history.history import History, refined, states_at
-from compensation.history.lags import played
-from compensation.history.states import Memory, States, ThermalState
+from compensation.history.states import Memory, States, row_of, state_of
 
 S = 1_000_000_000
 MEMORY = Memory((600.0, 3600.0), (2.0,), 20.0)
@@ -80,12 +80,12 @@ def test_after_a_gap_the_state_is_a_guess_again():
 
 def test_samples_one_by_one_give_the_same_state_as_the_recording():
     record = history()
-    state = ThermalState(MEMORY)
+    state = state_of(MEMORY)
     for second in range(10, 6001, 10):
         air = [24.0 if edge <= STEP_AT_S else 34.0 for edge in (second - 10, second)]
         state.advance(10.0, sum(air) / 2, 1.0, air[1] + 20.0)
-    np.testing.assert_allclose(state.row, at(record, 6000).rows[0], rtol=1e-9)
-    assert state.states.camera_degC[0] == 54.0
+    np.testing.assert_allclose(row_of(state), at(record, 6000).rows[0], rtol=1e-9)
+    assert state.camera_degC == 54.0
 
 
 def test_before_the_record_and_without_one_only_the_camera_is_known():
@@ -114,8 +114,9 @@ def test_a_display_in_quarters_is_refined_between_its_steps():
 
 
 def test_a_play_stays_until_it_is_pushed_from_either_side():
-    radii = np.array([1.0, 3.0])
-    places = [np.zeros(2)]
-    for driver in (0.5, 5.0, 3.5, -2.0):
-        places.append(played(places[-1], driver, radii))
-    assert [place.tolist() for place in places[1:]] == [[0, 0], [4, 2], [4, 2], [-1, 1]]
+    state = ThermalState((), (1.0, 3.0), 20.0)
+    places: list[list[float]] = []
+    for camera_degC in (0.0, 0.5, 5.0, 3.5, -2.0):
+        state.advance(10.0, 0.0, 1.0, camera_degC)
+        places.append(state.plays.tolist())
+    assert places[1:] == [[0, 0], [4, 2], [4, 2], [-1, 1]]

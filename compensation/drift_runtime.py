@@ -8,6 +8,8 @@
 Integer pixel coordinates are pixel centres. A model of the form `paper` uses the camera's temperature only; one of the
 form `thermal` remembers the air, the supply and the camera, and must be fed for about three of its longest time
 constants (`drift.memory_s`) before it is right, unless it was fed from a cold start on.
+
+The fit, too, follows the camera with the ThermalState of this file.
 """
 
 import json
@@ -19,8 +21,77 @@ PLACE, CAMERA, AMBIENT, SWITCHED_ON, HISTORY = 1, 2, 4, 8, 16
 """Flags: the point is outside the markers' hull; the camera's temperature, the air's temperature or its rate of change
 are outside the calibrated range; the camera was switched on too recently; it has not been followed for long enough."""
 
-_RATE_TAU_S, _UNPOWERED_TAU_S, _COLD_K, _SETTLED_TAUS = 600.0, 900.0, 3.0, 3.0
+RATE_TAU_S = 600.0
+"""The ambient's rate of change is that of its 10 min lag."""
+SETTLED_TAUS = 3.0
+"""After so many time constants a state that began with a guess has forgotten it (5 % are left)."""
+_COLD_K = 3.0
+"""A camera this close to the air around it has been off for long: nothing of it is warm."""
+_UNPOWERED_TAU_S = 900.0
+"""An unpowered camera tells no temperature; its excess over the air is taken to decay like this until it does again."""
 _SPAN_K, _MARGIN, _HULL_MARGIN_PX, _SWITCHED_ON_S = 20.0, 0.02, 1.0, 1.0
+
+
+class ThermalState:
+    """The thermal state of one camera, followed from sample to sample.
+
+    It begins, and begins again after a gap, in equilibrium: lags of temperatures at these temperatures, lags of the
+    power at the part of its self-heating that the camera shows. Unless the camera is as cold as the air, that is a
+    guess, which is forgotten after about three of the time constants. camera_degC, air_degC: the last ones.
+    ambient_lag, power_lag, camera_lag: the 10 min lag, then one for each of taus_s. plays: one for each of plays_K.
+    settled_s: how long ago the state was a guess. on_s: since the camera was switched on. begun: False in a gap.
+    """
+
+    def __init__(self, taus_s, plays_K, self_heating_K):
+        """taus_s: time constants, s. plays_K: radii. self_heating_K: over the air of a camera that has been on for
+        long."""
+        self._taus_s = np.array([RATE_TAU_S, *taus_s])
+        self._radii_K = np.array(plays_K, float)
+        self._self_heating_K = self_heating_K
+        self.begun = False
+        self.settled_s = self.on_s = self.air_degC = self.camera_degC = math.nan
+        self.ambient_lag = self.power_lag = self.camera_lag = np.full(len(self._taus_s), math.nan)
+        self.plays = np.full(len(self._radii_K), math.nan)
+
+    def advance(self, dt_s, ambient_degC, power_on, camera_degC):
+        """dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them
+        powered; at their end the camera tells its temperature (NaN: it does not). An ambient of NaN is a gap."""
+        if math.isnan(ambient_degC) or math.isnan(power_on):
+            self.begun = False
+            return
+        if not self.begun:
+            self._begin(ambient_degC, power_on, camera_degC)
+        before_degC = self.camera_degC
+        excess_K = (before_degC - self.air_degC) * math.exp(-dt_s / _UNPOWERED_TAU_S)
+        self.air_degC = ambient_degC
+        self.camera_degC = ambient_degC + excess_K if math.isnan(camera_degC) else camera_degC
+        # First-order followers of a constant input, exactly: z + (s - z)(1 - exp(-dt/tau)); and Prandtl-Ishlinskii
+        # plays, which stay where they are until the camera is further away than their radius.
+        gained = -np.expm1(-dt_s / self._taus_s)
+        self.ambient_lag = self.ambient_lag + (ambient_degC - self.ambient_lag) * gained
+        self.power_lag = self.power_lag + (power_on - self.power_lag) * gained
+        self.camera_lag = self.camera_lag + ((before_degC + self.camera_degC) / 2 - self.camera_lag) * gained
+        self.plays = np.clip(self.plays, self.camera_degC - self._radii_K, self.camera_degC + self._radii_K)
+        self.settled_s += dt_s
+        self.on_s = self.on_s + dt_s if power_on == 1 else dt_s * power_on
+
+    @property
+    def rate_K_per_h(self):
+        """How fast the ambient changes."""
+        return 3600 / RATE_TAU_S * (self.air_degC - self.ambient_lag[0])
+
+    def _begin(self, ambient_degC, power_on, camera_degC):
+        excess_K = 0.0 if math.isnan(camera_degC) else camera_degC - ambient_degC
+        cold = abs(excess_K) < _COLD_K and not math.isnan(camera_degC)
+        warmed = 0.0 if cold else min(max(excess_K / self._self_heating_K, 0.0), 1.0)
+        self.begun = True
+        self.settled_s = math.inf if cold else 0.0
+        self.on_s = 0.0 if cold or power_on == 0 else math.inf
+        self.air_degC, self.camera_degC = ambient_degC, ambient_degC + excess_K
+        self.ambient_lag = np.full(len(self._taus_s), float(ambient_degC))
+        self.power_lag = np.full(len(self._taus_s), warmed)
+        self.camera_lag = np.full(len(self._taus_s), self.camera_degC)
+        self.plays = np.full(len(self._radii_K), self.camera_degC)
 
 
 class Drift:
@@ -33,10 +104,10 @@ class Drift:
         self._model = model
         self._coefficients = np.array(model["coefficients_px"])
         self._hull_px = np.array(model["hull_px"])
-        self._taus_s = np.array([_RATE_TAU_S, *model.get("taus_s", [])])
-        self._radii_K = np.array(model.get("plays_K", []), float)
+        self._state = ThermalState(
+            model.get("taus_s", []), model.get("plays_K", []), model.get("self_heating_K", math.nan)
+        )
         self._camera_degC = math.nan
-        self._begun = False
 
     @classmethod
     def load(cls, path):
@@ -47,35 +118,19 @@ class Drift:
     @property
     def memory_s(self):
         """How long it must have been fed to be right, s; 0 for a form without memory."""
-        return _SETTLED_TAUS * max(self._model.get("taus_s", []), default=0.0)
+        return SETTLED_TAUS * max(self._model.get("taus_s", []), default=0.0)
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
-        """dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them
-        powered; at their end the camera tells its temperature (NaN: it does not). An ambient of NaN is a gap."""
-        if math.isnan(ambient_degC) or math.isnan(power_on):
-            self._begun = False
-            self._camera_degC = camera_degC
-            return
-        if not self._begun:
-            self._begin(ambient_degC, power_on, camera_degC)
-        before_degC = self._camera_degC
-        excess_K = (before_degC - self._air_degC) * math.exp(-dt_s / _UNPOWERED_TAU_S)
-        self._air_degC = ambient_degC
-        self._camera_degC = ambient_degC + excess_K if math.isnan(camera_degC) else camera_degC
-        gained = -np.expm1(-dt_s / self._taus_s)
-        self._ambient_lag += (ambient_degC - self._ambient_lag) * gained
-        self._power_lag += (power_on - self._power_lag) * gained
-        self._camera_lag += ((before_degC + self._camera_degC) / 2 - self._camera_lag) * gained
-        self._plays = np.clip(self._plays, self._camera_degC - self._radii_K, self._camera_degC + self._radii_K)
-        self._settled_s += dt_s
-        self._on_s = self._on_s + dt_s if power_on == 1 else dt_s * power_on
+        """As ThermalState.advance."""
+        self._state.advance(dt_s, ambient_degC, power_on, camera_degC)
+        self._camera_degC = self._state.camera_degC if self._state.begun else camera_degC
 
     def shift(self, points_px):
         """Displacement (N, 2), px, of points (N, 2) to where they would be at the reference; NaN before `advance`."""
         points_px = np.asarray(points_px, float)
         if self._model["form"] == "paper":
             return self._polynomial(points_px) @ self._coefficients.T
-        if not self._begun:
+        if not self._state.begun:
             return np.full_like(points_px, np.nan)
         amounts = self._coefficients @ (self._features() - np.array(self._model["reference_features"]))
         return self._moved(points_px, amounts)
@@ -94,20 +149,6 @@ class Drift:
         outside = ~(distance_px >= -_HULL_MARGIN_PX).all(axis=1)
         return np.where(outside, PLACE, 0) | self._state_flags()
 
-    def _begin(self, ambient_degC, power_on, camera_degC):
-        """In equilibrium; unless the camera is as cold as the air, that is a guess."""
-        excess_K = 0.0 if math.isnan(camera_degC) else camera_degC - ambient_degC
-        cold = abs(excess_K) < _COLD_K and not math.isnan(camera_degC)
-        warmed = 0.0 if cold else min(max(excess_K / self._model.get("self_heating_K", 15.0), 0.0), 1.0)
-        self._begun = True
-        self._settled_s = math.inf if cold else 0.0
-        self._on_s = 0.0 if cold or power_on == 0 else math.inf
-        self._air_degC, self._camera_degC = ambient_degC, ambient_degC + excess_K
-        self._ambient_lag = np.full(len(self._taus_s), float(ambient_degC))
-        self._power_lag = np.full(len(self._taus_s), warmed)
-        self._camera_lag = np.full(len(self._taus_s), self._camera_degC)
-        self._plays = np.full(len(self._radii_K), self._camera_degC)
-
     def _polynomial(self, points_px):
         """The paper's terms: products of Chebyshev polynomials of I, J and T, each scaled to [-1, 1]."""
         width, height = self._model["image_size_px"]
@@ -122,7 +163,7 @@ class Drift:
         """The terms of the thermal state."""
         camera_degC, air_degC = self._model["reference_degC"], self._model["reference_ambient_degC"]
         taus_s, radii_K = self._model["taus_s"], self._model["plays_K"]
-        own = (self._camera_degC - camera_degC) / _SPAN_K
+        state, own = self._state, (self._state.camera_degC - camera_degC) / _SPAN_K
         values = []
         for kind, parameter in self._model["terms"]:
             at = 1 + taus_s.index(parameter) if parameter in taus_s else 0
@@ -131,11 +172,11 @@ class Drift:
                     "constant": lambda: 1.0,
                     "camera": lambda: own,
                     "camera squared": lambda: own**2,
-                    "ambient lag": lambda at=at: (self._ambient_lag[at] - air_degC) / _SPAN_K,
-                    "power lag": lambda at=at: self._power_lag[at] - 1,
-                    "camera lag": lambda at=at: (self._camera_lag[at] - camera_degC) / _SPAN_K,
-                    "camera lag squared": lambda at=at: ((self._camera_lag[at] - camera_degC) / _SPAN_K) ** 2,
-                    "play": lambda r=parameter: (self._plays[radii_K.index(r)] - camera_degC) / _SPAN_K,
+                    "ambient lag": lambda at=at: (state.ambient_lag[at] - air_degC) / _SPAN_K,
+                    "power lag": lambda at=at: state.power_lag[at] - 1,
+                    "camera lag": lambda at=at: (state.camera_lag[at] - camera_degC) / _SPAN_K,
+                    "camera lag squared": lambda at=at: ((state.camera_lag[at] - camera_degC) / _SPAN_K) ** 2,
+                    "play": lambda r=parameter: (state.plays[radii_K.index(r)] - camera_degC) / _SPAN_K,
                 }[kind]()
             )
         return np.array(values)
@@ -153,16 +194,15 @@ class Drift:
         found = _beyond(self._camera_degC, self._limits("camera_range_degC"), CAMERA)
         if self._model["form"] == "paper":
             return found
-        if not self._begun:
+        if not self._state.begun:
             return CAMERA | AMBIENT | SWITCHED_ON | HISTORY
-        rate_K_per_h = 3600 / _RATE_TAU_S * (self._air_degC - self._ambient_lag[0])
-        found |= _beyond(rate_K_per_h, self._limits("rate_range_K_per_h", 1.0), AMBIENT)
+        found |= _beyond(self._state.rate_K_per_h, self._limits("rate_range_K_per_h", 1.0), AMBIENT)
         least_on_s = self._model["least_on_s"]
         least_on_s = math.inf if least_on_s is None else least_on_s - _SWITCHED_ON_S
-        found |= _beyond(self._on_s, (least_on_s, math.inf), SWITCHED_ON)
+        found |= _beyond(self._state.on_s, (least_on_s, math.inf), SWITCHED_ON)
         if self._model["taus_s"]:
-            found |= _beyond(self._ambient_lag[-1], self._limits("ambient_range_degC"), AMBIENT)
-        return found | _beyond(self._settled_s, (self.memory_s, math.inf), HISTORY)
+            found |= _beyond(self._state.ambient_lag[-1], self._limits("ambient_range_degC"), AMBIENT)
+        return found | _beyond(self._state.settled_s, (self.memory_s, math.inf), HISTORY)
 
     def _limits(self, name, least=0.0):
         """A calibrated range with its margin; the paper's form has none."""
