@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from enum import StrEnum
 from itertools import islice
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
 from compensation.history.history import History, recorded_history
 from compensation.one_equilibrium import check_sessions
+from experiments.steps import Role
 from foundation.documents import parse_document
 from foundation.errors import SessionError
 from foundation.progress import Report
@@ -45,22 +45,8 @@ _AIR_GAP_NS = 120_000_000_000
 _PREVIEW_WIDTH_PX = 816
 
 
-class Role(StrEnum):
-    """What a frame was taken for, as its step says. OTHER: no such step, or one without a set-point.
-
-    All but the last are experiments.steps.Role, written out again because this package knows recorded sessions only and
-    may not import what plans them: the words in the recording are what the two share.
-    """
-
-    REFERENCE = "reference"
-    FIT = "fit"
-    VALIDATION = "validation"
-    WARM_UP = "warm_up"
-    SETTLING = "settling"
-    CALIBRATION = "calibration"
-    POSE = "pose"
-    REPEATABILITY = "repeatability"
-    OTHER = "other"
+OTHER = "other"
+"""The role of a frame that no capture asked for, or one without a set-point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +104,7 @@ class Observations:
         """Whether any of the frames are known to be of a simulated laboratory."""
         return any(session.simulated for session in self.sessions)
 
-    def of(self, *roles: Role) -> Mask:
+    def of(self, *roles: str) -> Mask:
         """(F,): usable frames taken for one of these purposes."""
         return self.usable & np.isin(self.role, [str(role) for role in roles])
 
@@ -264,11 +250,11 @@ def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: Ma
     return tuple(reasons)
 
 
-def _purpose(parameters: dict[str, object]) -> tuple[Role, float]:
+def _purpose(parameters: dict[str, object]) -> tuple[str, float]:
     """Role and set-point of a step that takes frames, from its parameters."""
     role, chamber_degC = parameters.get("role"), parameters.get("chamber_degC")
     if not isinstance(chamber_degC, int | float) or not isinstance(role, str) or role not in set(Role):
-        return Role.OTHER, math.nan
+        return OTHER, math.nan
     return Role(role), float(chamber_degC)
 
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.observations import Float, Mask, Observations, Role
+from compensation.observations import Float, Mask, Observations
+from experiments.steps import Role
 from foundation.errors import SessionError
 
 _ANCHOR_FRAMES = 20

@@ -14,7 +14,8 @@ from compensation.drift.paper_model import PaperModel
 from compensation.drift.thermal_choice import left_out_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
-from compensation.observations import Float, Mask, Observations, Role
+from compensation.observations import Float, Mask, Observations
+from experiments.steps import Role
 from foundation.errors import SessionError
 
 PAPER_BEFORE_PX = (0.191, 0.576)

@@ -11,7 +11,8 @@ from compensation.drift.candidates import Pair
 from compensation.drift.displacements import Displacements, reference_centres
 from compensation.drift.hull import convex_hull, is_area
 from compensation.history.states import Float
-from compensation.observations import Observations, Role
+from compensation.observations import Observations
+from experiments.steps import Role
 from foundation.errors import SessionError
 
 

@@ -18,7 +18,8 @@ from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.training import frame_states
 from compensation.history.states import Float
-from compensation.observations import Mask, Observations, Role
+from compensation.observations import Mask, Observations
+from experiments.steps import Role
 
 _CYCLE = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 

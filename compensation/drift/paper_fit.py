@@ -12,7 +12,8 @@ from compensation.drift.displacements import Displacements, displacements
 from compensation.drift.facts import facts_of
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
-from compensation.observations import Mask, Observations, Role
+from compensation.observations import Mask, Observations
+from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError
 
 _LEAST_TEMPERATURES = 3

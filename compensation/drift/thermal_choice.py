@@ -19,7 +19,8 @@ from compensation.drift.thermal_fit import RIDGE, RIDGE_WITH_PLAYS, Equations, e
 from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
 from compensation.drift.training import Training, self_heating_K, training
 from compensation.history.states import Float, Memory
-from compensation.observations import Observations, Role
+from compensation.observations import Observations
+from experiments.steps import Role
 from foundation.errors import SessionError
 
 _FEWEST_FOLDS = 3

@@ -11,7 +11,8 @@ from compensation.drift.instants import Instants, condense_instants
 from compensation.drift.terms import Kind, Origin, Term, features
 from compensation.history.history import states_at
 from compensation.history.states import Float, Memory, States
-from compensation.observations import Mask, Observations, Role
+from compensation.observations import Mask, Observations
+from experiments.steps import Role
 from foundation.errors import SessionError
 
 _TRUSTED_S = 3600.0

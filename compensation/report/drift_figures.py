@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compensation.drift.hysteresis import Gap
-from compensation.observations import Float, Observations, Role
+from compensation.observations import Float, Observations
 from compensation.report.figures import (
     CAMERA_COLOUR,
     COORDINATES,
@@ -22,6 +22,7 @@ from compensation.report.figures import (
     style,
 )
 from compensation.report.tracks import Rows, Visit, WarmUp, mean_over_markers, moved_px, thinned
+from experiments.steps import Role
 
 CURVE_POINTS = 400
 """Frames of a curve that are drawn; more only make the page larger."""

@@ -16,7 +16,7 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.training import frame_states
-from compensation.observations import Float, Mask, Observations, Role
+from compensation.observations import OTHER, Float, Mask, Observations
 from compensation.report.extras import Extras
 from compensation.report.numbers import (
     FORMAT,
@@ -31,6 +31,7 @@ from compensation.report.numbers import (
 )
 from compensation.report.tracks import WarmUp, warm_ups
 from compensation.validation3d.document import as_json as validation_json
+from experiments.steps import Role
 from markers.detection import Flag
 
 PAPER_WARM_UP_PX = (0.3, 1.1)
@@ -74,7 +75,7 @@ def _session(observations: Observations, index: int) -> SessionNumbers:
     used = own & observations.usable
     flags = observations.flags[used]
     by_flag = {_words(flag.name or ""): int(((flags & flag) != 0).sum()) for flag in Flag}
-    by_role = {str(role): int((own & (observations.role == str(role))).sum()) for role in Role}
+    by_role = {str(role): int((own & (observations.role == str(role))).sum()) for role in (*Role, OTHER)}
     return SessionNumbers(
         session_id=facts.session_id,
         recipe=facts.recipe,

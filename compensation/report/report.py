@@ -12,7 +12,7 @@ from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.model_file import save_model
-from compensation.observations import Observations, Progress, Role, observe_sessions
+from compensation.observations import Observations, Progress, observe_sessions
 from compensation.report.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.report.data_section import data_section, utc
 from compensation.report.drift_section import drift_section
@@ -24,6 +24,7 @@ from compensation.report.result_section import result_section
 from compensation.report.space_section import space_section
 from compensation.report.stand_section import stand_section
 from compensation.report.table_positions import table_positions
+from experiments.steps import Role
 from foundation.errors import SessionError
 from foundation.files import check_writable, write_whole
 from recording.reading.session import Session

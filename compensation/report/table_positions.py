@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compensation.calibration.visits import visits_for
-from compensation.observations import Role
 from compensation.report.figures import FULL_WIDTH_IN, GREY, J_COLOUR, legend_above, new_figure, style
+from experiments.steps import Role
 from foundation.items import StepMark
 from markers.target import Target
 

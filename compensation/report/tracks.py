@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.displacements import reference_centres
-from compensation.observations import Float, Observations, Role
+from compensation.observations import Float, Observations
+from experiments.steps import Role
 
 Rows = NDArray[np.int64]
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.calibration.visits import Visit, place, visits_for
-from compensation.observations import Float, Observations, Role
+from compensation.observations import Float, Observations
+from experiments.steps import Role
 from foundation.errors import SessionError
 from recording.reading.session import Session
 

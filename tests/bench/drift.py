@@ -15,8 +15,8 @@ from compensation.drift.choosing import FORMS, Form, fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
-from compensation.observations import Role
 from drivers.sim.optics import CameraKind
+from experiments.steps import Role
 from tests.bench.figures import Figure, at_most, progress, side_by_side
 from tests.compensation.plant_night import Dwell, Seen, WarmUp, night, warm_up_and_cycles
 

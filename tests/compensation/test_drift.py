@@ -16,7 +16,8 @@ from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_fit import choose, fit_paper
 from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import condense, design, solve
-from compensation.observations import Observations, Role, concatenate
+from compensation.observations import Observations, concatenate
+from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError
 from foundation.files import write_whole
 

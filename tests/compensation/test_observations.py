@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from compensation.drift.displacements import displacements, reference_centres
-from compensation.observations import Observations, Role, concatenate, observe, session_target
+from compensation.observations import Observations, concatenate, observe, session_target
+from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from foundation.errors import ConfigError, SessionError
 from foundation.instants import utc_text

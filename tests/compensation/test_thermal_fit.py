@@ -21,7 +21,8 @@ from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.history.history import states_at
 from compensation.history.states import States, row_of, state_of
-from compensation.observations import Observations, Role, concatenate
+from compensation.observations import Observations, concatenate
+from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError
 
 from .reservoirs import cycle, reference, session, warm_up

@@ -23,8 +23,9 @@ from compensation.calibration.positions import Positions
 from compensation.calibration.stages import TableSigma
 from compensation.drift.model_file import save_model
 from compensation.drift.paper_fit import fit_paper
-from compensation.observations import Float, Observations, Role, observe, session_target
+from compensation.observations import Float, Observations, observe, session_target
 from compensation.validation3d.positions import validation_frames
+from experiments.steps import Role
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.documents import parse_document
 from foundation.errors import SessionError

@@ -15,7 +15,8 @@ from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
-from compensation.observations import Observations, Role, observe_sessions
+from compensation.observations import Observations, observe_sessions
+from experiments.steps import Role
 from foundation.hub import Hub
 from foundation.items import Item
 from foundation.progress import progress

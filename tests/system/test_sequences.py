@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import Role as ObservedRole
-from compensation.observations import observe_sessions
+from compensation.observations import OTHER, observe_sessions
 from experiments.steps import Role
 from foundation.items import Event, StepMark, StepState
 from foundation.progress import progress
@@ -132,8 +131,8 @@ def check_relaxed_stages_came_back(session: Session) -> None:
 def check_no_drift_is_fitted_to_them(session: Session) -> None:
     """Whoever looks for the frames of the drift finds none, but the warm-up's."""
     observed = observe_sessions([session.path], progress)
-    cycle = (ObservedRole.REFERENCE, ObservedRole.FIT, ObservedRole.VALIDATION)
+    cycle = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
     assert observed.of(*cycle).sum() == 0
-    elsewhere = (ObservedRole.CALIBRATION, ObservedRole.POSE, ObservedRole.REPEATABILITY)
-    assert (observed.of(ObservedRole.WARM_UP).sum(), observed.of(*elsewhere).sum()) == (12, 12)
-    assert observed.of(ObservedRole.OTHER).sum() == 0
+    elsewhere = (Role.CALIBRATION, Role.POSE, Role.REPEATABILITY)
+    assert (observed.of(Role.WARM_UP).sum(), observed.of(*elsewhere).sum()) == (12, 12)
+    assert observed.of(OTHER).sum() == 0

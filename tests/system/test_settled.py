@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import Observations, Role, observe_sessions
+from compensation.observations import Observations, observe_sessions
+from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from foundation.items import StepState
 from foundation.progress import progress

@@ -20,7 +20,8 @@ from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import rms_px
 from compensation.drift.training import frame_states
-from compensation.observations import Observations, Role, observe_sessions
+from compensation.observations import Observations, observe_sessions
+from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
 from foundation.items import Item
