@@ -9,14 +9,14 @@ from typing import Protocol, cast
 
 import usb.backend
 
-from drivers.devices.camera import Camera, CameraSettings, TemperatureFeature
-from drivers.devices.flap import Flap, FlapSettings
+from drivers.devices.camera import Camera
+from drivers.devices.flap import Flap
 from drivers.devices.protocols import Sensor
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays
-from drivers.devices.stage import Axis, AxisSettings
-from drivers.devices.thermometers import ThermometerChannel, Thermometers
-from drivers.wires.bus import Bus, LineSettings
+from drivers.devices.stage import Axis
+from drivers.devices.thermometers import Thermometers
+from drivers.wires.bus import Bus
 from drivers.wires.registers import RegisterMap, load_register_map
 from foundation.clock import Clock, VirtualClock
 from foundation.errors import ConfigError
@@ -24,7 +24,7 @@ from foundation.hub import Hub
 from stand.chamber.chamber import ChamberLimits
 from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import PermitLimits
-from stand.config.stand_config import CameraConfig, StandConfig, packaged
+from stand.config.stand_config import StandConfig, packaged
 from stand.fault import Fault
 from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
@@ -107,8 +107,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     notifier = Notifier(config.guard.notify, config.guard.notify_limit_s, clock)
     if missing := notifier.missing():
         raise ConfigError(missing)
-    line = LineSettings(config.bus.baud, config.bus.parity, config.bus.stopbits)
-    bus = Bus("bus", config.bus.address, clock, line, config.bus.timeout_s, config.bus.gap_s)
+    bus = Bus("bus", config.bus, clock)
     devices = Devices(
         regulator=Regulator(
             "regulator",
@@ -123,12 +122,9 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
             {str(name): number for name, number in config.relays.channels.items()},
         ),
         thermometers=_thermometers(config, bus, clock),
-        axes={
-            str(name): Axis(name, AxisSettings(axis.address, axis.serial_number, axis.profile, axis.limits), clock)
-            for name, axis in config.axes.items()
-        },
+        axes={str(name): Axis(name, axis, clock) for name, axis in config.axes.items()},
         flap=_flap(config, clock),
-        camera=Camera("camera", camera_settings(config.camera), clock),
+        camera=Camera("camera", config.camera, clock),
     )
     compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
     state_file = config.compressor.state_file
@@ -142,12 +138,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
 
 
 def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers:
-    channels = {
-        str(name): ThermometerChannel(
-            entry.channel, entry.offset_K, entry.polynomial, entry.certificate, entry.plausible_degC
-        )
-        for name, entry in config.thermometers.channels.items()
-    }
+    channels = {str(name): entry for name, entry in config.thermometers.channels.items()}
     register_map = _register_map(config.thermometers.registers, config.thermometers.unit)
     return Thermometers("thermometers", bus, register_map, channels, clock)
 
@@ -174,34 +165,4 @@ def _flap(config: StandConfig, clock: Clock) -> Flap:
             backend = module.get_backend(flap.backend_address)
         except ValueError as error:
             raise ConfigError(f"flap.backend_address: {error}") from error
-    settings = FlapSettings(flap.serial_number, flap.open_target, flap.closed_target, flap.tolerance, flap.travel_s)
-    return Flap("flap", settings, clock, backend)
-
-
-def camera_settings(camera: CameraConfig) -> CameraSettings:
-    """The driver's settings from the configuration's."""
-    temperature = None
-    if camera.temperature is not None:
-        entry = camera.temperature
-        temperature = TemperatureFeature(
-            feature=entry.feature,
-            selector=entry.selector,
-            entry=entry.entry,
-            min_degC=entry.min_degC,
-            max_degC=entry.max_degC,
-        )
-    return CameraSettings(
-        address=camera.address,
-        serial_number=camera.serial_number,
-        pixel_format=camera.pixel_format,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        exposure_s=camera.exposure_s,
-        gain_dB=camera.gain_dB,
-        trigger=camera.trigger,
-        frame_rate_hz=camera.frame_rate_hz,
-        packet_size=camera.packet_size,
-        heartbeat_s=camera.heartbeat_s,
-        temperature=temperature,
-        has_temperature=camera.has_temperature,
-    )
+    return Flap("flap", flap, clock, backend)

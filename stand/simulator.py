@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 
+from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
 from foundation.errors import ConfigError, Unreachable
 from stand.config.stand_config import StandConfig
@@ -117,8 +118,7 @@ class ControlSocket:
     """The simulator's control socket: one JSON object a line in, one out."""
 
     def __init__(self, address: str) -> None:
-        self._host, port = address.removeprefix("tcp:").rsplit(":", 1)
-        self._port = int(port)
+        self._host, self._port = tcp_place(address)
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
 

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_connection import Connection, FrameCount, Shot
 from drivers.wires.camera_settings import (
-    CameraSettings,
     EffectiveSettings,
+    GigeCameraSettings,
     Identity,
     TemperatureFeature,
     device_error,
@@ -24,7 +24,7 @@ from foundation.errors import DeviceError, Unreachable
 from foundation.lane import Lane, Result
 from foundation.readings import Frame, Reading, bad_reading
 
-__all__ = ["Camera", "CameraSettings", "EffectiveSettings", "Identity", "TemperatureFeature"]
+__all__ = ["Camera", "GigeCameraSettings", "EffectiveSettings", "Identity", "TemperatureFeature"]
 
 ATTEMPTS = 3  # frames in a row that may fail before the camera counts as lost
 
@@ -34,9 +34,9 @@ _CLOCK_SLACK_S = 1.0  # its clock is read that well, and it is heard for longer 
 class Camera:
     """A GigE Vision camera under `name`; channels `<name>.image` and `<name>.temperature`."""
 
-    def __init__(self, name: str, settings: CameraSettings, clock: Clock) -> None:
+    def __init__(self, name: str, settings: GigeCameraSettings, clock: Clock) -> None:
         self._name = name
-        self._settings = settings
+        self.settings = settings
         self._clock = clock
         self._lane: Lane | None = None
         self._connection: Connection | None = None
@@ -109,10 +109,10 @@ class Camera:
         Refused: exposure not taken.
         """
         connection = self._usable()
-        wanted_s = self._settings.exposure_s if exposure_s is None else exposure_s
+        wanted_s = self.settings.exposure_s if exposure_s is None else exposure_s
         if not connection.running:
             await self._call(connection.start)
-        if self._settings.trigger == "software":
+        if self.settings.trigger == "software":
             shot = await self._grab_triggered(connection, wanted_s, due_ns)
         else:
             shot = await self._grab_free_running(connection, wanted_s)
@@ -205,7 +205,7 @@ class Camera:
 
     def _connect(self) -> None:
         self._disconnect()
-        self._connection = Connection(self._name, self._settings, self._clock, self._frames, self._counts)
+        self._connection = Connection(self._name, self.settings, self._clock, self._frames, self._counts)
         self._counts["opened"] += 1
 
     def _disconnect(self) -> None:

@@ -6,14 +6,17 @@ import errno
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import Protocol, Self, cast
 
 import usb.backend
 import usb.core
 import usb.util
+from pydantic import Field, model_validator
 
 from drivers.devices.flap_travel import POLL_S, Travel
 from drivers.devices.motion import Motion, Turn
+from drivers.settings import Polled
+from foundation.addresses import TcpAddress
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Superseded, Unreachable
 from foundation.lane import Lane, Result
@@ -41,16 +44,26 @@ _ERROR_NAMES = (
 _JAM_DUTY = 0.9  # of the configured maximum
 
 
-@dataclass(frozen=True, slots=True)
-class FlapSettings:
-    """`serial_number`: of the USB device. Targets, tolerance: scaled feedback counts, 0..4095. travel_s: longest time
-    a whole travel may take on the stand's clock."""
+class FlapSettings(Polled):
+    """serial_number: of the USB device. backend: a module with `get_backend(address)` that gives a pyusb backend; none
+    means libusb, the real bus. Targets, tolerance: scaled feedback counts. travel_s: longest time a whole travel may
+    take on the stand's clock."""
 
-    serial_number: str
-    open_target: int
-    closed_target: int
-    tolerance: int
-    travel_s: float
+    serial_number: str = Field(pattern=r"^[!-~]{1,32}$")
+    backend: str | None = Field(default=None, pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*$")
+    backend_address: TcpAddress | None = None
+    open_target: int = Field(default=3500, ge=0, le=4095)
+    closed_target: int = Field(default=500, ge=0, le=4095)
+    tolerance: int = Field(default=40, ge=1, le=500)
+    travel_s: float = Field(default=5.0, gt=0, le=60)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if abs(self.open_target - self.closed_target) <= 2 * self.tolerance:
+            raise ValueError("open_target and closed_target are closer than twice the tolerance")
+        if (self.backend is None) != (self.backend_address is None):
+            raise ValueError("backend and backend_address go together")
+        return self
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Collection, Iterable, Mapping
+from typing import Annotated, Literal, Self, get_args
 
+from pydantic import Field, model_validator
+
+from drivers.settings import OnBus, PollPeriod_s
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import Point, RegisterMap
@@ -15,6 +19,27 @@ COIL_ON = 0xFF00
 COIL_OFF = 0x0000
 MAX_PULSE_COUNTS = 0x7FFF
 CAMERA_POWER = "camera_power"  # stays on by default: a warm camera is hours of work, and harms nobody
+
+
+RelayName = Literal["heater_enable", "compressor", "camera_power"]
+
+
+class RelaysSettings(OnBus):
+    """The relay board: which relay does what (0 is the first). self_test_s: of the timed-on with which the board's
+    timer is tested, once at the start of each run; the test takes 2.2 times as long."""
+
+    channels: dict[RelayName, Annotated[int, Field(ge=0, le=31)]]
+    poll_s: PollPeriod_s = 5.0
+    self_test_s: float = Field(default=3.0, ge=0.6, le=10)
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        missing = set(get_args(RelayName)) - set(self.channels)
+        if missing:
+            raise ValueError(f"channels lacks {', '.join(sorted(missing))}")
+        if len(set(self.channels.values())) < len(self.channels):
+            raise ValueError("two channels share one relay")
+        return self
 
 
 class Relays:

@@ -10,11 +10,15 @@ import contextlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
 
 from drivers.devices.motion import Motion, Turn
+from drivers.settings import Polled, PollPeriod_s, Range
 from drivers.wires.link import SerialSettings, open_link
 from drivers.wires.ximc_client import XimcClient
+from foundation.addresses import ByteAddress
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from foundation.lane import Lane, Result
@@ -49,7 +53,7 @@ _NOT_HOMED = "not homed"
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """unit per full step, the way (in units) that every move ends upwards at least.
+    """unit per full step, the way (in units) that every move ends upwards at least, and how far it travels.
 
     `home_from`: from where the homing procedure, which seeks its switch downwards, has a short way to it; None: from
     anywhere. The rotary table's switch is 12.5 deg above its zero (HomeDelta -1250): from below it would go all the way
@@ -59,27 +63,41 @@ class Profile:
     unit: Literal["mm", "deg"]
     unit_per_step: float
     overshoot: float
+    travel: float
     home_from: float | None = None
 
 
-PROFILES: dict[str, Profile] = {
-    "8MT160-300": Profile("mm", 0.0025, 0.5),
-    "8MR151": Profile("deg", 0.01, 1.0, home_from=16.0),
+ProfileName = Literal["8MT160-300", "8MR151"]
+PROFILES: dict[ProfileName, Profile] = {
+    "8MT160-300": Profile("mm", 0.0025, 0.5, travel=300.0),
+    "8MR151": Profile("deg", 0.01, 1.0, travel=360.0, home_from=16.0),  # it goes round, its cables do not
 }
 
 
-@dataclass(frozen=True, slots=True)
-class AxisSettings:
-    """`address`: serial:PATH or tcp:HOST:PORT. `profile`: a key of PROFILES.
+class AxisSettings(Polled):
+    """A stage behind a Standa XIMC controller; lengths in the profile's unit.
 
-    `limits`: lowest and highest target. To reach a target from below, the stage passes the lowest by up to the
+    limits: lowest and highest target. To reach a target from below, the stage passes the lowest by up to the
     profile's overshoot, which must be free.
     """
 
-    address: str
-    serial_number: int
-    profile: str
-    limits: tuple[float, float]
+    address: ByteAddress
+    serial_number: int = Field(ge=0, le=0xFFFFFFFF)
+    profile: ProfileName
+    limits: Range
+    poll_s: PollPeriod_s = 5.0
+
+    @model_validator(mode="after")
+    def _within_travel(self) -> Self:
+        travel, unit = PROFILES[self.profile].travel, self.unit
+        if max(map(abs, self.limits)) > travel:
+            raise ValueError(f"limits {self.limits} are beyond the travel of {travel:g} {unit}")
+        return self
+
+    @property
+    def unit(self) -> Literal["mm", "deg"]:
+        """The axis' unit."""
+        return PROFILES[self.profile].unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +142,6 @@ class Axis:
     """
 
     def __init__(self, name: str, settings: AxisSettings, clock: Clock) -> None:
-        if settings.profile not in PROFILES:
-            raise ValueError(f"{name}: no stage profile {settings.profile!r}, only {', '.join(PROFILES)}")
         self.name = name
         self._settings = settings
         self.profile = PROFILES[settings.profile]

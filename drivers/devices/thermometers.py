@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
+from pydantic import Field
+
+from drivers.settings import Line, Range
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import RegisterMap, Sample
 from foundation.clock import Clock
+from foundation.documents import Document
 from foundation.errors import ConfigError, DeviceError, Unreachable
 from foundation.readings import Quality, Reading, bad_reading
 
+PLAUSIBLE_DEGC = (-40.0, 100.0)
 
-@dataclass(frozen=True, slots=True)
-class ThermometerChannel:
+
+class ThermometerSettings(Document):
     """One sensor: `channel` 0.. of the module and its calibration against a certificate.
 
     T = t + offset_K + sum_k polynomial[k] * t**k, where t is what the module says, in degC. A calibrated value outside
     plausible_degC is no measurement.
     """
 
-    channel: int
-    offset_K: float = 0.0
-    polynomial: tuple[float, ...] = ()
-    certificate: str = ""
-    plausible_degC: tuple[float, float] = (-50.0, 100.0)
+    channel: int = Field(ge=0, le=15)
+    offset_K: float = Field(default=0.0, ge=-10, le=10)  # a Pt100 that is further off is broken
+    polynomial: tuple[float, ...] = Field(default=(), max_length=8)
+    certificate: Line = ""
+    plausible_degC: Range = PLAUSIBLE_DEGC
 
     def calibrated_degC(self, indicated_degC: float) -> float:
         """The temperature for an indication."""
@@ -47,7 +51,7 @@ class Thermometers:
         name: str,
         bus: Bus,
         register_map: RegisterMap,
-        channels: Mapping[str, ThermometerChannel],
+        channels: Mapping[str, ThermometerSettings],
         clock: Clock,
     ) -> None:
         self.name = name
@@ -106,7 +110,7 @@ class Thermometers:
         yield Reading(f"{channel}_raw", float(sample.raw), "1", now_ns)
 
     def _calibrated(
-        self, channel: str, sensor: ThermometerChannel, sample: Sample, alarms: str, unconfirmed: str, now_ns: int
+        self, channel: str, sensor: ThermometerSettings, sample: Sample, alarms: str, unconfirmed: str, now_ns: int
     ) -> Reading:
         if reason := sample.reason or alarms:
             return bad_reading(channel, "degC", now_ns, reason)

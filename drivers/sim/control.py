@@ -18,6 +18,7 @@ from drivers.sim.faults import LinkFaults
 from drivers.sim.laboratory import Laboratory
 from drivers.sim.laboratory_faults import FAULTS, inject
 from drivers.sim.wire import Lines, TcpWire
+from foundation.addresses import tcp_place
 
 
 class Control:
@@ -64,5 +65,5 @@ class Control:
 def serve_control(laboratory: Laboratory, quit_: Callable[[], None]) -> TcpWire:
     """Listen on the laboratory's control address; `quit_` is called for a `quit` request."""
     control = Control(laboratory, quit_)
-    host, port = laboratory.spec.control.removeprefix("tcp:").rsplit(":", 1)
-    return TcpWire(host, int(port), lambda: Lines(control.answer), LinkFaults())
+    place = tcp_place(laboratory.spec.control, may_be_free=True)
+    return TcpWire(*place, lambda: Lines(control.answer), LinkFaults())

@@ -25,6 +25,7 @@ from drivers.sim.usb import UsbServer
 from drivers.sim.wire import Engine, PtyWire, TcpWire
 from drivers.sim.ximc import FakeAxis
 from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from foundation.addresses import tcp_place
 from foundation.clock import FollowedClock, WallClock
 from foundation.documents import Document
 from foundation.errors import ConfigError
@@ -106,6 +107,9 @@ class Laboratory:
             raise ConfigError(
                 f"an address of the simulated laboratory cannot be used; is one running already? ({error})"
             ) from error
+        except ValueError as error:
+            self.close()
+            raise ConfigError(f"laboratory: {error}") from error
         except BaseException:
             self.close()
             raise
@@ -154,7 +158,7 @@ class Laboratory:
             self.axes[str(name)] = axis
             self._listen(name, settings.address, axis.engine)
         self.flap = FakeFlap(plant, clock, spec.flap.serial_number or "")
-        usb = UsbServer(*_host_and_port(spec.flap.address or ""), [self.flap])
+        usb = UsbServer(*tcp_place(spec.flap.address or "", may_be_free=True), [self.flap])
         self._closers.append(usb.close)
         self.camera = self._camera_at(spec.camera.address) if spec.camera.address else self._camera_at_a_free_address()
         self._closers.append(self.camera.close)
@@ -199,7 +203,7 @@ class Laboratory:
             path = address.removeprefix("serial:")
             wire: PtyWire | TcpWire = PtyWire(Path(path) if path else None, make_engine(), faults)
         else:
-            wire = TcpWire(*_host_and_port(address), make_engine, faults)
+            wire = TcpWire(*tcp_place(address, may_be_free=True), make_engine, faults)
         self._closers.append(wire.close)
         self.addresses[name] = wire.address
         return wire, faults
@@ -209,11 +213,3 @@ class Laboratory:
             self.plant.advance(time_ns if self._followed is None else self._clock.now_ns())
             optics, flap_open = self.plant.optics(time_ns), self.plant.flap_open_at(time_ns)
         return self._scene.render(optics, time_ns, exposure_s, gain_dB, flap_open)
-
-
-def _host_and_port(address: str) -> tuple[str, int]:
-    kind, _, place = address.partition(":")
-    host, _, port = place.rpartition(":")
-    if kind != "tcp" or not port.isdigit():
-        raise ConfigError(f"laboratory: expected tcp:HOST:PORT, not {address!r}")
-    return host, int(port)

@@ -28,6 +28,7 @@ from usb.core import USBError, USBTimeoutError
 
 from drivers.sim.faults import LinkFaults
 from drivers.sim.wire import Lines, TcpWire
+from foundation.addresses import tcp_place
 
 GET_DESCRIPTOR_IN, GET_DESCRIPTOR, STRING_DESCRIPTOR = 0x80, 6, 3
 LANGUAGES = b"\x04\x03\x09\x04"  # one language: English (United States)
@@ -154,11 +155,7 @@ def _string(device: UsbDevice, index: int) -> bytes:
 
 def get_backend(address: str) -> ForwardingBackend:
     """A pyusb backend that finds the devices of the simulator at `address`, "tcp:HOST:PORT"; ValueError else."""
-    scheme, _, place = address.partition(":")
-    host, _, port = place.rpartition(":")
-    if scheme != "tcp" or not host or not port.isdecimal():
-        raise ValueError(f"a simulated USB address is tcp:HOST:PORT, not {address!r}")
-    return ForwardingBackend(host, int(port))
+    return ForwardingBackend(*tcp_place(address))
 
 
 @dataclass(frozen=True, slots=True)

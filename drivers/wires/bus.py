@@ -13,13 +13,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from drivers.wires.modbus_client import Fault, LineSettings, ModbusClient, WireFault
+from drivers.wires.modbus_client import BusSettings, Fault, ModbusClient, WireFault
 from drivers.wires.registers import Space
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 from foundation.lane import Lane
 
-__all__ = ["Bus", "BusCounters", "LineSettings"]
+__all__ = ["Bus", "BusCounters", "BusSettings"]
 
 Result = TypeVar("Result")
 
@@ -82,28 +82,19 @@ class _Health:
 class Bus:
     """A Modbus line that several devices share: `serial:PATH` (RTU) or `tcp:HOST:PORT` (a Modbus TCP gateway).
 
-    timeout_s must exceed the slowest normal reply of any unit; gap_s is the silence between frames on a serial line (a
-    gateway keeps its own). All calls raise Unreachable, GarbledReply or Refused naming `device`. Reads are tried up
+    All calls raise Unreachable, GarbledReply or Refused naming `device`. Reads are tried up
     to three times when the unit answered last time, be it garbled. Writes go out once, and to a dead unit or line too,
     so that a make-safe is never withheld. `counters` are public.
     """
 
-    def __init__(
-        self,
-        name: str,
-        address: str,
-        clock: Clock,
-        line: LineSettings,
-        timeout_s: float = 0.3,
-        gap_s: float = 0.005,
-    ) -> None:
+    def __init__(self, name: str, settings: BusSettings, clock: Clock) -> None:
         self.name = name
-        self.address = address
+        self.address = settings.address
         self.counters = BusCounters()
         self.clock = clock
-        self._client = ModbusClient(address, line, timeout_s)
-        self._gap_s = gap_s if self._client.serial else 0.0
-        self._quarantine_s = timeout_s + QUARANTINE_MARGIN_S
+        self._client = ModbusClient(settings)
+        self._gap_s = settings.gap_s if self._client.serial else 0.0
+        self._quarantine_s = settings.timeout_s + QUARANTINE_MARGIN_S
         self._lane: Lane | None = None
         self._health: dict[int, _Health] = {}
         self._line_fault = ""  # why the line is down, "" while it is up

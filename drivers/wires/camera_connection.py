@@ -28,7 +28,7 @@ from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_settings import (
     BYTES_PER_PIXEL,
     NO_CONTROL_HINT,
-    CameraSettings,
+    GigeCameraSettings,
     TemperatureFeature,
     apply_settings,
     find_temperature,
@@ -105,7 +105,7 @@ class Connection:
     """Opens the camera, takes control, writes the settings. AravisError, Refused."""
 
     def __init__(
-        self, name: str, settings: CameraSettings, clock: Clock, frames: FrameCount, counts: Counter[str]
+        self, name: str, settings: GigeCameraSettings, clock: Clock, frames: FrameCount, counts: Counter[str]
     ) -> None:
         self.control_lost = threading.Event()
         self._name = name
@@ -368,7 +368,7 @@ class Connection:
         return self._device.read_register(high) << 32 | self._device.read_register(low)
 
 
-def _open_controlled(name: str, settings: CameraSettings) -> GigeDevice:
+def _open_controlled(name: str, settings: GigeCameraSettings) -> GigeDevice:
     """The camera with us in control.
 
     A client that died keeps the camera until its heartbeat runs out: try for that long and a little more.

@@ -5,20 +5,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self, cast
 
+from pydantic import Field, model_validator
+
+from drivers.settings import CameraSettings
 from drivers.wires.aravis import GigeDevice
 from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
+from foundation.addresses import IpAddress
+from foundation.documents import Document
 from foundation.errors import DeviceError, Refused, Unreachable
 from foundation.readings import Cause
 
-BYTES_PER_PIXEL = {"Mono8": 1, "Mono10": 2, "Mono12": 2, "Mono16": 2}
+PixelFormat = Literal["Mono8", "Mono10", "Mono12", "Mono16"]
+BYTES_PER_PIXEL: dict[PixelFormat, int] = {"Mono8": 1, "Mono10": 2, "Mono12": 2, "Mono16": 2}
 
 # Bootstrap registers every GigE Vision camera has (GigE Vision 1.2, section 28).
 VENDOR, MODEL, VERSION, SERIAL = (0x0048, 32), (0x0068, 32), (0x0088, 32), (0x00D8, 16)
 HEARTBEAT_TIMEOUT_MS = 0x0938
-
-LEAST_HEARTBEAT_S = 1.5
 
 # Wider than any sensor's quantisation (line time, 0.1..0.36 dB steps), narrower than a clamped value.
 EXPOSURE_TOLERANCE, EXPOSURE_TOLERANCE_S = 0.01, 50e-6
@@ -37,67 +41,68 @@ NO_CONTROL = {10, 17}  # not controller, access denied
 NO_CONTROL_HINT = "another client controls the camera, or one that died held it less than its heartbeat ago"
 
 
-@dataclass(frozen=True, slots=True)
-class TemperatureFeature:
-    """Where the camera shows its temperature: a float feature (after `selector` is set to `entry`), or a 32-bit
-    register holding (value & mask) * scale + offset in degC. Outside min_degC..max_degC a value is not believed."""
+class TemperatureFeature(Document):
+    """Where the camera shows its temperature: a float feature (after `selector` is set to `entry`; null for a camera
+    that has no selector), or a 32-bit register holding (value & mask) * scale + offset in degC. Outside
+    min_degC..max_degC a value is not believed."""
 
-    feature: str | None = None
-    selector: str | None = None
-    entry: str | None = None
-    register: int | None = None
-    mask: int = 0xFFFFFFFF
+    feature: str | None = Field(default="DeviceTemperature", min_length=1)
+    selector: str | None = Field(default="DeviceTemperatureSelector", min_length=1)
+    entry: str | None = Field(default="Sensor", min_length=1)
+    register_address: int | None = Field(default=None, ge=0, le=0xFFFFFFFC, multiple_of=4)
+    mask: int = Field(default=0xFFFFFFFF, ge=0, le=0xFFFFFFFF)
     scale: float = 1.0
     offset: float = 0.0
     min_degC: float = -40.0
     max_degC: float = 120.0
 
-    def __post_init__(self) -> None:
-        if (self.feature is None) == (self.register is None):
-            raise ValueError("a temperature is a feature or a register, one of them")
+    @model_validator(mode="before")
+    @classmethod
+    def _register_instead_of_feature(cls, data: object) -> object:
+        if isinstance(data, dict) and "register_address" in data:
+            return {"feature": None, "selector": None, "entry": None, **cast("dict[str, object]", data)}
+        return data
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.feature is None) == (self.register_address is None):
+            raise ValueError("a temperature is a feature or a register_address, one of them")
         if (self.selector is None) != (self.entry is None):
-            raise ValueError("a temperature selector needs an entry, and an entry its selector")
+            raise ValueError("selector and entry go together")
+        if self.min_degC >= self.max_degC:
+            raise ValueError(f"min_degC {self.min_degC} is not below max_degC {self.max_degC}")
+        return self
 
 
 # GenICam SFNC 2, then Basler's older name.
-USUAL_TEMPERATURES = (TemperatureFeature("DeviceTemperature"), TemperatureFeature("TemperatureAbs"))
+USUAL_TEMPERATURES = tuple(
+    TemperatureFeature(feature=name, selector=None, entry=None) for name in ("DeviceTemperature", "TemperatureAbs")
+)
 
 
-@dataclass(frozen=True, slots=True)
-class CameraSettings:
-    """What the stand asks of a camera; all of it is written at each open.
+class GigeCameraSettings(CameraSettings):
+    """A GigE Vision camera; all of it is written at each open.
 
-    address: IP. serial_number: refused when another camera answers; None takes any. width_px, height_px: from the
-    sensor's first pixel; None the whole sensor. trigger: one frame per software trigger, or frames at frame_rate_hz all
-    the time (constant self-heating). packet_size: bytes of an IP packet; None lets Aravis find it. heartbeat_s: the
-    camera frees itself after so long without us. temperature: None looks for the usual features, unless the camera is
-    said to have none (has_temperature). resend: lost packets are asked for again.
+    address: IP. packet_size: bytes of an IP packet; none lets Aravis find it. packet_delay_ns: pause between two
+    packets, for a host or switch that loses some. heartbeat_s: the camera frees itself after so long without us
+    (Aravis asks once a second). temperature: none looks for the usual features. resend: lost packets are asked for
+    again. buffers: frames that the host keeps in reserve.
     """
 
-    address: str
-    serial_number: str | None = None
-    pixel_format: str = "Mono8"
-    width_px: int | None = None
-    height_px: int | None = None
-    exposure_s: float = 0.1
-    gain_dB: float = 0.0
-    trigger: Literal["software", "free_run"] = "software"
-    frame_rate_hz: float = 2.0
-    packet_size: int | None = None
-    packet_delay_ns: int = 0
-    heartbeat_s: float = 3.0
+    address: IpAddress
+    pixel_format: PixelFormat = "Mono8"
+    packet_size: int | None = Field(default=None, ge=220, le=16112)
+    packet_delay_ns: int = Field(default=0, ge=0, le=1_000_000_000)
+    heartbeat_s: float = Field(default=3.0, ge=1.5, le=60)
     temperature: TemperatureFeature | None = None
-    has_temperature: bool = True
     resend: bool = True
-    buffers: int = 6
+    buffers: int = Field(default=6, ge=1, le=100)
 
-    def __post_init__(self) -> None:
-        if self.pixel_format not in BYTES_PER_PIXEL:
-            raise ValueError(f"pixel_format is one of {', '.join(BYTES_PER_PIXEL)}, not {self.pixel_format}")
-        if min(self.exposure_s, self.frame_rate_hz, self.buffers) <= 0:
-            raise ValueError("exposure_s, frame_rate_hz and buffers are positive")
-        if self.heartbeat_s < LEAST_HEARTBEAT_S:
-            raise ValueError(f"heartbeat_s is at least {LEAST_HEARTBEAT_S}: Aravis asks once a second")
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.temperature is not None and not self.has_temperature:
+            raise ValueError("has_temperature is false, yet temperature says where it is; leave one of them out")
+        return self
 
     @property
     def period_s(self) -> float:
@@ -114,7 +119,7 @@ class EffectiveSettings:
 
     width_px: int
     height_px: int
-    pixel_format: str
+    pixel_format: PixelFormat
     exposure_s: float
     gain_dB: float
     frame_rate_hz: float
@@ -163,7 +168,7 @@ def read_identity(device: GigeDevice) -> Identity:
     return Identity(*(device.read_text(*register) for register in (VENDOR, MODEL, SERIAL, VERSION)))
 
 
-def apply_settings(name: str, device: GigeDevice, settings: CameraSettings) -> EffectiveSettings:
+def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) -> EffectiveSettings:
     """Write everything, read it back and compare; Refused when the camera did otherwise.
 
     Acquisition must be off: cameras lock region, pixel format and packet size while they stream.
@@ -210,7 +215,7 @@ def _set_heartbeat(device: GigeDevice, heartbeat_s: float) -> float:
     return device.read_register(HEARTBEAT_TIMEOUT_MS) / 1000
 
 
-def _set_region(name: str, device: GigeDevice, settings: CameraSettings) -> tuple[int, int]:
+def _set_region(name: str, device: GigeDevice, settings: GigeCameraSettings) -> tuple[int, int]:
     """Pixel format and region, to the letter."""
     device.set_pixel_format(settings.pixel_format)
     if device.pixel_format() != settings.pixel_format:
@@ -239,7 +244,7 @@ def _set_gain(name: str, device: GigeDevice, gain_dB: float) -> float:
     return 0.0
 
 
-def _set_trigger(name: str, device: GigeDevice, settings: CameraSettings) -> float:
+def _set_trigger(name: str, device: GigeDevice, settings: GigeCameraSettings) -> float:
     """Software trigger or free run; returns the rate in force, the configured one with a trigger."""
     if settings.trigger == "software":
         device.set_trigger("Software")
@@ -257,7 +262,7 @@ def _set_trigger(name: str, device: GigeDevice, settings: CameraSettings) -> flo
     return rate_hz
 
 
-def _set_packets(name: str, device: GigeDevice, settings: CameraSettings) -> tuple[int, int]:
+def _set_packets(name: str, device: GigeDevice, settings: GigeCameraSettings) -> tuple[int, int]:
     """Packet size and the pause between packets."""
     if settings.packet_size is None:
         device.find_packet_size()
@@ -311,7 +316,7 @@ def temperature_place(device: GigeDevice, place: TemperatureFeature) -> str:
 
 def _named(place: TemperatureFeature) -> str:
     if place.feature is None:
-        return f"register {place.register or 0:#x}"
+        return f"register {place.register_address or 0:#x}"
     return place.feature if place.selector is None else f"{place.feature} of {place.selector} {place.entry!r}"
 
 
@@ -327,8 +332,8 @@ def _offered(device: GigeDevice, place: TemperatureFeature) -> str:
 def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[float, str, Cause]:
     """Temperature in degC and ""; or NaN, the reason and who says so. Never raises: a run goes on without it."""
     try:
-        if place.register is not None:
-            value_degC = (device.read_register(place.register) & place.mask) * place.scale + place.offset
+        if place.register_address is not None:
+            value_degC = (device.read_register(place.register_address) & place.mask) * place.scale + place.offset
         else:
             value_degC = device.get_float(place.feature or "")
     except AravisError as error:

@@ -13,7 +13,8 @@ from typing import Protocol
 
 import serial
 
-from foundation.errors import ConfigError, Unreachable
+from foundation.addresses import SerialPlace, place_of
+from foundation.errors import Unreachable
 
 _CONNECT_S = 1.0
 _WRITE_S = 1.0  # a device that takes no bytes must not hold the caller
@@ -45,15 +46,12 @@ class SerialSettings:
 
 
 def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
-    """Open `serial:PATH` (exclusively) or `tcp:HOST:PORT` for `device`; raises Unreachable, or ConfigError when
+    """Open `serial:PATH` (exclusively) or `tcp:HOST:PORT` for `device`; raises Unreachable, or ValueError when
     `address` is neither."""
-    kind, _, place = address.partition(":")
-    if kind == "serial" and place:
-        return _SerialLink(device, place, settings)
-    host, _, port = place.rpartition(":")
-    if kind == "tcp" and host and port.isdecimal() and 0 < int(port) < 65536:
-        return _TcpLink(device, host, int(port))
-    raise ConfigError(f"{device}: an address is serial:PATH or tcp:HOST:PORT, not {address!r}")
+    place = place_of(address)
+    if isinstance(place, SerialPlace):
+        return _SerialLink(device, place.path, settings)
+    return _TcpLink(device, place.host, place.port)
 
 
 class _SerialLink:

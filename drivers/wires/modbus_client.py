@@ -11,11 +11,11 @@ import socket
 import struct
 import termios
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
 import serial
+from pydantic import Field
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException
 from pymodbus.pdu import ModbusPDU
@@ -28,7 +28,8 @@ from pymodbus.pdu.register_message import (
 )
 
 from drivers.wires.registers import Space
-from foundation.errors import ConfigError
+from foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of
+from foundation.documents import Document
 
 # Every fault is raised and counted here; pymodbus would print it a second time on stderr.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
@@ -53,13 +54,17 @@ EXCEPTIONS = {
 UNANSWERED_EXCEPTIONS = frozenset({6, 10, 11})  # somebody answered, but not the unit, or not now
 
 
-@dataclass(frozen=True, slots=True)
-class LineSettings:
-    """An RS-485 line: baud, parity N, E or O, stop bits; always 8 data bits. Every unit on it is set to the same."""
+class BusSettings(Document):
+    """An RS-485 bus, by a serial adapter or behind a Modbus TCP gateway; every unit is set to the same line, which has
+    8 data bits. Real seconds: timeout_s must exceed the slowest normal reply of any unit; gap_s is the silence between
+    a reply and the next request on a serial line (a gateway keeps its own)."""
 
-    baud: int = 9600
+    address: ByteAddress
+    baud: int = Field(default=9600, ge=1200, le=921600)
     parity: Literal["N", "E", "O"] = "N"
     stopbits: Literal[1, 2] = 1
+    timeout_s: float = Field(default=0.3, gt=0, le=10)
+    gap_s: float = Field(default=0.005, ge=0, le=1)
 
 
 class Fault(StrEnum):
@@ -140,15 +145,13 @@ class _TcpClient(ModbusTcpClient):
 class ModbusClient:
     """A blocking Modbus master on one line, for one thread. Bounded: a transaction ends within twice the time-out."""
 
-    def __init__(self, address: str, line: LineSettings, timeout_s: float) -> None:
-        self.serial = address.startswith("serial:")
-        self._address = address
-        self._line = line
-        self._timeout_s = timeout_s
+    def __init__(self, settings: BusSettings) -> None:
+        self._settings = settings
+        self._place = place_of(settings.address)
+        self.serial = isinstance(self._place, SerialPlace)
         self._client: _SerialClient | _TcpClient | None = None
         self._sent = b""
         self._heard = b""
-        self._target = _parse(address)
 
     def connect(self) -> None:
         """Open the port or connection unless it is open; raises WireFault LINE_DOWN with the reason."""
@@ -160,22 +163,24 @@ class ModbusClient:
             client.connect()
         except (OSError, termios.error) as error:
             client.close()
-            raise WireFault(Fault.LINE_DOWN, f"cannot open {self._address}: {error}") from error
+            raise WireFault(Fault.LINE_DOWN, f"cannot open {self._settings.address}: {error}") from error
         self._client = client
 
     def _make(self) -> _SerialClient | _TcpClient:
-        host, port = self._target
-        if port is None:
-            return _SerialClient(
-                host,
-                baudrate=self._line.baud,
-                parity=self._line.parity,
-                stopbits=self._line.stopbits,
-                timeout=self._timeout_s,
-                retries=0,
-                trace_packet=self._trace,
+        settings, place = self._settings, self._place
+        if isinstance(place, TcpPlace):
+            return _TcpClient(
+                place.host, port=place.port, timeout=settings.timeout_s, retries=0, trace_packet=self._trace
             )
-        return _TcpClient(host, port=port, timeout=self._timeout_s, retries=0, trace_packet=self._trace)
+        return _SerialClient(
+            place.path,
+            baudrate=settings.baud,
+            parity=settings.parity,
+            stopbits=settings.stopbits,
+            timeout=settings.timeout_s,
+            retries=0,
+            trace_packet=self._trace,
+        )
 
     def close(self) -> None:
         """Let go of the port or connection; never raises, may be called twice."""
@@ -253,20 +258,20 @@ class ModbusClient:
     def _execute(self, request: ModbusPDU) -> ModbusPDU:
         client = self._client
         if client is None:
-            raise WireFault(Fault.LINE_DOWN, f"{self._address} is closed")
+            raise WireFault(Fault.LINE_DOWN, f"{self._settings.address} is closed")
         self._heard = b""
         try:
             return client.execute(False, request)
         except ConnectionException as error:
             self.close()
-            raise WireFault(Fault.LINE_DOWN, f"{self._address} is gone: {error.string}") from error
+            raise WireFault(Fault.LINE_DOWN, f"{self._settings.address} is gone: {error.string}") from error
         except ModbusException as error:
             if self._heard:
                 raise WireFault(Fault.GARBLED, f"no valid reply in {self._heard.hex(' ')}") from error
-            raise WireFault(Fault.SILENCE, f"no reply within {self._timeout_s:g} s") from error
+            raise WireFault(Fault.SILENCE, f"no reply within {self._settings.timeout_s:g} s") from error
         except (OSError, termios.error) as error:
             self.close()
-            raise WireFault(Fault.LINE_DOWN, f"{self._address} is gone: {error}") from error
+            raise WireFault(Fault.LINE_DOWN, f"{self._settings.address} is gone: {error}") from error
 
     def _trace(self, sending: bool, data: bytes) -> bytes:
         """pymodbus hands every packet here: what went out, and what has come and is not yet a frame."""
@@ -275,17 +280,6 @@ class ModbusClient:
         else:
             self._heard = data
         return data
-
-
-def _parse(address: str) -> tuple[str, int | None]:
-    """`serial:PATH` -> (path, None); `tcp:HOST:PORT` -> (host, port); raises ConfigError."""
-    kind, _, rest = address.partition(":")
-    if kind == "serial" and rest:
-        return rest, None
-    host, _, port = rest.rpartition(":")
-    if kind == "tcp" and host and port.isdecimal() and 0 < int(port) < 65536:
-        return host, int(port)
-    raise ConfigError(f"bus address {address!r} is neither serial:PATH nor tcp:HOST:PORT")
 
 
 def _exactly(values: list[int], expected: int, count: int) -> list[int]:

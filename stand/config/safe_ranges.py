@@ -9,12 +9,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
-CORRECTED_DEGC = (-40.0, 100.0)  # where a thermometer's correction is looked at
+from drivers.devices.thermometers import PLAUSIBLE_DEGC, ThermometerSettings
+
 _MOST_K = 1e9  # JSON has no infinity
 
 
@@ -56,19 +56,12 @@ SAFE_RANGES = (
 _CORRECTION = "a temperature that far from what the module indicates is a slip in the file, and hides heat"
 
 
-class _Thermometer(Protocol):
-    @property
-    def offset_K(self) -> float: ...
-    @property
-    def polynomial(self) -> tuple[float, ...]: ...
-
-
-def outside(config: object, thermometers: Mapping[str, _Thermometer]) -> dict[str, float]:
+def outside(config: object, thermometers: Mapping[str, ThermometerSettings]) -> dict[str, float]:
     """The values of `config` outside their safe ranges, by their paths."""
     return {safe.path: value for safe, value in _values(config, thermometers) if value not in safe}
 
 
-def check(config: object, thermometers: Mapping[str, _Thermometer], accepted: Sequence[str]) -> None:
+def check(config: object, thermometers: Mapping[str, ThermometerSettings], accepted: Sequence[str]) -> None:
     """ValueError with a sentence for each value that is outside its range and not `accepted`, and for each entry of
     `accepted` that is no such path, is given twice, or has a value within its range."""
     found = list(_values(config, thermometers))
@@ -86,7 +79,7 @@ def check(config: object, thermometers: Mapping[str, _Thermometer], accepted: Se
         raise ValueError("; ".join(faults))
 
 
-def _values(config: object, thermometers: Mapping[str, _Thermometer]) -> Iterator[tuple[SafeRange, float]]:
+def _values(config: object, thermometers: Mapping[str, ThermometerSettings]) -> Iterator[tuple[SafeRange, float]]:
     for safe in SAFE_RANGES:
         yield safe, float(attrgetter(safe.path)(config))
     for name, entry in thermometers.items():
@@ -95,7 +88,7 @@ def _values(config: object, thermometers: Mapping[str, _Thermometer]) -> Iterato
 
 
 def _refusal(safe: SafeRange, value: float) -> str:
-    low_degC, high_degC = CORRECTED_DEGC
+    low_degC, high_degC = PLAUSIBLE_DEGC
     what = f"{value:g}{safe.unit}"
     if safe.reason == _CORRECTION:
         what = f"with offset_K a correction of up to {what} over {low_degC:g} to {high_degC:g} degC"
@@ -106,9 +99,9 @@ def _refusal(safe: SafeRange, value: float) -> str:
 
 
 def largest_correction_K(offset_K: float, polynomial: Sequence[float]) -> float:
-    """The largest distance, K, of a corrected temperature from the indicated one over CORRECTED_DEGC; 1e9 when it is
+    """The largest distance, K, of a corrected temperature from the indicated one over PLAUSIBLE_DEGC; 1e9 when it is
     more, or cannot be computed."""
-    low_degC, high_degC = CORRECTED_DEGC
+    low_degC, high_degC = PLAUSIBLE_DEGC
     with np.errstate(all="ignore"):
         correction = Polynomial([offset_K]) + Polynomial(polynomial or [0.0])
         try:

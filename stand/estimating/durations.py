@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from drivers.devices.stage import PROFILES
+from drivers.devices.stage import PROFILES, AxisSettings
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -28,7 +28,7 @@ from experiments.steps import (
     kind_of,
 )
 from foundation.errors import ConfigError
-from stand.config.stand_config import AxisConfig, StandConfig
+from stand.config.stand_config import StandConfig
 from stand.estimating.thermal_model import ChamberModel
 
 # Until recorded nights have shown better, s: a flap's travel with its confirmation, homing from near the switch.
@@ -118,7 +118,7 @@ def expect(
     return replace(usual, overhead_s=overheads_s.get(usual.work, usual.overhead_s))
 
 
-def axis_of(config: StandConfig, name: str) -> AxisConfig:
+def axis_of(config: StandConfig, name: str) -> AxisSettings:
     """The stand's axis of that name; ConfigError when it has none."""
     axis = next((axis for known, axis in config.axes.items() if known == name), None)
     if axis is None:
@@ -161,7 +161,7 @@ def _usual(step: Step, found: Situation, config: StandConfig, chamber: ChamberMo
             return Expectation(kind_of(step), estimate_s(step, config.camera.boot_s), 0.0)
 
 
-def _move_s(axis: AxisConfig, begin: float, end: float) -> float:
+def _move_s(axis: AxisSettings, begin: float, end: float) -> float:
     """As the driver moves: when not from below, past the end first, then up to it."""
     profile, pace = PROFILES[axis.profile], _PACES[axis.profile]
     below = end - profile.overshoot
@@ -169,5 +169,5 @@ def _move_s(axis: AxisConfig, begin: float, end: float) -> float:
     return sum(pace.move_s(way / profile.unit_per_step) for way in ways)
 
 
-def _to_home_s(axis: AxisConfig, position: float) -> float:
+def _to_home_s(axis: AxisSettings, position: float) -> float:
     return abs(position) / PROFILES[axis.profile].unit_per_step / _PACES[axis.profile].homing_speed

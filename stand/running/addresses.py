@@ -8,6 +8,7 @@ import socket
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from foundation.addresses import SerialPlace, place_of
 from stand.config.stand_config import StandConfig
 
 
@@ -42,13 +43,12 @@ def addresses(config: StandConfig) -> tuple[Address, ...]:
 
 def _places(address: str) -> Iterator[str]:
     """The name that was given for a serial port counts as well: after a replug it leads to another device file."""
-    kind, _, place = address.partition(":")
-    if kind == "serial":
-        yield from {f"serial {os.path.abspath(place)}", f"serial {os.path.realpath(place)}"}
+    place = place_of(address)
+    if isinstance(place, SerialPlace):
+        yield from {f"serial {os.path.abspath(place.path)}", f"serial {os.path.realpath(place.path)}"}
         return
-    host, _, port = place.rpartition(":")
-    for ip in _resolved(host):
-        yield _of_host("tcp", ip, f":{int(port)}")
+    for ip in _resolved(place.host):
+        yield _of_host("tcp", ip, f":{place.port}")
 
 
 def _resolved(host: str) -> set[str]:

@@ -12,7 +12,7 @@ import math
 import time
 from pathlib import Path
 
-from drivers.devices.camera import Camera, CameraSettings
+from drivers.devices.camera import Camera, GigeCameraSettings
 from drivers.wires.aravis_library import library
 from foundation.clock import WallClock
 from foundation.errors import StandError
@@ -41,7 +41,9 @@ def figures(directory: Path) -> list[Figure]:
 
 def _at_pace(what: str, pace_MBps: int) -> Figure:
     progress(f"{what} at {pace_MBps} MB/s")
-    settings = CameraSettings(ADDRESS, serial_number=SERIAL_NUMBER, exposure_s=0.001, packet_size=PACKET_SIZE)
+    settings = GigeCameraSettings(
+        address=ADDRESS, serial_number=SERIAL_NUMBER, exposure_s=0.001, packet_size=PACKET_SIZE
+    )
     with fakes("camera", ADDRESS, SERIAL_NUMBER, pace_MBps):
         own, limit = asyncio.run(_measure(Camera("camera", settings, WallClock()), pace_MBps))
     return side_by_side(what, "frames/s", f"wire paced at {pace_MBps} MB/s", own, limit)

@@ -16,7 +16,7 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.client.base import ModbusBaseSyncClient
 
 from drivers.devices.regulator import Regulator
-from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import Block, RegisterMap, load_register_map, plan_blocks
 from foundation.clock import WallClock
 from stand.config.stand_config import packaged
@@ -47,7 +47,7 @@ def figures(directory: Path) -> list[Figure]:
 def _compare(what: str, address: str, gap_s: float, client: ModbusBaseSyncClient, register_map: RegisterMap) -> Figure:
     progress(what)
     blocks = plan_blocks(register_map, register_map.polled())
-    bus = Bus("bus", address, WallClock(), LineSettings(baud=BAUD), TIMEOUT_s, gap_s)
+    bus = Bus("bus", BusSettings(address=address, baud=BAUD, timeout_s=TIMEOUT_s, gap_s=gap_s), WallClock())
     regulator = Regulator("regulator", bus, register_map, WallClock())
     with asyncio.Runner() as runner:
         runner.run(bus.open())

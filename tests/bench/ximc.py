@@ -63,7 +63,11 @@ def _client(path: Path, peer: VendorAxis) -> Figure:
 
 
 def _driver(path: Path, peer: VendorAxis) -> Figure:
-    axis = Axis("linear", AxisSettings(f"serial:{path}", 0x1234, "8MT160-300", (0, 280)), WallClock())
+    axis = Axis(
+        "linear",
+        AxisSettings(address=f"serial:{path}", serial_number=0x1234, profile="8MT160-300", limits=(0, 280)),
+        WallClock(),
+    )
     with asyncio.Runner() as runner:
         runner.run(axis.open())
         own, other = in_turns(

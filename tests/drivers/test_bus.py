@@ -17,13 +17,12 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.sim.faults import LinkFaults
 from drivers.sim.wire import PtyWire, TcpWire
-from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.bus import Bus, BusSettings
 from foundation.clock import VirtualClock, WallClock, seconds_ns
-from foundation.errors import ConfigError, DeviceError, GarbledReply, Refused, Unreachable
+from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 TIMEOUT_S = 0.05
 LATE_S = 0.08  # after the time-out, before the quarantine (0.1 s) ends
-LINE = LineSettings()
 
 
 def word(unit: int, address: int) -> int:
@@ -137,7 +136,7 @@ def responder() -> Responder:
 @pytest.fixture
 async def bus(responder: Responder, tmp_path: Path) -> AsyncIterator[Bus]:
     wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
-    bus = Bus("rs485", f"serial:{tmp_path / 'rs485'}", WallClock(), LINE, timeout_s=TIMEOUT_S, gap_s=0.0)
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S, gap_s=0.0), WallClock())
     await bus.open()
     yield bus
     await bus.close()
@@ -152,7 +151,7 @@ async def test_a_pymodbus_server_is_read_and_written_in_all_four_spaces(serve_mo
     bits = [SimData(0x80, values=[True, False, True, False, False, True], datatype=DataType.BITS)]
     registers = [SimData(0x2000, values=[100, 200, 0xFFFF], datatype=DataType.REGISTERS)]
     address = await serve_modbus([SimDevice(5, simdata=(bits, bits, registers, registers))], [])
-    bus = Bus("rs485", address, WallClock(), LINE, timeout_s=0.5)
+    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.5), WallClock())
     await bus.open()
     assert await bus.read("dut", 5, "coil", 0x80, 6) == [1, 0, 1, 0, 0, 1]
     assert await bus.read("dut", 5, "discrete", 0x82, 4) == [1, 0, 0, 1]
@@ -242,7 +241,7 @@ async def test_bytes_that_nobody_asked_for_are_thrown_away_before_the_next_reque
     master, slave = os.openpty()
     tty.setraw(slave)
     asyncio.get_running_loop().add_reader(master, lambda: os.write(master, responder.feed(os.read(master, 99))))
-    bus = Bus("rs485", f"serial:{os.ttyname(slave)}", WallClock(), LINE, timeout_s=TIMEOUT_S)
+    bus = Bus("rs485", BusSettings(address=f"serial:{os.ttyname(slave)}", timeout_s=TIMEOUT_S), WallClock())
     await bus.open()
     os.write(master, frame(bytes([1, 3, 12]) + bytes(12)))  # as a reply to the next request would look
     assert select.select([slave], [], [], 1.0)[0]  # the kernel passes them on a little later
@@ -256,7 +255,7 @@ async def test_bytes_that_nobody_asked_for_are_thrown_away_before_the_next_reque
 
 async def test_bytes_one_by_one_and_junk_before_a_reply_do_no_harm(responder: Responder, tmp_path: Path) -> None:
     wire = PtyWire(tmp_path / "slow", responder, LinkFaults(byte_by_byte=True))
-    bus = Bus("rs485", f"serial:{tmp_path / 'slow'}", WallClock(), LINE, timeout_s=TIMEOUT_S)
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'slow'}", timeout_s=TIMEOUT_S), WallClock())
     await bus.open()
     responder.fault = junk
     assert await read_is_right(bus, 100)
@@ -271,7 +270,7 @@ async def test_a_dead_unit_is_skipped_and_probed_at_growing_intervals_and_the_ot
     clock = VirtualClock(0)
     driver = asyncio.create_task(clock.run())
     wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
-    bus = Bus("rs485", f"serial:{tmp_path / 'rs485'}", clock, LINE, timeout_s=TIMEOUT_S)
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S), clock)
     await bus.open()
     responder.silent_units = {2}
     asked: list[int] = []
@@ -311,7 +310,7 @@ async def test_unplugged_and_replugged_it_works_again_within_two_seconds(respond
     clock = VirtualClock(0)
     driver = asyncio.create_task(clock.run())
     wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
-    bus = Bus("rs485", f"serial:{tmp_path / 'rs485'}", clock, LINE, timeout_s=TIMEOUT_S)
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S), clock)
     await bus.open()
     assert await read_is_right(bus, 100)
     wire.close()
@@ -330,7 +329,7 @@ async def test_unplugged_and_replugged_it_works_again_within_two_seconds(respond
 async def test_over_tcp_a_late_reply_dies_with_its_connection_and_a_hang_up_costs_nothing() -> None:
     responder = MbapResponder()
     wire = TcpWire("127.0.0.1", 0, lambda: responder, LinkFaults())
-    bus = Bus("gateway", f"tcp:127.0.0.1:{wire.port}", WallClock(), LINE, timeout_s=TIMEOUT_S)
+    bus = Bus("gateway", BusSettings(address=f"tcp:127.0.0.1:{wire.port}", timeout_s=TIMEOUT_S), WallClock())
     await bus.open()
     responder.fault = late
     assert await read_is_right(bus, 100)
@@ -370,14 +369,14 @@ async def test_a_soak_with_a_fault_in_every_sixth_reply_gives_no_wrong_value(
 
 
 async def test_a_second_opener_is_told_that_the_port_is_taken(bus: Bus) -> None:
-    other = Bus("other", bus.address, WallClock(), LINE)
+    other = Bus("other", BusSettings(address=bus.address), WallClock())
     with pytest.raises(Unreachable, match="lock"):
         await other.open()
     await other.close()
 
 
 async def test_a_missing_port_and_a_bus_not_open_say_so(tmp_path: Path) -> None:
-    bus = Bus("rs485", f"serial:{tmp_path / 'none'}", WallClock(), LINE)
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'none'}"), WallClock())
     with pytest.raises(Unreachable, match="not open"):
         await bus.read("dut", 1, "holding", 0, 1)
     with pytest.raises(Unreachable, match="No such file"):
@@ -389,6 +388,6 @@ async def test_a_missing_port_and_a_bus_not_open_say_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "address", ["", "serial:", "tcp:host", "tcp:host:0", "tcp:host:99999", "/dev/ttyUSB0", "udp:a:1"]
 )
-def test_an_address_that_is_none_is_a_config_error(address: str) -> None:
-    with pytest.raises(ConfigError, match="neither"):
-        Bus("rs485", address, WallClock(), LINE)
+def test_an_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(ValueError, match=r"expected (serial:PATH|tcp:HOST:PORT)"):
+        BusSettings(address=address)

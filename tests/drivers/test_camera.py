@@ -7,7 +7,7 @@ diagonal ramp: pixel = (x + y + frame) mod 255 at 10 ms of exposure.
 import numpy as np
 import pytest
 
-from drivers.devices.camera import Camera, CameraSettings, TemperatureFeature
+from drivers.devices.camera import Camera, GigeCameraSettings, TemperatureFeature
 from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from drivers.wires.camera_connection import FrameCount
 from drivers.wires.camera_settings import device_error
@@ -20,9 +20,9 @@ EXPOSURE_S = 0.01
 TEST_REGISTER = 0x1F0  # 0x12345678 in its XML
 
 
-def settings(**changes: object) -> CameraSettings:
+def settings(**changes: object) -> GigeCameraSettings:
     usual: dict[str, object] = {"width_px": 320, "height_px": 240, "exposure_s": EXPOSURE_S}
-    return CameraSettings(ADDRESS, **{**usual, **changes})  # pyright: ignore[reportArgumentType]
+    return GigeCameraSettings.model_validate({"address": ADDRESS, **usual, **changes})
 
 
 class Opened:
@@ -90,11 +90,17 @@ def test_settings_no_camera_could_take_are_refused_at_once(changes: dict[str, ob
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"feature": "A", "register": 4}, {"feature": "A", "selector": "B"}, {"feature": "A", "entry": "C"}],
+    [
+        {"feature": None},
+        {"feature": "A", "register_address": 4},
+        {"feature": "A", "selector": "B", "entry": None},
+        {"feature": "A", "selector": None, "entry": "C"},
+        {"register_address": 4, "selector": "B"},
+    ],
 )
 def test_a_temperature_is_one_place(changes: dict[str, object]):
-    with pytest.raises(ValueError, match="temperature"):
-        TemperatureFeature(**changes)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"one of them|go together"):
+        TemperatureFeature.model_validate(changes)
 
 
 @pytest.mark.usefixtures("stock_camera")
@@ -200,9 +206,13 @@ async def test_a_missing_temperature_is_a_bad_reading_with_its_reason():
 @pytest.mark.parametrize(
     ("register", "value", "reason"),
     [
-        (TemperatureFeature(register=TEST_REGISTER, mask=0xFF, scale=0.5, offset=-10.0), 50.0, ""),
-        (TemperatureFeature(register=TEST_REGISTER, mask=0xFF, scale=2.0), None, "240 degC is outside -40..120"),
-        (TemperatureFeature(register=TEST_REGISTER, mask=0), None, "the camera shows exactly 0 degC"),
+        (TemperatureFeature(register_address=TEST_REGISTER, mask=0xFF, scale=0.5, offset=-10.0), 50.0, ""),
+        (
+            TemperatureFeature(register_address=TEST_REGISTER, mask=0xFF, scale=2.0),
+            None,
+            "240 degC is outside -40..120",
+        ),
+        (TemperatureFeature(register_address=TEST_REGISTER, mask=0), None, "the camera shows exactly 0 degC"),
     ],
 )
 async def test_a_temperature_register_is_scaled_and_checked(
@@ -238,7 +248,7 @@ async def test_a_closed_camera_is_unreachable_until_it_is_opened_again():
 
 
 async def test_an_address_where_nobody_answers_is_unreachable():
-    camera = Camera("camera", CameraSettings("127.0.0.62"), WallClock())
+    camera = Camera("camera", GigeCameraSettings(address="127.0.0.62"), WallClock())
     with pytest.raises(Unreachable, match=r"127\.0\.0\.62"):
         await camera.open()
     await camera.close()

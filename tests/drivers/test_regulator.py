@@ -10,7 +10,7 @@ from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.devices.regulator import Regulator
-from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import load_register_map
 from foundation.clock import WallClock, seconds_ns
 from foundation.errors import ConfigError, DeviceFault, Occupied, Refused, Unreachable
@@ -102,7 +102,7 @@ def clock() -> SettableClock:
 async def regulator(serve_modbus: Serve, unit: E5cc, clock: SettableClock) -> AsyncIterator[Regulator]:
     """Not yet opened."""
     address = await serve_modbus([unit.device()], [])
-    bus = Bus("rs485", address, clock, LineSettings(), timeout_s=0.1, gap_s=0.0)
+    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.1, gap_s=0.0), clock)
     await bus.open()
     yield Regulator("regulator", bus, MAP, clock)
     await bus.close()
@@ -295,6 +295,6 @@ async def test_keys_pressed_at_the_unit_are_reported(regulator: Regulator, unit:
 
 
 def test_a_map_without_what_a_regulator_needs_is_refused() -> None:
-    bus = Bus("rs485", "tcp:localhost:502", WallClock(), LineSettings())
+    bus = Bus("rs485", BusSettings(address="tcp:localhost:502"), WallClock())
     with pytest.raises(ConfigError, match="lacks run, stop"):
         Regulator("regulator", bus, MAP.model_copy(update={"commands": {}}), WallClock())

@@ -13,7 +13,7 @@ from pymodbus.pdu import ModbusPDU
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.devices.relays import Relays
-from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import load_register_map
 from foundation.clock import WallClock
 from foundation.errors import ConfigError, DeviceFault, GarbledReply, Refused, Unreachable
@@ -66,7 +66,7 @@ async def bus(serve_modbus: Serve, board: type[BoardWrite]) -> AsyncIterator[Bus
     coils = [SimData(0, values=[False] * 8, datatype=DataType.BITS)]
     words = [SimData(0, values=0, datatype=DataType.REGISTERS)]
     address = await serve_modbus([SimDevice(UNIT, simdata=(coils, coils, words, words))], [board])
-    bus = Bus("rs485", address, WallClock(), LineSettings(), timeout_s=0.1, gap_s=0.0)
+    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.1, gap_s=0.0), WallClock())
     await bus.open()
     yield bus
     await bus.close()
@@ -174,6 +174,6 @@ async def test_a_board_that_is_not_there_fails_to_open(bus: Bus) -> None:
 def test_channels_that_cannot_be_are_config_errors(
     channels: dict[str, int], safe_off: list[str] | None, complaint: str
 ) -> None:
-    bus = Bus("rs485", "tcp:localhost:502", WallClock(), LineSettings())
+    bus = Bus("rs485", BusSettings(address="tcp:localhost:502"), WallClock())
     with pytest.raises(ConfigError, match=complaint):
         Relays("relays", bus, MAP, channels, safe_off)

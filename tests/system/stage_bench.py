@@ -86,7 +86,11 @@ class Bench:
         self._wire = self.plug(self.tap, wire)
         self.address = f"tcp:127.0.0.1:{self._wire.port}" if isinstance(self._wire, TcpWire) else f"serial:{self._path}"
         profile = "8MT160-300" if kind == "linear" else "8MR151"
-        self.axis = Axis(kind, AxisSettings(self.address, SERIAL_NUMBER, profile, LIMITS[kind]), self.clock)
+        self.axis = Axis(
+            kind,
+            AxisSettings(address=self.address, serial_number=SERIAL_NUMBER, profile=profile, limits=LIMITS[kind]),
+            self.clock,
+        )
 
     def controller(self, serial_number: int) -> FakeAxis:
         profile = LINEAR_8MT160_300 if self.kind == "linear" else ROTARY_8MR151
@@ -143,7 +147,11 @@ class Bench:
 
     def another(self, name: str, serial_number: int) -> Axis:
         """A driver that expects somebody else at the same address."""
-        return Axis(name, AxisSettings(self.address, serial_number, "8MR151", (0.0, 1.0)), self.clock)
+        return Axis(
+            name,
+            AxisSettings(address=self.address, serial_number=serial_number, profile="8MR151", limits=(0.0, 1.0)),
+            self.clock,
+        )
 
     def change_microsteps(self, mode: int) -> None:
         """As somebody with the vendor's program would, and saved."""

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.devices.camera import Camera, CameraSettings, TemperatureFeature
+from drivers.devices.camera import Camera, GigeCameraSettings, TemperatureFeature
 from drivers.sim.camera import FakeCamera
 from drivers.wires.aravis_library import library
 from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
@@ -89,9 +89,9 @@ def fake(plant: WarmPlant) -> Iterator[FakeCamera]:
         yield camera
 
 
-def settings(**changes: object) -> CameraSettings:
+def settings(**changes: object) -> GigeCameraSettings:
     usual: dict[str, object] = {"serial_number": SERIAL, "exposure_s": EXPOSURE_S, "heartbeat_s": 1.5}
-    return CameraSettings(ADDRESS, **{**usual, **changes})  # pyright: ignore[reportArgumentType]
+    return GigeCameraSettings.model_validate({"address": ADDRESS, **usual, **changes})
 
 
 @asynccontextmanager
@@ -228,7 +228,7 @@ async def test_a_clamped_exposure_is_refused_and_does_not_stay():
     ("temperature", "value_degC"),
     [
         (None, 41.5),
-        (TemperatureFeature("DeviceTemperature", "DeviceTemperatureSelector", "Mainboard"), 38.0),
+        (TemperatureFeature(entry="Mainboard"), 38.0),
     ],
 )
 @pytest.mark.usefixtures("fake")
@@ -257,7 +257,7 @@ async def test_a_broken_temperature_is_bad_and_the_frames_go_on(fake: FakeCamera
 
 @pytest.mark.usefixtures("fake")
 async def test_an_unknown_selector_entry_is_a_bad_reading():
-    place = TemperatureFeature("DeviceTemperature", "DeviceTemperatureSelector", "Lens")
+    place = TemperatureFeature(entry="Lens")
     async with opened(temperature=place) as camera:
         (reading,) = await camera.read()
         await camera.grab()
@@ -390,9 +390,9 @@ async def test_while_another_client_controls_the_camera_open_is_refused():
 
 CRASH = f"""
 import asyncio, os
-from drivers.devices.camera import Camera, CameraSettings
+from drivers.devices.camera import Camera, GigeCameraSettings
 from foundation.clock import WallClock
-asyncio.run(Camera("camera", CameraSettings("{ADDRESS}", heartbeat_s=1.5), WallClock()).open())
+asyncio.run(Camera("camera", GigeCameraSettings(address="{ADDRESS}", heartbeat_s=1.5), WallClock()).open())
 os._exit(0)
 """
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.camera import Camera, CameraSettings
+from drivers.devices.camera import Camera, GigeCameraSettings
 from drivers.devices.flap import Flap
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays
 from drivers.devices.stage import Axis, AxisSettings
 from drivers.devices.thermometers import Thermometers
-from drivers.wires.bus import Bus, LineSettings
+from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import load_register_map
 from foundation.clock import Clock, WallClock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, Refused, Superseded, Unreachable
@@ -299,7 +299,9 @@ async def in_real_time(bench: Bench) -> Axis:
     axis = await bench.ready()
     await axis.move_to(20.0)
     await axis.close()
-    settings = AxisSettings(bench.address, SERIAL_NUMBER, "8MT160-300", (0.0, 299.95))
+    settings = AxisSettings(
+        address=bench.address, serial_number=SERIAL_NUMBER, profile="8MT160-300", limits=(0.0, 299.95)
+    )
     real = Axis("linear", settings, WallClock())
     await real.open()
     return real
@@ -321,11 +323,11 @@ async def test_made_safe_while_what_comes_before_a_motion_is_answered_the_motion
 
 def stand_with(axis: Axis, clock: Clock) -> Stand:
     """A stand of which only this axis answers."""
-    bus = Bus("bus", "tcp:127.0.0.1:9", clock, LineSettings())
+    bus = Bus("bus", BusSettings(address="tcp:127.0.0.1:9"), clock)
     maps = [load_register_map(packaged("registers", name)) for name in ("omron-e5cc", "waveshare-relay")]
     relays = Relays("relays", bus, maps[1], {"heater_enable": 0, "compressor": 1, "camera_power": 2})
     regulator, flap = Regulator("regulator", bus, maps[0], clock), Flap("flap", FLAP, clock, None)
-    camera = Camera("camera", CameraSettings("127.0.0.1"), clock)
+    camera = Camera("camera", GigeCameraSettings(address="127.0.0.1"), clock)
     thermometers = Thermometers("thermometers", bus, maps[0], {}, clock)
     compressor = CompressorLimits(**CompressorConfig().model_dump(exclude={"state_file"}))
     chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, compressor), 5.0)

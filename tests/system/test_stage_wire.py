@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.stage import Axis, AxisSettings
-from foundation.clock import VirtualClock, seconds_ns
+from drivers.devices.stage import AxisSettings
+from foundation.clock import seconds_ns
 from foundation.errors import DeviceFault, Refused
 from foundation.readings import Quality, Reading
 
-from .stage_bench import OVERSHOOT, START_STEPS, T0, UNIT_PER_STEP, Bench, Kind, running_bench
+from .stage_bench import OVERSHOOT, START_STEPS, UNIT_PER_STEP, Bench, Kind, running_bench
 
 
 @pytest.fixture
@@ -177,8 +177,10 @@ async def test_a_division_that_a_power_cycle_brought_is_found_before_homing(benc
 
 
 def test_an_unknown_profile_is_a_mistake_of_the_caller() -> None:
-    with pytest.raises(ValueError, match="no stage profile '8MT999'"):
-        Axis("linear", AxisSettings("serial:none", 1, "8MT999", (0, 1)), VirtualClock(T0))
+    with pytest.raises(ValueError, match="profile"):
+        AxisSettings.model_validate(
+            {"address": "serial:none", "serial_number": 1, "profile": "8MT999", "limits": (0, 1)}
+        )
 
 
 # Trouble on the way

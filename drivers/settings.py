@@ -1,0 +1,69 @@
+"""What the settings of several devices have in common.
+
+A driver's settings are one frozen model beside it: what a stand's file has, what is checked, what the driver takes.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from foundation.documents import Document
+
+PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]
+Line = Annotated[str, Field(pattern=r"^\P{Cc}*$", max_length=200)]  # free text without control characters
+
+
+def ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+    """The bounds; ValueError unless the first is the lower."""
+    if bounds[0] >= bounds[1]:
+        raise ValueError(f"{bounds} is not in ascending order")
+    return bounds
+
+
+Range = Annotated[tuple[float, float], AfterValidator(ascending)]
+
+
+class Polled(Document):
+    """A device that is read every poll_s."""
+
+    poll_s: PollPeriod_s = 1.0
+
+
+class OnBus(Polled):
+    """A unit on the Modbus bus; `registers` is a file in configs/registers."""
+
+    registers: str
+    unit: int = Field(ge=1, le=247)
+
+
+class EquilibriumSettings(Document):
+    """When a camera that was or may have been off is in thermal equilibrium again: its own temperature has moved by
+    less than rate_K_per_min for duration_s; without a temperature, 5 x time_constant_s (of its slowest part) are
+    over."""
+
+    rate_K_per_min: float = Field(default=0.2, gt=0, le=5)
+    duration_s: float = Field(default=600.0, ge=60, le=7200)
+    time_constant_s: float = Field(default=1500.0, ge=10, le=36000)
+
+
+class CameraSettings(Polled):
+    """What the stand asks of a camera, whatever its protocol.
+
+    serial_number: refused when another camera answers; none takes any. width_px, height_px: from the sensor's first
+    pixel; none the whole sensor. trigger: one frame per software trigger, or frames at frame_rate_hz all the time
+    (constant self-heating). has_temperature: whether it measures its own temperature; false has to be said, a run needs
+    no GOOD one then. boot_s: from its supply being switched on until it answers.
+    """
+
+    serial_number: str | None = Field(default=None, pattern=r"^[ -~]{1,16}$")  # as the bootstrap register holds it
+    width_px: int | None = Field(default=None, ge=16, le=65535)
+    height_px: int | None = Field(default=None, ge=16, le=65535)
+    exposure_s: float = Field(default=0.1, gt=0, le=10)
+    gain_dB: float = Field(default=0.0, ge=0, le=60)
+    trigger: Literal["software", "free_run"] = "software"
+    frame_rate_hz: float = Field(default=2.0, gt=0, le=10_000)
+    has_temperature: bool = True
+    boot_s: float = Field(default=8.0, ge=0, le=600)
+    equilibrium: EquilibriumSettings = EquilibriumSettings()

@@ -1,0 +1,64 @@
+"""Addresses as a configuration writes them: `serial:PATH`, `tcp:HOST:PORT`, IPv4. Checked and taken apart here only."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from typing import Annotated, NamedTuple
+
+from pydantic import AfterValidator
+
+_TCP = re.compile(r"tcp:([^:\s]+):([0-9]{1,5})")
+_SERIAL = re.compile(r"serial:([^\s\x00]+)")
+
+
+class TcpPlace(NamedTuple):
+    """A port of a host."""
+
+    host: str
+    port: int
+
+
+class SerialPlace(NamedTuple):
+    """The path of a serial port."""
+
+    path: str
+
+
+def tcp_place(address: str, *, may_be_free: bool = False) -> TcpPlace:
+    """Where `tcp:HOST:PORT` leads; ValueError when it is none. Port 0, for a free one, only if it `may_be_free`."""
+    found = _TCP.fullmatch(address)
+    if found is None or not (0 if may_be_free else 1) <= int(found[2]) < 65536:
+        raise ValueError("expected tcp:HOST:PORT with a port of 1..65535")
+    return TcpPlace(found[1], int(found[2]))
+
+
+def place_of(address: str) -> SerialPlace | TcpPlace:
+    """Where `serial:PATH` or `tcp:HOST:PORT` leads; ValueError when it is neither."""
+    if found := _SERIAL.fullmatch(address):
+        return SerialPlace(found[1])
+    if address.startswith("tcp:"):
+        return tcp_place(address)
+    raise ValueError("expected serial:PATH (such as serial:/dev/ttyUSB0) or tcp:HOST:PORT")
+
+
+def _byte_address(address: str) -> str:
+    place_of(address)
+    return address
+
+
+def _tcp_address(address: str) -> str:
+    tcp_place(address)
+    return address
+
+
+def _ip_address(address: str) -> str:
+    try:
+        return str(ipaddress.IPv4Address(address))
+    except ValueError as error:
+        raise ValueError("expected an IPv4 address such as 192.168.1.10") from error
+
+
+ByteAddress = Annotated[str, AfterValidator(_byte_address)]
+TcpAddress = Annotated[str, AfterValidator(_tcp_address)]
+IpAddress = Annotated[str, AfterValidator(_ip_address)]
