@@ -1,1 +1,11 @@
-"""Offline: marker centres, drift models, validation and the report, from recorded sessions only."""
+"""Offline: marker centres, drift models, validation and the report, from recorded sessions or plain arrays.
+
+observations = observe(session_folder)          or observations_of(centres_px, camera_degC, ...)
+model = fit(observations)
+evaluation = evaluate(model, observations)
+write_report("report.html", observations, model, evaluation)
+"""
+
+from foundation.lazy_names import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

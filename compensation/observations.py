@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,13 +22,12 @@ from compensation.one_equilibrium import check_sessions
 from experiments.steps import Role
 from foundation.documents import parse_document
 from foundation.errors import SessionError
-from foundation.progress import Report
+from foundation.progress import Report, unwatched
 from foundation.readings import Frame
 from markers.noise import Noise, estimate_noise
 from markers.target import Target
 from recording.format.utc_offsets import UtcOffsets
 from recording.reading.session import Session
-from recording.reading.superseded import begins_of, is_superseded
 from recording.reading.using import Say, open_whole
 
 Float = NDArray[np.float64]
@@ -39,9 +37,6 @@ Progress = Callable[[str, float], AbstractContextManager[Report]]
 """foundation.progress.progress, or anything like it: (title, total) -> a context that yields report(done, text)."""
 
 _NOISE_FRAMES = 4
-_AIR_CHANNEL = "thermometers.air"
-_AIR_GAP_NS = 120_000_000_000
-"""The air temperature is interpolated between readings this close together, and unknown elsewhere."""
 _PREVIEW_WIDTH_PX = 816
 
 
@@ -127,7 +122,7 @@ def session_noise(session: Session) -> Noise | None:
     return estimate_noise([frame.image for frame in first if frame.image.ndim == 2], partial[-1] if partial else None)
 
 
-def observe(
+def observe_session(
     session: Session, target: Target, finder: Finder | None = None, report: Report | None = None
 ) -> Observations:
     """Find the target in every frame; `report` counts frames. finder: how, else one frame after the other.
@@ -162,28 +157,29 @@ def read_frames(session: Session) -> Iterator[Frame]:
         raise SessionError(f"{error}; this was frame {done}, counted from 0") from error
 
 
-def observe_sessions(
-    paths: Sequence[Path],
-    progress: Progress,
+def observe(
+    paths: Path | str | Sequence[Path | str],
+    progress: Progress | None = None,
     target: Target | None = None,
     finder: Finder | None = None,
     *,
     across_gap: bool = False,
     incomplete: Say | None = None,
 ) -> Observations:
-    """All frames of all sessions, found once, with progress. target: instead of the ones attached to the sessions.
+    """All frames of all sessions, found once. target: instead of the ones attached to the sessions. progress: such as
+    foundation.progress.progress. finder: how the markers are found, else one frame after the other.
 
     SessionError when a session has frames of two equilibria of the camera, unless `across_gap`, or when something of it
     is missing, unless `incomplete` takes the sentence that says what.
     """
-    sessions = [open_whole(path, incomplete) for path in paths]
+    sessions = [open_whole(path, incomplete) for path in ([paths] if isinstance(paths, Path | str) else paths)]
     check_sessions(sessions, across_gap=across_gap)
     targets = [target or session_target(session) for session in sessions]
     parts: list[Observations] = []
     done = 0
-    with progress("find markers", sum(session.frame_count for session in sessions)) as report:
+    with (progress or unwatched)("find markers", sum(session.frame_count for session in sessions)) as report:
         for session, its_target in zip(sessions, targets, strict=True):
-            parts.append(observe(session, its_target, finder, _continued(report, done)))
+            parts.append(observe_session(session, its_target, finder, _continued(report, done)))
             done += session.frame_count
     return concatenate(parts)
 
@@ -197,13 +193,9 @@ def _continued(report: Report, done_before: float) -> Report:
 
 def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -> Observations:
     """first: the first frame with the target, whose size the others must have."""
-    captures = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
-    metas = {(time_ns, meta.block_id & 0xFFFFFFFF): meta for time_ns, meta in session.frame_metas}
-    described = [metas.get(name) for name in zip(found.time_ns.tolist(), found.block.tolist(), strict=True)]
-    step_id = tuple("" if meta is None else meta.step_id for meta in described)
-    camera_degC = np.array([math.nan if meta is None else meta.camera_degC for meta in described])
-    reasons = _reasons(found, first, camera_degC, _superseded(session, found.time_ns, step_id))
-    purposes = [_purpose(captures.get(name, {})) for name in step_id]
+    known = session.frames_table()
+    reasons = _reasons(found, first, known.camera_degC, known.superseded)
+    purposes = [_purpose(role, chamber_degC) for role, chamber_degC in zip(known.role, known.chamber_degC, strict=True)]
     unusable = (found.flags != 0) | np.array([bool(reason) for reason in reasons])[:, None]
     image = session.frame(first).image
     return Observations(
@@ -215,10 +207,10 @@ def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -
         frame=np.arange(len(reasons)),
         time_ns=found.time_ns,
         role=np.array([str(role) for role, _ in purposes]),
-        step_id=step_id,
+        step_id=tuple(known.step_id.tolist()),
         chamber_degC=np.array([chamber_degC for _, chamber_degC in purposes]),
-        camera_degC=camera_degC,
-        air_degC=_air_degC(session, found.time_ns),
+        camera_degC=known.camera_degC,
+        air_degC=known.air_degC,
         centres_px=np.where(unusable[:, :, None], np.nan, found.centres_px),
         covariance_px2=np.where(unusable[:, :, None, None], np.nan, found.covariance_px2),
         flags=np.where((found.reason == "")[:, None], found.flags, 0).astype(np.uint8),
@@ -227,14 +219,7 @@ def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -
     )
 
 
-def _superseded(session: Session, time_ns: NDArray[np.int64], step_id: Sequence[str]) -> Mask:
-    """(K,): frames of a capture that was begun anew after them."""
-    begins_ns = begins_of(session)
-    named = zip(time_ns.tolist(), step_id, strict=True)
-    return np.array([is_superseded(time_ns, name, begins_ns) for time_ns, name in named])
-
-
-def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: Mask) -> tuple[str, ...]:
+def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: NDArray[np.bool_]) -> tuple[str, ...]:
     """Why each frame cannot be used, "" when it can."""
     width, height = found.size_px[first].tolist()
     columns = (found.size_px.tolist(), found.reason.tolist(), camera_degC.tolist(), superseded.tolist())
@@ -250,12 +235,11 @@ def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: Ma
     return tuple(reasons)
 
 
-def _purpose(parameters: dict[str, object]) -> tuple[str, float]:
-    """Role and set-point of a step that takes frames, from its parameters."""
-    role, chamber_degC = parameters.get("role"), parameters.get("chamber_degC")
-    if not isinstance(chamber_degC, int | float) or not isinstance(role, str) or role not in set(Role):
+def _purpose(role: str, chamber_degC: float) -> tuple[str, float]:
+    """Role and set-point of a frame, from those of its step; OTHER, and NaN, unless both are known."""
+    if role not in set(Role) or math.isnan(chamber_degC):
         return OTHER, math.nan
-    return Role(role), float(chamber_degC)
+    return role, chamber_degC
 
 
 def _facts(session: Session) -> SessionFacts:
@@ -265,25 +249,10 @@ def _facts(session: Session) -> SessionFacts:
     return SessionFacts(**texts, simulated=simulated, incomplete=len(session.incomplete), utc=session.utc)
 
 
-def _air_degC(session: Session, time_ns: NDArray[np.int64]) -> Float:
-    """Linear between the readings before and after; NaN beyond them and across gaps."""
-    try:
-        times_ns, values = session.readings(_AIR_CHANNEL)
-    except SessionError:
-        return np.full(len(time_ns), np.nan)
-    good = np.isfinite(values)
-    times_ns, values = times_ns[good], values[good]
-    if len(times_ns) == 0:
-        return np.full(len(time_ns), np.nan)
-    after = np.clip(np.searchsorted(times_ns, time_ns), 1, max(len(times_ns) - 1, 1))
-    near = (times_ns[np.minimum(after, len(times_ns) - 1)] - times_ns[after - 1]) <= _AIR_GAP_NS
-    origin = int(times_ns[0])
-    air = np.interp(time_ns - origin, times_ns - origin, values, left=np.nan, right=np.nan)
-    return np.where(near, air, np.nan)
-
-
 def _preview(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
     """The image at a width for the report; averaging before rounding takes most of the noise away."""
+    import cv2  # fits from arrays need no OpenCV
+
     height, width = image.shape
     factor = max(1, math.ceil(width / _PREVIEW_WIDTH_PX))
     reduced = cv2.resize(image, (width // factor, height // factor), interpolation=cv2.INTER_AREA)

@@ -38,6 +38,12 @@ def progress(title: str, total: float) -> Generator[Report]:
 
 
 @contextmanager
+def unwatched(title: str, total: float) -> Generator[Report]:
+    """As `progress`, for whoever does not want to see any."""
+    yield lambda done, text: None
+
+
+@contextmanager
 def late_progress(title: str, total: float) -> Generator[Report]:
     """As `progress`, from the moment on when the work has taken long enough for somebody to wait."""
     with ExitStack() as stack:

@@ -17,10 +17,10 @@ from markers.detection import DetectionError, Image, grey_image
 _NO_IMAGE = (OSError, ValueError, SyntaxError, LookupError, EOFError, OverflowError, struct.error)
 
 
-def read_image(path: Path) -> Image:
+def read_image(path: Path | str) -> Image:
     """A grey image (height, width) from a file, 8 or 16 bits; DetectionError when it cannot be read or is too large."""
     try:
-        data = path.read_bytes()
+        data = Path(path).read_bytes()
     except OSError as error:
         raise DetectionError(f"{path}: cannot be read ({error.strerror})") from error
     fault = _fault(data)

@@ -144,6 +144,6 @@ class Target(Document):
         return divmod(number - 1, self.columns)
 
 
-def load_target(path: Path) -> Target:
+def load_target(path: Path | str) -> Target:
     """The target described by a YAML file; raises ConfigError naming the file and the path in it."""
-    return load_document(path, Target)
+    return load_document(Path(path), Target)

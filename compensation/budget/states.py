@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from compensation.budget.geometry import StandState
 from foundation.errors import SessionError
 from foundation.items import StepState
+from recording.reading.interpolation import interpolated
 from recording.reading.session import Session
 
-_GAP_NS = 120_000_000_000
-"""A temperature is interpolated between readings this close together, and unknown elsewhere."""
 _SENSORS = tuple(name.removesuffix("_degC") for name in StandState.__dataclass_fields__)
 
 
@@ -36,7 +35,7 @@ def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[StandState]
 
     SessionError when the session has no such thermometer.
     """
-    columns = [_interpolated(session, f"thermometers.{sensor}", times_ns) for sensor in _SENSORS]
+    columns = [interpolated(*session.readings(f"thermometers.{sensor}"), times_ns) for sensor in _SENSORS]
     return [StandState(*map(float, row)) for row in np.stack(columns, axis=1)]
 
 
@@ -64,16 +63,3 @@ def capture_states(session: Session) -> list[CaptureState]:
         role = str(mark.parameters.get("role") or "")
         found.append(CaptureState(mark.step_id, role, chamber_degC, mark.time_ns, ended[mark.step_id], state))
     return found
-
-
-def _interpolated(session: Session, channel: str, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    at_ns, values = session.readings(channel)
-    good = np.isfinite(values)
-    at_ns, values = at_ns[good], values[good]
-    if len(at_ns) == 0:
-        return np.full(len(times_ns), np.nan)
-    after = np.clip(np.searchsorted(at_ns, times_ns), 1, max(len(at_ns) - 1, 1))
-    near = at_ns[np.minimum(after, len(at_ns) - 1)] - at_ns[after - 1] <= _GAP_NS
-    origin = int(at_ns[0])  # float64 holds ns since the epoch to 256 ns only
-    found = np.interp(times_ns - origin, at_ns - origin, values, left=np.nan, right=np.nan)
-    return np.where(near, found, np.nan)

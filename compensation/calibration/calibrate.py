@@ -51,12 +51,14 @@ class Calibration:
         return next(score for score in self.scores if score.model == model)
 
 
-def calibrate(positions: Positions, target: Target, sigma: TableSigma, model: Model = Model.AUTO) -> Calibration:
+def calibrate(
+    positions: Positions, target: Target, sigma: TableSigma | None = None, model: Model = Model.AUTO
+) -> Calibration:
     """Adjust, choose pinhole and degree of the rays by held-out positions, and compare the session's halves.
 
-    CalibrationError when the positions do not determine a camera.
+    sigma: of the table, else a TableSigma as it is. CalibrationError when the positions do not determine a camera.
     """
-    board = board_of(target)
+    board, sigma = board_of(target), sigma or TableSigma()
     scores = score_models(positions, board, sigma)
     pinholes = tuple(score for score in scores if score.model in (BROWN, RATIONAL))
     chosen = {Model.BROWN: BROWN, Model.RATIONAL: RATIONAL}.get(model) or best(pinholes)

@@ -24,7 +24,7 @@ from compensation.drift.evaluation import evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
 from compensation.finding.found import finder
-from compensation.observations import observe_sessions
+from compensation.observations import observe
 from compensation.report.extras import Extras
 from compensation.report.report import can_be_fitted, check_report_writable, write_report
 from compensation.report.table_positions import table_positions
@@ -67,7 +67,7 @@ def fit(
         check_request(degree, form)
         check_writable(out)
         found_by = finder(workers, cluster, use_cache=cache)
-        observations = observe_sessions(
+        observations = observe(
             sessions,
             progress,
             named_target(target),
@@ -116,7 +116,7 @@ def report(
             positions=table_positions([Session.open(path).steps() for path in sessions]),
             validation=None if validation is None else load_validation(validation),
         )
-        observations = observe_sessions(
+        observations = observe(
             sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said_if(incomplete)
         )
         has_cycle = can_be_fitted(observations)

@@ -21,7 +21,7 @@ from compensation.commands.options import (
 )
 from compensation.drift.model_file import load_model
 from compensation.finding.found import finder
-from compensation.observations import Float, observe_sessions
+from compensation.observations import Float, observe
 from compensation.report.validation_report import validation_page
 from compensation.validation3d.document import as_json
 from compensation.validation3d.positions import validation_frames
@@ -69,7 +69,7 @@ def validate_session(
             check_writable(path)
         file, drift = CameraFile.load(camera), load_model(model)
         geometry = None if budget is None else load_geometry(budget)
-        observations = observe_sessions(
+        observations = observe(
             [session],
             progress,
             named_target(target),

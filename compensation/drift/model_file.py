@@ -93,15 +93,15 @@ _ANY: TypeAdapter[PaperFile | ThermalFile] = TypeAdapter(
 )
 
 
-def save_model(model: DriftModel, path: Path) -> None:
+def save_model(model: DriftModel, path: Path | str) -> None:
     """Write the model as JSON, whole or not at all; SessionError when the place refuses."""
-    write_whole(path, _document(model).model_dump_json(indent=1) + "\n")
+    write_whole(Path(path), _document(model).model_dump_json(indent=1) + "\n")
 
 
-def load_model(path: Path) -> DriftModel:
+def load_model(path: Path | str) -> DriftModel:
     """The model in a file that `save_model` wrote, number for number; SessionError when it is anything else."""
     try:
-        file = _ANY.validate_json(path.read_text(encoding="utf-8"), strict=True)
+        file = _ANY.validate_json(Path(path).read_text(encoding="utf-8"), strict=True)
         return _model(file)
     except (OSError, UnicodeDecodeError) as error:
         raise SessionError(f"{path}: cannot be read ({error})") from error

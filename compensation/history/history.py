@@ -15,12 +15,10 @@ from compensation.history.states import Float, Memory, States, row_of, state_of
 from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
 from foundation.items import StepState
+from recording.reading.interpolation import GAP_NS, interpolated
 from recording.reading.session import Session
 
 TimesNs = NDArray[np.int64]
-
-GAP_NS = 120 * NS_PER_S
-"""Readings further apart than this say nothing of the time between them."""
 
 _STEP_NS = 10 * NS_PER_S
 """How far the state is moved at once: the inputs' means over it are exact, and the fastest lag takes minutes."""
@@ -79,7 +77,7 @@ def refined(history: History) -> History:
         return history
     told, seconds = history.camera_degC, (history.camera_ns - history.camera_ns[0]) / NS_PER_S
     states = states_at(history, Memory(_SHAPE_TAUS_S), history.camera_ns, told)
-    ambient = _line(history.ambient_ns, history.ambient_degC, history.camera_ns)
+    ambient = interpolated(history.ambient_ns, history.ambient_degC, history.camera_ns, GAP_NS)
     terms = np.column_stack([np.ones(len(told)), ambient, states.ambient_lag_degC, states.power_lag])
     known = np.isfinite(terms).all(axis=1)
     shape = np.where(known, terms @ _least_squares(terms[known], told[known]), told)
@@ -158,7 +156,7 @@ def _followed(memory: Memory, inputs: Float) -> Float:
 def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
     """The camera's temperature at the marks, NaN where it tells none: at the frames what it told with them, but for the
     place within the display's step, which only the whole record knows."""
-    camera = _line(history.camera_ns, history.camera_degC, marks_ns)
+    camera = interpolated(history.camera_ns, history.camera_degC, marks_ns, GAP_NS)
     at = np.searchsorted(marks_ns, time_ns)
     told = np.isfinite(camera_degC) & (time_ns >= marks_ns[0])
     known, half_K = camera[at[told]], history.resolution_K / 2
@@ -170,20 +168,8 @@ def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: 
 def _means(history: History, marks_ns: TimesNs) -> tuple[Float, Float]:
     """Mean ambient, by the trapezoidal rule, and powered share between the marks (M,), (M - 1,) each; NaN where the
     record does not tell."""
-    ambient = _line(history.ambient_ns, history.ambient_degC, marks_ns)
+    ambient = interpolated(history.ambient_ns, history.ambient_degC, marks_ns, GAP_NS)
     return (ambient[1:] + ambient[:-1]) / 2, _powered_share(history, marks_ns)
-
-
-def _line(times_ns: TimesNs, values: Float, at_ns: TimesNs) -> Float:
-    """Linear between readings; NaN before and after them and across gaps."""
-    if len(times_ns) == 0:
-        return np.full(len(at_ns), np.nan)
-    after = np.clip(np.searchsorted(times_ns, at_ns), 1, max(len(times_ns) - 1, 1))
-    near = (times_ns[np.minimum(after, len(times_ns) - 1)] - times_ns[after - 1]) <= GAP_NS
-    inside = (at_ns >= times_ns[0] - GAP_NS) & (at_ns <= times_ns[-1] + GAP_NS)
-    origin_ns = int(times_ns[0])
-    found = np.interp((at_ns - origin_ns) / NS_PER_S, (times_ns - origin_ns) / NS_PER_S, values)
-    return np.where(near & inside, found, np.nan)
 
 
 def _powered_share(history: History, marks_ns: TimesNs) -> Float:

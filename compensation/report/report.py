@@ -12,7 +12,7 @@ from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.model_file import save_model
-from compensation.observations import Observations, Progress, observe_sessions
+from compensation.observations import Observations, Progress, observe
 from compensation.report.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.report.data_section import data_section, utc
 from compensation.report.drift_section import drift_section
@@ -40,7 +40,7 @@ def analyse(
     """
     check_writable(model_path)
     check_report_writable(report_path, model_path)
-    observations = observe_sessions(session_paths, progress)
+    observations = observe(session_paths, progress)
     extras = Extras(positions=table_positions([Session.open(path).steps() for path in session_paths]))
     with progress("fit and report", 3) as report:
         report(0, "choosing the form")
@@ -76,14 +76,15 @@ def numbers_path(page_path: Path) -> Path:
 
 
 def write_report(
-    path: Path,
+    path: Path | str,
     observations: Observations,
-    model: DriftModel | None,
-    evaluation: Evaluation | None,
+    model: DriftModel | None = None,
+    evaluation: Evaluation | None = None,
     extras: Extras | None = None,
 ) -> None:
-    """Write page and numbers, each whole or not at all; SessionError when the place refuses."""
-    extras = extras or Extras()
+    """Write page and numbers, each whole or not at all; without a model the drift alone. SessionError when the place
+    refuses."""
+    extras, path = extras or Extras(), Path(path)
     numbers = numbers_of(observations, model, evaluation, extras)
     text = _page(observations, evaluation, numbers, extras)
     write_whole(path, text)

@@ -20,7 +20,6 @@ import zlib
 from collections.abc import Iterator
 from typing import NamedTuple, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,12 +28,6 @@ from foundation.image_limit import size_fault
 
 ImageArray = NDArray[np.uint8] | NDArray[np.uint16]
 Windows = NDArray[np.int32]
-
-LEVEL_1 = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-HUFFMAN_ONLY = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
-RUNS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
-AVERAGE = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG)
-ABOVE = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
 
 WINDOWS_KEYWORD = b"Windows"
 MOST_WINDOWS = 10_000
@@ -66,8 +59,16 @@ class Header(NamedTuple):
 def encode_png(image: ImageArray, windows: Windows | None = None) -> bytes:
     """The image, shape (height, width), as a PNG. windows: x, y, width, height of the parts that are real, px, shape
     (n, 4); they are noted in a text chunk. ValueError when windows are not within the image."""
+    import cv2  # here and below: whoever reads no image need not wait for OpenCV; a recorder imports it at once
+
     native = image.astype(image.dtype.newbyteorder("="), copy=False)
-    parameters = [*LEVEL_1, *(HUFFMAN_ONLY if windows is None else RUNS), *(AVERAGE if image.itemsize == 1 else ABOVE)]
+    parameters = [
+        *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+        cv2.IMWRITE_PNG_STRATEGY,
+        cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY if windows is None else cv2.IMWRITE_PNG_STRATEGY_RLE,
+        cv2.IMWRITE_PNG_FILTER,
+        cv2.IMWRITE_PNG_FILTER_AVG if image.itemsize == 1 else cv2.IMWRITE_PNG_FILTER_UP,
+    ]
     if windows is not None:
         check_windows(windows, image.shape)
     done, png = cv2.imencode(".png", native, parameters)
@@ -96,6 +97,8 @@ def decode_png(data: bytes) -> tuple[ImageArray, Windows | None]:
     SessionError when it is not a whole, undamaged grey PNG of 8 or 16 bit; a size that the data cannot fill is refused
     before any memory is asked for.
     """
+    import cv2
+
     header, windows, plain, _ = _taken_apart(data)
     try:
         image = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED)

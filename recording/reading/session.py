@@ -56,6 +56,7 @@ from recording.reading.columns import Column, TopicColumns
 from recording.reading.contents import Contents
 from recording.reading.coverage import coverage_of
 from recording.reading.extent import extent_of
+from recording.reading.frames_table import FramesTable, frames_table
 from recording.reading.hole_finder import find_holes
 from recording.reading.journal_lines import journal_facts
 from recording.reading.run_word import Run, run_word
@@ -89,8 +90,9 @@ class Session:
         self._metas_of: dict[Path, dict[tuple[int, int], bytes]] = {}
 
     @classmethod
-    def open(cls, path: Path) -> Session:
+    def open(cls, path: Path | str) -> Session:
         """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
+        path = Path(path)
         telemetry, frames = (_segments(path / name, FINISHED) for name in (TELEMETRY, FRAMES))
         if not telemetry:
             count = len(_files_of(path, UNFINISHED))
@@ -190,6 +192,12 @@ class Session:
     def frame_times_ns(self) -> NDArray[np.int64]:
         """Middle of the exposure of each frame, shape (frame_count,), ascending."""
         return np.array([place.time_ns for place in self._places()], np.int64)
+
+    def frames_table(self) -> FramesTable:
+        """What is known of each frame as columns; no image is decoded."""
+        places = list(self._places())
+        files = [f"{FRAMES}/{place.path.name}" for place in places]
+        return frames_table(self, files, np.array([place.time_ns for place in places], np.int64))
 
     def frame(self, index: int) -> Frame:
         """The frame of that index, counted from 0 in order of time; SessionError when there is none."""

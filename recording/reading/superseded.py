@@ -7,9 +7,12 @@ switched on.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from recording.format.restarts import restarted_step
-from recording.reading.session import Session
+
+if TYPE_CHECKING:
+    from recording.reading.session import Session
 
 
 def begins_of(session: Session) -> dict[str, int]:

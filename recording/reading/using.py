@@ -14,7 +14,7 @@ _MOST = 6  # holes in a sentence before the rest is only counted
 Say = Callable[[str], None]
 
 
-def open_whole(path: Path, incomplete: Say | None = None) -> Session:
+def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
     """The session in `path`; SessionError when something of it is missing, unless `incomplete` takes the sentence that
     says what. Frames that were never acknowledged, or that the recorder itself said it lost, are not missing."""
     session = Session.open(path)

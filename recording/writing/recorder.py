@@ -17,6 +17,7 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2  # noqa: F401  # pyright: ignore[reportUnusedImport] - here, so that no frame waits for it
 import numpy as np
 
 from foundation.clock import Clock, seconds_ns

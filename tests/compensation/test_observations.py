@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from compensation.drift.displacements import displacements, reference_centres
-from compensation.observations import Observations, concatenate, observe, session_target
+from compensation.observations import Observations, concatenate, observe_session, session_target
 from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from foundation.errors import ConfigError, SessionError
@@ -28,7 +28,7 @@ from .synthetic import facts, observations, quadratic
 @pytest.fixture(scope="module")
 def observed(recorded: Recorded) -> Observations:
     session = Session.open(recorded.path)
-    return observe(session, session_target(session))
+    return observe_session(session, session_target(session))
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_air_is_interpolated_between_readings_and_unknown_after_the_last(observe
 
 def test_progress_counts_frames(recorded: Recorded):
     session, told = Session.open(recorded.path), list[tuple[float, str]]()
-    observe(session, session_target(session), report=lambda done, text: told.append((done, text)))
+    observe_session(session, session_target(session), report=lambda done, text: told.append((done, text)))
     count = len(SEQUENCE)
     assert told == [(done, f"frame {done} of {count}") for done in (0, 10, count)]  # the segments' ends
 
@@ -90,7 +90,7 @@ def test_a_session_says_whether_it_is_simulated_or_nothing(recorded_frame: Path,
     session = Session.open(recorded_frame)
     session.metadata.pop("simulated", None)
     session.metadata.update({} if word is None else {"simulated": word})
-    seen = observe(session, session_target(session))
+    seen = observe_session(session, session_target(session))
     assert seen.sessions[0].simulated is simulated
     assert seen.simulated is bool(simulated)
 
@@ -106,7 +106,7 @@ def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
     segment.write_bytes(data)
     when = utc_text(place.time_ns)
     with pytest.raises(SessionError, match=rf"{segment.name}: .*; this was the frame of {when}$"):
-        observe(session, session_target(session))
+        observe_session(session, session_target(session))
 
 
 def test_frames_of_a_capture_that_was_begun_anew_do_not_count(tmp_path: Path):
@@ -114,7 +114,7 @@ def test_frames_of_a_capture_that_was_begun_anew_do_not_count(tmp_path: Path):
     again = restarted(after_ns, "step-1", 1, "after a long interruption")
     asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))
     session = Session.open(tmp_path / "night")
-    seen = observe(session, session_target(session))
+    seen = observe_session(session, session_target(session))
     assert seen.reasons == ("", "its capture was begun anew", "", "")
     assert np.isnan(seen.centres_px[1]).all()
 
@@ -131,7 +131,7 @@ def test_a_session_without_or_with_a_wrong_target_is_refused(tmp_path: Path):
 def test_a_session_that_never_shows_the_target_is_refused(recorded: Recorded):
     session = Session.open(recorded.path)
     with pytest.raises(SessionError, match="no frame can be used"):
-        observe(session, session_target(session).model_copy(update={"columns": 12, "minimum_markers": 72}))
+        observe_session(session, session_target(session).model_copy(update={"columns": 12, "minimum_markers": 72}))
 
 
 def test_sessions_are_put_end_to_end_with_references_of_their_own():

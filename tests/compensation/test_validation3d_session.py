@@ -23,7 +23,7 @@ from compensation.calibration.positions import Positions
 from compensation.calibration.stages import TableSigma
 from compensation.drift.model_file import save_model
 from compensation.drift.paper_fit import fit_paper
-from compensation.observations import Float, Observations, observe, session_target
+from compensation.observations import Float, Observations, observe_session, session_target
 from compensation.validation3d.positions import validation_frames
 from experiments.steps import Role
 from foundation.clock import NS_PER_S, VirtualClock
@@ -220,7 +220,7 @@ def test_a_silent_thermometer_is_named_where_it_is_needed(folder: Path, tmp_path
 
 def test_pose_frames_teach_the_drift_nothing(folder: Path):
     session = Session.open(folder / "session")
-    observed = observe(session, session_target(session))
+    observed = observe_session(session, session_target(session))
     assert observed.role.tolist() == ["pose", "pose", "repeatability"] * 2
     with pytest.raises(SessionError, match="no usable frames for a fit"):
         fit_paper(observed, 1)
@@ -229,7 +229,7 @@ def test_pose_frames_teach_the_drift_nothing(folder: Path):
 
 def test_frames_are_sorted_by_where_the_table_stood_not_by_their_order(folder: Path):
     session = Session.open(folder / "session")
-    observed = observe(session, session_target(session))
+    observed = observe_session(session, session_target(session))
     found = validation_frames(session, observed)
     assert found.names == ("V0", "V1")
     assert [[indices.tolist() for indices in row] for row in found.frames] == [[[0], [1], [2]], [[3], [4], [5]]]

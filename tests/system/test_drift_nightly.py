@@ -15,7 +15,7 @@ from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
-from compensation.observations import Observations, observe_sessions
+from compensation.observations import Observations, observe
 from experiments.steps import Role
 from foundation.hub import Hub
 from foundation.items import Item
@@ -76,7 +76,7 @@ async def record(order: Order, out: Path) -> Seen:
         hub.subscribe(look)
 
     path = await run_virtual(order, out, 1, watch)
-    return observe_sessions([path], progress), np.array(truth)
+    return observe([path], progress), np.array(truth)
 
 
 def left_mpx(model: DriftModel, seen: Seen, role: Role, reference_px: NDArray[np.float64]) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.observations import observe, session_target
+from compensation.observations import observe_session, session_target
 from foundation.hub import Hub
 from foundation.items import Event
 from recording.reading.session import Session
@@ -41,7 +41,7 @@ async def test_roi_keeps_the_markers_and_a_whole_frame_of_each_capture(tmp_path:
     session = Session.open(directory)
     windows = [frame.windows for frame in session.frames()]
     assert [0 if window is None else len(window) for window in windows] == [0, 54, 54, 0, 54]
-    observed = observe(session, session_target(session))
+    observed = observe_session(session, session_target(session))
     assert observed.usable.all()
     assert not np.isnan(observed.centres_px).any()
     sizes = [len(image.data) for image in session.images()]

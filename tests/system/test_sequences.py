@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import OTHER, observe_sessions
+from compensation.observations import OTHER, observe
 from experiments.steps import Role
 from foundation.items import Event, StepMark, StepState
 from foundation.progress import progress
@@ -130,7 +130,7 @@ def check_relaxed_stages_came_back(session: Session) -> None:
 
 def check_no_drift_is_fitted_to_them(session: Session) -> None:
     """Whoever looks for the frames of the drift finds none, but the warm-up's."""
-    observed = observe_sessions([session.path], progress)
+    observed = observe([session.path], progress)
     cycle = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
     assert observed.of(*cycle).sum() == 0
     elsewhere = (Role.CALIBRATION, Role.POSE, Role.REPEATABILITY)

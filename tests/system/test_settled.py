@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import Observations, observe_sessions
+from compensation.observations import Observations, observe
 from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from foundation.items import StepState
@@ -57,7 +57,7 @@ async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: P
         assert earned_s == sorted(earned_s)
         assert earned_s[-1] == 3600.0  # nothing is owed
     check_the_flap_opens_for_looks_only(session)
-    check_looks_are_not_fitted(observe_sessions([session.path], progress))
+    check_looks_are_not_fitted(observe([session.path], progress))
 
 
 def check_the_flap_opens_for_looks_only(session: Session) -> None:

@@ -20,7 +20,7 @@ from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import rms_px
 from compensation.drift.training import frame_states
-from compensation.observations import Observations, observe_sessions
+from compensation.observations import Observations, observe
 from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
@@ -91,7 +91,7 @@ async def night(order: Order, out: Path) -> Night:
     path = await run_virtual(order, out, 1, watch)
     steps = Session.open(path).steps()
     duration_s = (steps[-1].time_ns - steps[0].time_ns) / NS_PER_S
-    return Night(observe_sessions([path], progress), np.array(truth), duration_s)
+    return Night(observe([path], progress), np.array(truth), duration_s)
 
 
 def true_centres(order: Order) -> object:

@@ -1,0 +1,17 @@
+from compensation.arrays import observations_of as observations_of
+from compensation.calibration.calibrate import Calibration as Calibration
+from compensation.calibration.calibrate import calibrate as calibrate
+from compensation.calibration.positions import Positions as Positions
+from compensation.calibration.positions import observe_positions as observe_positions
+from compensation.calibration.stages import TableSigma as TableSigma
+from compensation.drift.choosing import fit as fit
+from compensation.drift.drift_model import DriftModel as DriftModel
+from compensation.drift.evaluation import Evaluation as Evaluation
+from compensation.drift.evaluation import evaluate as evaluate
+from compensation.drift.model_file import load_model as load_model
+from compensation.drift.model_file import save_model as save_model
+from compensation.finding.found import finder as finder
+from compensation.observations import Observations as Observations
+from compensation.observations import observe as observe
+from compensation.report.report import write_report as write_report
+from experiments.steps import Role as Role

@@ -1,0 +1,113 @@
+"""Observations from plain arrays: a fit of centres that somebody else has measured needs no session and no stand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from compensation.history.history import History, refined
+from compensation.observations import Float, Observations, SessionFacts
+from experiments.steps import Role
+from foundation.clock import NS_PER_S
+from markers.target import Target
+from recording.reading.interpolation import interpolated
+
+_SPACING_mm = 1.0
+
+
+def observations_of(
+    centres_px: ArrayLike,
+    camera_degC: ArrayLike,
+    time_ns: ArrayLike | None = None,
+    *,
+    chamber_degC: ArrayLike | None = None,
+    reference_degC: float | None = None,
+    role: ArrayLike | None = None,
+    air: tuple[ArrayLike, ArrayLike] | None = None,
+    sigma_px: float = 0.01,
+    covariance_px2: ArrayLike | None = None,
+    image_size: tuple[int, int] | None = None,
+    target: Target | None = None,
+    camera_serial: str = "",
+    name: str = "arrays",
+) -> Observations:
+    """F frames of N markers of one camera.
+
+    centres_px (F, N, 2): (x, y), NaN where a marker is missing. camera_degC (F,): the camera's own temperature; a frame
+    where it is NaN is not used. time_ns (F,): middle of the exposure, ascending; else a frame a second. chamber_degC
+    (F,): the set-point, whose frames are left out together to choose a model; else camera_degC in whole degrees. role
+    (F,): of experiments.steps.Role; else `reference` at the set-point nearest to reference_degC (else that of the first
+    frame) and `fit` at the others. air: (time_ns, degC), both (A,), of the air near the camera, for the thermal form.
+    sigma_px: standard uncertainty of a coordinate, where there is no covariance_px2 (F, N, 2, 2). image_size: (width,
+    height); else what holds the centres. ValueError when shapes do not agree.
+    """
+    centres = np.array(centres_px, np.float64)
+    camera = np.array(camera_degC, np.float64)
+    if centres.ndim != 3 or centres.shape[2] != 2 or camera.shape != centres.shape[:1] or not len(camera):
+        raise ValueError(f"centres are (F, N, 2) and temperatures (F,), not {centres.shape} and {camera.shape}")
+    frames, count = centres.shape[:2]
+    covariance = np.eye(2) * sigma_px**2 if covariance_px2 is None else np.array(covariance_px2, np.float64)
+    instants = np.arange(frames) * NS_PER_S if time_ns is None else np.array(time_ns, np.int64)
+    chamber = np.round(camera) if chamber_degC is None else np.array(chamber_degC, np.float64)
+    roles = _roles(chamber, reference_degC) if role is None else np.array(role, np.str_)
+    for what, column in (("time_ns", instants), ("chamber_degC", chamber), ("role", roles)):
+        if column.shape != (frames,):
+            raise ValueError(f"{what} has shape {column.shape}, not ({frames},)")
+    missing = np.isnan(centres).any(axis=2) | np.isnan(camera)[:, None]
+    size = image_size or (math.ceil(np.nanmax(centres[..., 0])) + 1, math.ceil(np.nanmax(centres[..., 1])) + 1)
+    history = None if air is None else _history(air, instants, camera)
+    return Observations(
+        target=target or _unnamed(count),
+        sessions=(SessionFacts(name, "", camera_serial, "", "", simulated=None, incomplete=0),),
+        image_size=size,
+        preview=np.zeros((max(1, size[1] // 8), max(1, size[0] // 8)), np.uint8),
+        session=np.zeros(frames, np.int64),
+        frame=np.arange(frames),
+        time_ns=instants,
+        role=roles,
+        step_id=("",) * frames,
+        chamber_degC=chamber,
+        camera_degC=camera,
+        air_degC=np.full(frames, np.nan)
+        if history is None
+        else interpolated(history.ambient_ns, history.ambient_degC, instants),
+        centres_px=np.where(missing[..., None], np.nan, centres),
+        covariance_px2=np.where(missing[..., None, None], np.nan, covariance),
+        flags=np.zeros((frames, count), np.uint8),
+        reasons=tuple(
+            _reason(degC, unseen)
+            for degC, unseen in zip(camera.tolist(), np.all(missing, axis=1).tolist(), strict=True)
+        ),
+        histories=() if history is None else (history,),
+    )
+
+
+def _reason(camera_degC: float, unseen: bool) -> str:
+    if math.isnan(camera_degC):
+        return "the camera's temperature is unknown"
+    return "no marker has a centre" if unseen else ""
+
+
+def _roles(chamber_degC: Float, reference_degC: float | None) -> NDArray[np.str_]:
+    """`reference` at the set-point nearest to the wanted one, `fit` at the others."""
+    known = np.unique(chamber_degC[np.isfinite(chamber_degC)])
+    wanted = chamber_degC[0] if reference_degC is None else reference_degC
+    nearest = known[np.argmin(np.abs(known - wanted))] if len(known) else math.nan
+    return np.where(chamber_degC == nearest, str(Role.REFERENCE), str(Role.FIT))
+
+
+def _history(air: tuple[ArrayLike, ArrayLike], instants: NDArray[np.int64], camera_degC: Float) -> History:
+    """What lags are computed from; the camera's supply is on, for it has temperatures."""
+    time_ns, degC = np.array(air[0], np.int64), np.array(air[1], np.float64)
+    good, told = np.isfinite(degC), np.isfinite(camera_degC)
+    nothing = np.empty(0, np.int64), np.empty(0)
+    return refined(History(time_ns[good], degC[good], *nothing, instants[told], camera_degC[told]))
+
+
+def _unnamed(count: int) -> Target:
+    """N markers in no known order: models are of the image, and do not ask where the markers are on the target."""
+    return Target.model_construct(
+        name="", columns=count, rows=1, pitch_mm=_SPACING_mm, diameter_mm=_SPACING_mm / 3, minimum_markers=None
+    )

@@ -1,0 +1,10 @@
+from foundation.errors import SessionError as SessionError
+from foundation.items import Event as Event
+from foundation.items import StepMark as StepMark
+from foundation.readings import Frame as Frame
+from recording.exporting.export import export as export
+from recording.exporting.trim import trim as trim
+from recording.reading.frames_table import FramesTable as FramesTable
+from recording.reading.session import Session as Session
+from recording.reading.using import open_whole as open_whole
+from recording.repair.verify import verify as verify

@@ -1,0 +1,92 @@
+"""What a session knows of each of its frames, as columns: where it is, when and why it was taken, how warm it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foundation.errors import SessionError
+from recording.format.messages import FrameMeta
+from recording.reading.interpolation import Float, interpolated
+from recording.reading.superseded import begins_of, is_superseded
+
+if TYPE_CHECKING:
+    from recording.reading.session import Session
+
+_AIR = "thermometers.air"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramesTable:
+    """F frames in order of time; each column has shape (F,).
+
+    file: the segment that holds the image, within the session. time_ns: middle of the exposure, int64. step_id: the
+    step that took it, role: what for, as the step says, "" when neither is known. superseded: whether its capture was
+    begun again after it, so that it does not count. chamber_degC: the step's set-point. camera_degC: the camera's own
+    temperature. air_degC: near the camera, interpolated. positions: of each axis of the table, by its name, in its unit
+    (mm or deg), interpolated. Numbers are NaN when unknown.
+    """
+
+    file: NDArray[np.str_]
+    time_ns: NDArray[np.int64]
+    step_id: NDArray[np.str_]
+    role: NDArray[np.str_]
+    superseded: NDArray[np.bool_]
+    chamber_degC: Float
+    camera_degC: Float
+    air_degC: Float
+    positions: Mapping[str, Float] = field(default_factory=dict[str, Float])
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def columns(self) -> dict[str, NDArray[np.generic]]:
+        """Name -> column, the axes as `linear_position`: what pandas.DataFrame and the like take."""
+        names = ("file", "time_ns", "step_id", "role", "superseded", "chamber_degC", "camera_degC", "air_degC")
+        own: dict[str, NDArray[np.generic]] = {name: getattr(self, name) for name in names}
+        return own | {f"{axis}_position": column for axis, column in self.positions.items()}
+
+
+def frames_table(session: Session, files: list[str], times_ns: NDArray[np.int64]) -> FramesTable:
+    """The table of the frames at these instants (F,), which lie in these files."""
+    described: dict[int, list[FrameMeta]] = {}
+    for time_ns, meta in session.frame_metas:
+        described.setdefault(time_ns, []).append(meta)
+    metas = [described[time_ns].pop(0) if described.get(time_ns) else None for time_ns in times_ns.tolist()]
+    step_id = ["" if meta is None else meta.step_id for meta in metas]
+    steps = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
+    begins_ns = begins_of(session)
+    named = zip(times_ns.tolist(), step_id, strict=True)
+    return FramesTable(
+        file=np.array(files, np.str_),
+        time_ns=times_ns,
+        step_id=np.array(step_id, np.str_),
+        role=np.array([str(steps.get(name, {}).get("role") or "") for name in step_id], np.str_),
+        superseded=np.array([is_superseded(time_ns, name, begins_ns) for time_ns, name in named], bool),
+        chamber_degC=np.array([_number(steps.get(name, {}).get("chamber_degC")) for name in step_id], np.float64),
+        camera_degC=np.array([math.nan if meta is None else meta.camera_degC for meta in metas], np.float64),
+        air_degC=_at(session, _AIR, times_ns),
+        positions={axis: _at(session, f"{axis}.position", times_ns) for axis in _axes(session)},
+    )
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _axes(session: Session) -> list[str]:
+    """The devices that tell a position and whether they move."""
+    channels = set(session.channels())
+    return [name.removesuffix(".moving") for name in sorted(channels) if name.endswith(".moving")]
+
+
+def _at(session: Session, channel: str, times_ns: NDArray[np.int64]) -> Float:
+    try:
+        return interpolated(*session.readings(channel), times_ns)
+    except SessionError:
+        return np.full(len(times_ns), np.nan)

@@ -1,0 +1,141 @@
+"""The public names: what docs/notebook.md shows runs, `import thermostand` is enough, and arrays can be fitted."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import compensation
+import markers
+import recording
+import thermostand
+from experiments.steps import Role
+
+from .conftest import Recorded
+from .test_calibration_session import record as record_calibration
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOK = (ROOT / "docs" / "notebook.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", NOTEBOOK, re.DOTALL)
+
+
+def test_what_the_notebook_page_shows_runs(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert len(BLOCKS) == 5
+    (tmp_path / "night").symlink_to(recorded.path)
+    asyncio.run(record_calibration(tmp_path / "calibration", "calibration"))
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for block in BLOCKS:
+        exec(compile(block, "docs/notebook.md", "exec"), names)
+    assert {"model.json", "report.html", "report.json"} <= set(os.listdir(tmp_path))
+    assert len(names["settled"]) == 4  # type: ignore[arg-type]
+    assert max(names["evaluation"].rms_after_px) < 0.012  # type: ignore[attr-defined]
+    assert names["found"].found == 54  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("package", [recording, markers, compensation, thermostand])
+def test_each_public_name_is_there_and_no_other(package: object):
+    names = dir(package)
+    assert len(names) > 5
+    for name in names:
+        assert getattr(package, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        package.nothing  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_a_name_of_thermostand_is_that_of_its_package():
+    assert thermostand.Session is recording.Session
+    assert thermostand.session is recording.open_whole
+    assert thermostand.detect is markers.detect
+    assert thermostand.fit is compensation.fit
+    assert thermostand.__version__ == importlib.metadata.version("thermostand")
+
+
+def test_one_import_is_enough_and_light():
+    code = (
+        "import sys, thermostand\n"
+        "assert not {'numpy', 'recording.reading', 'numba', 'cv2'} & {*sys.modules}\n"
+        "thermostand.Session\n"
+        "assert not {'numba', 'scipy', 'cv2', 'matplotlib'} & {*sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_package_says_that_it_is_typed():
+    for name in ("foundation", "drivers", "experiments", "recording", "markers", "stand", "compensation"):
+        assert (ROOT / name / "py.typed").exists(), name
+    assert (ROOT / "thermostand" / "py.typed").exists()
+
+
+def arrays(set_points: tuple[float, ...] = (24.0, 10.0, 38.0, 52.0), frames: int = 3):
+    chamber_degC = np.repeat(set_points, frames)
+    x, y = np.meshgrid(np.linspace(50, 600, 6), np.linspace(50, 450, 4))
+    at_rest = np.column_stack([x.ravel(), y.ravel()])
+    moved = (chamber_degC - 24.0)[:, None, None] * np.array([0.01, -0.02])
+    return at_rest + moved, chamber_degC + 20, chamber_degC
+
+
+def test_arrays_become_observations_with_a_reference():
+    centres_px, camera_degC, chamber_degC = arrays()
+    centres_px[2, 5] = np.nan
+    camera_degC[4] = np.nan
+    seen = thermostand.observations_of(centres_px, camera_degC, chamber_degC=chamber_degC, reference_degC=23.0)
+    assert seen.of(Role.REFERENCE).tolist() == [True] * 3 + [False] * 9
+    assert seen.usable.tolist() == [True] * 4 + [False] + [True] * 7
+    assert np.isnan(seen.centres_px[2, 5]).all()
+    assert np.isnan(seen.covariance_px2[2, 5]).all()
+    assert np.isnan(seen.centres_px[4]).all()
+    assert seen.image_size == (602, 452)
+    assert np.diff(seen.time_ns).tolist() == [10**9] * 11
+    assert seen.target.count == 24
+
+
+def test_a_fit_of_arrays_finds_the_drift_and_may_be_kept(tmp_path: Path):
+    centres_px, camera_degC, chamber_degC = arrays()
+    seen = thermostand.observations_of(
+        centres_px, camera_degC, chamber_degC=chamber_degC, sigma_px=0.001, camera_serial="mine"
+    )
+    model = thermostand.fit(seen)
+    score = thermostand.evaluate(model, seen)
+    assert model.form == "paper"
+    assert score.rms_before_px == pytest.approx((0.18, 0.36), rel=0.2)
+    assert max(score.rms_after_px) < 1e-6
+    thermostand.save_model(model, tmp_path / "model.json")
+    again = thermostand.load_model(tmp_path / "model.json")
+    np.testing.assert_array_equal(again.correct(centres_px[-1], 72.0), model.correct(centres_px[-1], 72.0))
+    thermostand.report(tmp_path / "report.html", seen, model, score)
+    assert "camera mine" in (tmp_path / "report.html").read_text()
+
+
+def test_air_over_time_makes_a_history_for_the_thermal_form():
+    centres_px, camera_degC, chamber_degC = arrays()
+    time_ns = np.arange(12) * 60 * 10**9
+    air = (time_ns - 10**9, chamber_degC + 0.5)
+    seen = thermostand.observations_of(centres_px, camera_degC, time_ns, chamber_degC=chamber_degC, air=air)
+    assert np.isfinite(seen.air_degC[:11]).all()
+    assert len(seen.histories) == 1
+    assert seen.histories[0].has_ambient
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"camera_degC": np.zeros(5)}, r"not \(12, 24, 2\) and \(5,\)"),
+        ({"centres_px": np.zeros((12, 24))}, r"not \(12, 24\)"),
+        ({"time_ns": np.zeros(3)}, r"time_ns has shape \(3,\)"),
+        ({"role": ["fit"]}, r"role has shape \(1,\)"),
+    ],
+)
+def test_arrays_that_do_not_agree_are_refused(change: dict[str, object], sentence: str):
+    centres_px, camera_degC, chamber_degC = arrays()
+    given = {"centres_px": centres_px, "camera_degC": camera_degC, "chamber_degC": chamber_degC} | change
+    with pytest.raises(ValueError, match=sentence):
+        thermostand.observations_of(**given)  # type: ignore[arg-type]
