@@ -9,9 +9,14 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from typing import get_args
+
+from pydantic import TypeAdapter, ValidationError
+
+from foundation.errors import ConfigError
 
 
 class Role(StrEnum):
@@ -215,6 +220,25 @@ def parameters_of(step: Step) -> dict[str, object]:
     return {name: str(value) if isinstance(value, Role) else value for name, value in asdict(step).items()}
 
 
+_KINDS: dict[str, type[Step]] = {kind.__name__: kind for kind in get_args(Step)}
+
+
+def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
+    """The step that `kind_of` and `parameters_of` have given; ConfigError when there is none such."""
+    if kind not in _KINDS:
+        raise ConfigError(f"no step is called {kind!r}; there are {', '.join(_KINDS)}")
+    try:
+        step = TypeAdapter(_KINDS[kind]).validate_python(dict(parameters))
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
+        raise ConfigError(f"{kind}: {wrong}") from error
+    for name, value in asdict(step).items():
+        least = 1 if name == "frames" else 0 if name.endswith("_s") else -math.inf
+        if isinstance(value, int | float) and not least <= value < math.inf:
+            raise ConfigError(f"{kind}: {name} is {value}")
+    return step
+
+
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
     """A step at its place in the plan. `step_id` stays the same as long as place and parameters do."""
@@ -224,8 +248,8 @@ class PlannedStep:
     step: Step
 
 
-def number_steps(steps: Iterable[Step]) -> Iterator[PlannedStep]:
-    """Give each step its place (from 0) and its id."""
-    for index, step in enumerate(steps):
+def number_steps(steps: Iterable[Step], first: int = 0) -> Iterator[PlannedStep]:
+    """Give each step its place (from `first`) and its id."""
+    for index, step in enumerate(steps, first):
         text = json.dumps([index, kind_of(step), parameters_of(step)], sort_keys=True)
         yield PlannedStep(index, hashlib.sha256(text.encode()).hexdigest()[:12], step)

@@ -1,0 +1,281 @@
+"""What a run does next: one action for each state and each surroundings. The table of a run, without any effect.
+
+Rows are read from the top; the first that fits decides:
+
+    the plan is done                                         None
+    the step under way has all that it wants                 Complete
+    the next frame is not due yet                            Sleep
+    something holds the run                                  Wait
+    the set-up is disturbed; a warm-up was interrupted       StartCold
+    the set-up is disturbed                                  Restore
+    a soak since the last set-point owes time                Earn
+    the camera, which the step needs, is not in equilibrium  Equilibrate
+    the flap should be open and is not                       OpenAgain
+    the step was not begun by this daemon                    Begin
+    the step is a soak                                       Earn
+    it is a capture: without a deadline, or after a hold     Aim
+    ... a warm-up, and it was interrupted for long           StartCold
+    ... with frames, and it was interrupted for long         TakeAgain
+    ... else                                                 TakeFrame
+    any other step                                           Perform
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from experiments.steps import AnySoak, Capture, CloseFlap, OpenFlap, PlannedStep, PowerCamera, Prompt, Role
+from foundation.clock import seconds_ns
+from stand.running.state import Plan, RunState, SetUp
+
+# A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
+# chamber left alone for a minute has gone further. The camera, which is slower than the air, has then hardly moved.
+BAND_K = 1.0
+# A capture that did not go on for longer than this is taken again: its flap was shut meanwhile, and the air is not the
+# same any more.
+AGAIN_AFTER_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What of the stand decides. lead_ns: how long before its instant a frame is asked for. held: whether the gate is
+    closed, as after a latched fault. pv_degC: the chamber's last known temperature, NaN when it is not known.
+    lost_equilibrium: the camera's."""
+
+    now_ns: int
+    lead_ns: int = 0
+    held: bool = False
+    flap_open: bool = False
+    lost_equilibrium: bool = False
+    pv_degC: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Complete:
+    """The step is done when all that it has recorded is on the disk."""
+
+    planned: PlannedStep
+
+
+@dataclass(frozen=True, slots=True)
+class Sleep:
+    """Nothing is to be done before that instant."""
+
+    until_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Until nothing holds the run."""
+
+
+@dataclass(frozen=True, slots=True)
+class StartCold:
+    """These steps of a warm-up, its capture last, are done again."""
+
+    again: Plan
+
+
+@dataclass(frozen=True, slots=True)
+class Restore:
+    """Bring the set-up about again."""
+
+    set_up: SetUp
+
+
+@dataclass(frozen=True, slots=True)
+class Earn:
+    """Soak for what the soak still owes."""
+
+    soak: PlannedStep
+
+
+@dataclass(frozen=True, slots=True)
+class Equilibrate:
+    """Until the camera is in equilibrium again."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenAgain:
+    """Open the flap, which was shut in a hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """Begin the step."""
+
+    planned: PlannedStep
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """Prepare for frames, and say when the next is due."""
+
+    planned: PlannedStep
+    capture: Capture
+
+
+@dataclass(frozen=True, slots=True)
+class TakeAgain:
+    """The capture begins anew, after such an outage."""
+
+    planned: PlannedStep
+    outage_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TakeFrame:
+    """One frame; `is_settled`: the first after a soak."""
+
+    planned: PlannedStep
+    capture: Capture
+    due_ns: int
+    is_settled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Perform:
+    """Do the step, all of it."""
+
+    planned: PlannedStep
+
+
+Action = (
+    Complete
+    | Sleep
+    | Wait
+    | StartCold
+    | Restore
+    | Earn
+    | Equilibrate
+    | OpenAgain
+    | Begin
+    | Aim
+    | TakeAgain
+    | TakeFrame
+    | Perform
+)
+# Of these the outage of a capture is made. Soaks that come before the step count, too.
+Readies = Wait | Restore | Equilibrate | OpenAgain
+
+
+def next_action(state: RunState, around: Surroundings) -> Action | None:
+    """The action, None when the plan is done."""
+    if state.index >= len(state.plan):
+        return None
+    planned = state.plan[state.index]
+    is_under_way = state.under_way == planned.step_id
+    if is_under_way and _has_all(state, planned):
+        return Complete(planned)
+    if is_under_way and state.due_ns is not None and around.now_ns < state.due_ns - around.lead_ns:
+        return Sleep(state.due_ns - around.lead_ns)
+    if around.held:
+        return Wait()
+    if action := _readying(state, around, planned):
+        return action
+    if not is_under_way:
+        return Begin(planned)
+    if isinstance(planned.step, Capture):
+        return _capturing(state, around, planned, planned.step)
+    return Earn(planned) if isinstance(planned.step, AnySoak) else Perform(planned)
+
+
+def _has_all(state: RunState, planned: PlannedStep) -> bool:
+    if isinstance(planned.step, Capture):
+        return state.frames.get(planned.step_id, 0) >= planned.step.frames
+    return isinstance(planned.step, AnySoak) and not state.owed_ns(planned)
+
+
+def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Action | None:
+    """What is needed before the step; None when everything is as the steps before it have left it."""
+    set_up = state.set_up
+    if state.is_disturbed:
+        if again := cold_start(state):
+            return StartCold(again)
+        # A soak depends on what it has earned itself as on those before it.
+        return Restore(set_up.after(planned) if isinstance(planned.step, AnySoak) else set_up)
+    if owing := next((soak for soak in set_up.soaks if state.owed_ns(soak)), None):
+        return Earn(owing)
+    if set_up.camera_on and around.lost_equilibrium and isinstance(planned.step, OpenFlap | Capture):
+        return Equilibrate()
+    if set_up.flap_open and not around.flap_open and not isinstance(planned.step, CloseFlap):
+        return OpenAgain()
+    return None
+
+
+def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capture: Capture) -> Action:
+    if state.due_ns is None or state.readying or state.is_lost:
+        return Aim(planned, capture)
+    outage_ns, has_frames = state.outage_ns(around.now_ns), state.frames.get(planned.step_id, 0) > 0
+    is_warm_up = capture.role is Role.WARM_UP
+    if outage_ns > seconds_ns(AGAIN_AFTER_S):
+        if is_warm_up and (again := cold_start(state)):
+            return StartCold(again)
+        if has_frames:
+            return TakeAgain(planned, outage_ns)
+    return TakeFrame(planned, capture, state.due_ns, bool(state.set_up.soaks) and not is_warm_up and not has_frames)
+
+
+def next_due_ns(due_ns: int | None, capture: Capture, around: Surroundings, *, is_lost: bool) -> int:
+    """When the next frame is due after the capture was made ready, on a grid of absolute deadlines: those missed while
+    the run was held or a lost camera opened anew are skipped, not made up for by a burst."""
+    if due_ns is None:
+        return around.now_ns + around.lead_ns
+    interval_ns = seconds_ns(capture.interval_s)
+    return due_ns + max(is_lost, math.ceil((around.now_ns - due_ns) / interval_ns)) * interval_ns
+
+
+def due_after_ns(due_ns: int, capture: Capture, now_ns: int) -> int:
+    """When the next frame is due after one: at the latest deadline that has passed, for a free-running camera gives its
+    frame up to a period late."""
+    interval_ns = seconds_ns(capture.interval_s)
+    return due_ns + max(1, (now_ns - due_ns) // interval_ns) * interval_ns
+
+
+def cold_start(state: RunState) -> Plan:
+    """The steps of an interrupted warm-up that are done again, the capture last: from switching the camera off to its
+    capture, but for what the operator was asked for. A warm-up that was killed, or held by an interlock, cannot be gone
+    on with: its camera is warm.
+
+    Empty when no warm-up was interrupted after its camera was, or may have been, switched on.
+    """
+    steps = state.plan
+    last = next((step.index for step in steps if _is_warm_up(step) and step.step_id not in state.done), 0)
+    on = _last_switch(steps[:last], on=True)
+    off = _last_switch(steps[: on or 0], on=False)
+    if on is None or off is None or steps[on].step_id not in state.done | state.begun:
+        return ()
+    return tuple(step for step in steps[off : last + 1] if not isinstance(step.step, Prompt))
+
+
+def _is_warm_up(planned: PlannedStep) -> bool:
+    return isinstance(planned.step, Capture) and planned.step.role is Role.WARM_UP
+
+
+def _last_switch(steps: Plan, *, on: bool) -> int | None:
+    return next((step.index for step in reversed(steps) if step.step == PowerCamera(on)), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """What the soaks that were begun are worth after a disturbance; `lost` are soaked anew. kind: of the event that
+    says so, "" when there was nothing to lose; text: of it."""
+
+    kind: str = ""
+    text: str = ""
+    lost: Plan = ()
+
+
+def worth_of_soaks(state: RunState, set_up: SetUp, around: Surroundings) -> Worth:
+    """Soaks since the last set-point keep what they have earned only if the chamber is in its band, and the camera was
+    on."""
+    begun = tuple(soak for soak in set_up.soaks if soak.step_id in state.done or state.earned_ns.get(soak.step_id, 0))
+    if not begun or set_up.chamber_degC is None:
+        return Worth()
+    if state.is_cold and set_up.camera_on:
+        return Worth("soak_restarted", "the camera was or may have been off; it soaks anew", begun)
+    text = f"the chamber is at {around.pv_degC:.2f} degC, {{}}within {BAND_K:g} K of its set-point"
+    if abs(around.pv_degC - set_up.chamber_degC) <= BAND_K:
+        return Worth("soak_credited", text.format(""))
+    return Worth("soak_restarted", text.format("not ") + "; it soaks anew", begun)

@@ -1,0 +1,216 @@
+"""What happens to a run, entry by entry. RunState is folded from them; those that outlive the daemon are lines of its
+journal (recording/reading/journal_lines.py).
+
+    Begun     the run, its plan and the texts it was made of; the first line and no other
+    Step      a step was started, or is done
+    Dwell     what a soak has earned so far
+    Held      a reason to wait appeared or went
+    Gap       nothing ran between two instants
+    Again     steps that were done are to be done again
+    Skipped   a step is left out, or broken off, by an operator
+    Extended  a soak is made longer by an operator
+    Edited    the steps from a place on are replaced by an operator
+    Tripped   the guard has made the stand safe, and why
+    Cleared   an operator has seen to what had tripped
+    Ended     complete, stopped by the operator, tripped, or failed
+
+Not written: what the recording proves (Taken, Cooled), and what a Gap makes void (Due, Readying, Restored).
+
+    Taken     a capture has a frame more
+    Due       when the capture's next frame is due
+    Readying  the stand is being made ready for the next step, or is
+    Restored  the set-up of the steps so far has been brought about again
+    Cooled    the camera was or may have been off
+
+Instants are ns on the stand's clock, so a run in virtual time has the same journal each time.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Literal, cast
+
+from foundation.errors import SessionError
+from recording.reading.journal_lines import JOURNAL_NAME, journal_line, lines_of
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """run: the session's name. plan: hash of the steps' ids. texts: hash of each attached text by its name.
+    seed: of the simulated laboratory, None when it was the configured one."""
+
+    time_ns: int
+    run: str
+    plan: str
+    texts: dict[str, str]
+    seed: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of the plan; "done" is written when all it has recorded is on the disk."""
+
+    time_ns: int
+    step_id: str
+    state: Literal["started", "done"]
+
+
+@dataclass(frozen=True, slots=True)
+class Dwell:
+    """A soak has earned `earned_s` of its duration; also after its end, when it has to be earned anew."""
+
+    time_ns: int
+    step_id: str
+    earned_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """`reason` holds the run from now on, or (`held` false) does not any more."""
+
+    time_ns: int
+    reason: str
+    held: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Nothing was recorded, and nobody watched the stand, between these instants."""
+
+    from_ns: int
+    time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """These steps count as neither begun nor done from now on, and no frame of theirs before counts."""
+
+    time_ns: int
+    step_ids: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """The step is not done, or not to its end, and the run goes on behind it; its frames so far count."""
+
+    time_ns: int
+    step_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Extended:
+    """The soak takes so much longer."""
+
+    time_ns: int
+    step_id: str
+    by_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Edited:
+    """The steps from the place `from_index` on are these instead, each its kind and its parameters (JSON-able)."""
+
+    time_ns: int
+    from_index: int
+    steps: list[dict[str, object]]
+
+
+@dataclass(frozen=True, slots=True)
+class Tripped:
+    """The guard has made the stand safe; nothing goes on before an operator has cleared it."""
+
+    time_ns: int
+    rule: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cleared:
+    """An operator has seen to what had tripped."""
+
+    time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How the run ended, and why. `interrupted` is what journals of format 1 call `stopped`, by the operator."""
+
+    time_ns: int
+    status: Literal["complete", "stopped", "tripped", "failed", "interrupted"]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """A frame of the capture, exposed at this instant."""
+
+    time_ns: int
+    step_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Due:
+    """The next frame of the capture under way is due then, None when its deadlines begin anew. lost: the camera did not
+    give the last one."""
+
+    time_ns: int
+    due_ns: int | None
+    lost: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Readying:
+    """From now on (`begins`) or until now the stand is being made ready."""
+
+    time_ns: int
+    begins: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """What the first `disturbances` of the run had undone is as it was."""
+
+    time_ns: int
+    disturbances: int
+
+
+@dataclass(frozen=True, slots=True)
+class Cooled:
+    """The camera was or may have been off."""
+
+    time_ns: int
+
+
+Written = Begun | Step | Dwell | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Cleared | Ended
+Entry = Written | Taken | Due | Readying | Restored | Cooled
+Change = Skipped | Extended | Edited  # of the plan, by an operator
+
+_WRITTEN: dict[str, type[Written]] = {
+    kind.__name__: kind
+    for kind in (Begun, Step, Dwell, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Cleared, Ended)
+}
+
+
+def encode_line(entry: Written) -> bytes:
+    """The entry as a line."""
+    return journal_line(json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode())
+
+
+def read_lines(data: bytes) -> tuple[list[Written], int]:
+    """The entries of all sound lines, and how many bytes there are up to the end of the last one.
+
+    SessionError when a sound line holds an entry that is not known here.
+    """
+    lines = lines_of(data)
+    return [decoded(text) for text in lines.sound], lines.size_bytes
+
+
+def decoded(text: bytes) -> Written:
+    """The entry in a sound line; SessionError when it is not known here."""
+    try:
+        fields = cast("dict[str, object]", json.loads(text))
+        kind = _WRITTEN[cast("str", fields.pop("entry"))]
+        return kind(**fields)  # pyright: ignore[reportArgumentType] - a CRC vouches for what was written here
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({text[:80]!r})") from error
