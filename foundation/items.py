@@ -10,11 +10,12 @@ from foundation.readings import Frame, Reading
 
 
 class StepState(StrEnum):
-    """Where a step of the plan is."""
+    """Where a step of the plan is. skipped: left out, or broken off, by an operator."""
 
     STARTED = "started"
     DONE = "done"
     FAILED = "failed"
+    SKIPPED = "skipped"
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from recording.format.holes import Hole
 from recording.format.inventory import State
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.utc_offsets import UtcOffsets
-from recording.reading.contents import RUN_BEGINS, RUN_END
+from recording.reading.contents import RUN_BEGINS, RUN_END, TELL_PLAN
 from recording.reading.coverage import Coverage
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts
 from recording.reading.run_word import last_run_event
@@ -61,7 +61,7 @@ def lost_end(
 def frames_of_plan(events: Iterable[Event], frames: int) -> str:
     """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the recording does not tell of
     its plan (format 1 does not), or when there are as many."""
-    planned = [event.data.get("frames") for event in events if event.kind in RUN_BEGINS]
+    planned = [event.data.get("frames") for event in events if event.kind in TELL_PLAN]
     told = planned[-1] if planned else None
     return f"; {frames} of the {told} frames of the plan are there" if isinstance(told, int) and frames < told else ""
 

@@ -18,7 +18,7 @@ from recording.format.inventory import SegmentFile, State
 from recording.format.layout import FRAMES
 from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
 from recording.format.utc_offsets import UtcOffsets, offsets_of
-from recording.reading.contents import RUN_BEGINS, RUN_END, Channel, Contents
+from recording.reading.contents import RUN_END, TELL_PLAN, Channel, Contents
 from recording.reading.gaps import Silence, silences, told_blocks
 from recording.reading.glance import Glance, glance, within
 from recording.reading.run_word import Files
@@ -87,7 +87,7 @@ class Overview:
     @property
     def planned_steps(self) -> int | None:
         """How many steps the plan of the run has, None when the recording does not tell; those of format 1 do not."""
-        begins = [event.data.get("steps") for event in self.events if event.kind in RUN_BEGINS]
+        begins = [event.data.get("steps") for event in self.events if event.kind in TELL_PLAN]
         told = begins[-1] if begins else None
         return told if isinstance(told, int) else None
 

@@ -17,7 +17,7 @@ from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import PricedStep, price
 from stand.estimating.follow import parameters_text
 from stand.estimating.learned import load_learned
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 from stand.simulator import Simulator, laboratory_of
 
 app = typer.Typer(add_completion=False)

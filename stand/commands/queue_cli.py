@@ -18,7 +18,7 @@ from stand.queueing import queue
 from stand.queueing.queue_file import Entry, Queue
 from stand.queueing.queue_run import conclude, run_entry
 from stand.queueing.queue_work import Notes, work
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 from stand.running.stop import Interrupted
 
 app = typer.Typer(

@@ -26,7 +26,7 @@ from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.estimate import PricedStep, price
 from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 from stand.running.resume import interruption
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.stop import Interrupted
@@ -125,11 +125,11 @@ def resume_run(
                 check_reportable(order.recipe.plan())
             for segment in before.salvaged:
                 typer.echo(salvage_line(segment), err=True)
-            steps = price(order.recipe.plan(), order.config, load_learned(before.directory.parent))
+            steps = price(before.state.plan, order.config, load_learned(before.directory.parent))
         except BaseException:
             before.release()
             raise
-        with _run_progress(steps, before.progress.done, before.progress.earned_s) as watch:
+        with _run_progress(steps, before.kept.done, before.kept.earned_s) as watch:
             session = asyncio.run(resume(before, watch))
         _finished(session, order.config, report=report)
 

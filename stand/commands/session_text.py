@@ -162,7 +162,11 @@ def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
     planned = "" if found.planned_steps is None else f" of {found.planned_steps}"
     yield from _row("steps", f"{kinds.total()}{planned} done{f': {listed}' if listed else ''}" if steps else "none")
-    told = {StepState.FAILED: "failed", StepState.STARTED: "has no end in the recording"}
+    told = {
+        StepState.FAILED: "failed",
+        StepState.SKIPPED: "was left out",
+        StepState.STARTED: "has no end in the recording",
+    }
     for step in steps:
         if step.state is not StepState.DONE:
             parameters = " ".join(f"{name}={value}" for name, value in step.parameters.items())

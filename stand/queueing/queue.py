@@ -11,8 +11,7 @@ from pathlib import Path
 from foundation.errors import SessionError, StandTripped
 from stand.estimating.estimate import price
 from stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
-from stand.running.order_files import parse_order
-from stand.running.session_setup import Order
+from stand.running.order import Order, parse_order
 
 
 def order_of(entry: Entry) -> Order:

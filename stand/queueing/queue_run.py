@@ -19,10 +19,11 @@ from stand.estimating.learned import learn, load_learned
 from stand.queueing.queue import order_of
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Halt, Notes
-from stand.running.journal import Ended, Journal
+from stand.running.entries import Ended
+from stand.running.journal import Journal
+from stand.running.order import Order
 from stand.running.resume import Interruption, interruption
 from stand.running.run import resume, run_real, run_virtual
-from stand.running.session_setup import Order
 from stand.running.stop import Interrupted
 from stand.session_report import NotReported, check_reportable, report_session
 
@@ -41,7 +42,7 @@ async def run_entry(
         return session  # killed between its end and the note of it
     order = order_of(entry)
     before = None if session is None else await asyncio.to_thread(_interruption, session, order.config)
-    watch = _Watch(frozenset() if before is None else before.progress.done, notes.step_done)
+    watch = _Watch(frozenset() if before is None else before.kept.done, notes.step_done)
     try:
         with _followed(directory, order, before, tell) as follow:
 
@@ -102,12 +103,13 @@ def conclude(entry: Entry, session: Path, tell: Callable[[str], None], *, report
 def _followed(
     directory: Path, order: Order, before: Interruption | None, tell: Callable[[str], None]
 ) -> Generator[Follow]:
-    steps = price(order.recipe.plan(), order.config, load_learned(directory))
+    plan = order.recipe.plan() if before is None else before.state.plan
+    steps = price(plan, order.config, load_learned(directory))
     with progress("run", sum(step.duration_s for step in steps)) as report, aside() as later:
         if before is None:
             yield Follow(steps, later(report), later(tell))
         else:
-            yield Follow(steps, later(report), later(tell), before.progress.done, before.progress.earned_s)
+            yield Follow(steps, later(report), later(tell), before.kept.done, before.kept.earned_s)
 
 
 def _interruption(session: Path, own: StandConfig) -> Interruption:

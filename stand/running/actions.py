@@ -3,9 +3,10 @@
 Rows are read from the top; the first that fits decides:
 
     the plan is done                                         None
-    the step under way has all that it wants                 Complete
-    the next frame is not due yet                            Sleep
+    the capture under way has all its frames                 Complete
+    its next frame is not due yet                            Sleep
     something holds the run                                  Wait
+    the soak under way has earned its time                   Complete
     the set-up is disturbed; a warm-up was interrupted       StartCold
     the set-up is disturbed                                  Restore
     a soak since the last set-point owes time                Earn
@@ -31,7 +32,7 @@ from stand.running.state import Plan, RunState, SetUp
 
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
 # chamber left alone for a minute has gone further. The camera, which is slower than the air, has then hardly moved.
-BAND_K = 1.0
+CREDITED_WITHIN_K = 1.0
 # A capture that did not go on for longer than this is taken again: its flap was shut meanwhile, and the air is not the
 # same any more.
 AGAIN_AFTER_S = 60.0
@@ -112,7 +113,6 @@ class Begin:
 class Aim:
     """Prepare for frames, and say when the next is due."""
 
-    planned: PlannedStep
     capture: Capture
 
 
@@ -166,25 +166,22 @@ def next_action(state: RunState, around: Surroundings) -> Action | None:
         return None
     planned = state.plan[state.index]
     is_under_way = state.under_way == planned.step_id
-    if is_under_way and _has_all(state, planned):
+    step = planned.step
+    if is_under_way and isinstance(step, Capture) and state.frames.get(planned.step_id, 0) >= step.frames:
         return Complete(planned)
     if is_under_way and state.due_ns is not None and around.now_ns < state.due_ns - around.lead_ns:
         return Sleep(state.due_ns - around.lead_ns)
     if around.held:
         return Wait()
+    if is_under_way and isinstance(step, AnySoak) and not state.owed_ns(planned):
+        return Complete(planned)
     if action := _readying(state, around, planned):
         return action
     if not is_under_way:
         return Begin(planned)
-    if isinstance(planned.step, Capture):
-        return _capturing(state, around, planned, planned.step)
-    return Earn(planned) if isinstance(planned.step, AnySoak) else Perform(planned)
-
-
-def _has_all(state: RunState, planned: PlannedStep) -> bool:
-    if isinstance(planned.step, Capture):
-        return state.frames.get(planned.step_id, 0) >= planned.step.frames
-    return isinstance(planned.step, AnySoak) and not state.owed_ns(planned)
+    if isinstance(step, Capture):
+        return _capturing(state, around, planned, step)
+    return Earn(planned) if isinstance(step, AnySoak) else Perform(planned)
 
 
 def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Action | None:
@@ -206,7 +203,7 @@ def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Ac
 
 def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capture: Capture) -> Action:
     if state.due_ns is None or state.readying or state.is_lost:
-        return Aim(planned, capture)
+        return Aim(capture)
     outage_ns, has_frames = state.outage_ns(around.now_ns), state.frames.get(planned.step_id, 0) > 0
     is_warm_up = capture.role is Role.WARM_UP
     if outage_ns > seconds_ns(AGAIN_AFTER_S):
@@ -275,7 +272,7 @@ def worth_of_soaks(state: RunState, set_up: SetUp, around: Surroundings) -> Wort
         return Worth()
     if state.is_cold and set_up.camera_on:
         return Worth("soak_restarted", "the camera was or may have been off; it soaks anew", begun)
-    text = f"the chamber is at {around.pv_degC:.2f} degC, {{}}within {BAND_K:g} K of its set-point"
-    if abs(around.pv_degC - set_up.chamber_degC) <= BAND_K:
+    text = f"the chamber is at {around.pv_degC:.2f} degC, {{}}within {CREDITED_WITHIN_K:g} K of its set-point"
+    if abs(around.pv_degC - set_up.chamber_degC) <= CREDITED_WITHIN_K:
         return Worth("soak_credited", text.format(""))
     return Worth("soak_restarted", text.format("not ") + "; it soaks anew", begun)

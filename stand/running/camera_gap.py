@@ -1,16 +1,121 @@
-"""Whether the camera may have been off while nobody watched it; in doubt it was."""
+"""What a gap may have done to the camera.
+
+It may have been off while nobody watched it; in doubt it was. And its own temperature minus that of the air near it,
+once a set-point has settled, may be another one: what the camera gives off and how the air takes it. A gap in which
+that has changed (another mount, a fan, another camera board) parts a night in two: before and after are not of one
+equilibrium.
+"""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepState
 from foundation.readings import Quality, Reading
 from recording.reading.session import Session
 from stand.imaging.camera_cooling import Cooling
 from stand.imaging.equilibrium import CAMERA, LOST, REACHED
-from stand.running.camera_offset import settled_offsets
+
+AIR = "thermometers.air"
+CHANGED, SAME = "camera_offset_changed", "camera_offset_same"  # kinds of events
+LIMIT_K = 1.0
+_WINDOW_S = 120.0
+_TRANSIENT_ROLES = frozenset({"warm_up", "settling"})
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetGap:
+    """What was settled before it, camera minus air by set-point (K by degC), and its instants (ns)."""
+
+    before_K: Mapping[float, float]
+    from_ns: int
+    to_ns: int
+
+
+class OffsetWatch:
+    """One to a run. `gap`: the one after which the run is resumed, None when it begins."""
+
+    def __init__(self, hub: Hub, clock: Clock, gap: OffsetGap | None = None) -> None:
+        self._hub = hub
+        self._clock = clock
+        self._settled_K = {} if gap is None else dict(gap.before_K)
+        self._gap = gap
+        self._readings: dict[str, deque[tuple[int, float]]] = {CAMERA: deque(), AIR: deque()}
+        hub.subscribe(self._receive)
+
+    def settled(self, chamber_degC: float) -> None:
+        """The set-point has settled: keep its offset, and compare it when it is the first since a gap; the event
+        `camera_offset_changed`, or `camera_offset_same`."""
+        after_K = self._offset_K()
+        if math.isnan(after_K):
+            return
+        gap, before_K = self._gap, self._settled_K
+        if gap is not None and before_K:
+            nearest_degC = min(before_K, key=lambda each_degC: abs(each_degC - chamber_degC))
+            self._tell(gap, nearest_degC, before_K[nearest_degC], chamber_degC, after_K)
+        self._gap = None
+        self._settled_K = {**before_K, chamber_degC: after_K}
+
+    def _offset_K(self) -> float:
+        since_ns = self._clock.now_ns() - seconds_ns(_WINDOW_S)
+        camera, air = (
+            [value for time_ns, value in self._readings[name] if time_ns >= since_ns] for name in (CAMERA, AIR)
+        )
+        return float(np.mean(camera) - np.mean(air)) if camera and air else math.nan
+
+    def _tell(self, gap: OffsetGap, before_degC: float, before_K: float, after_degC: float, after_K: float) -> None:
+        data: dict[str, object] = {
+            "before_K": before_K,
+            "after_K": after_K,
+            "before_degC": before_degC,
+            "after_degC": after_degC,
+            "gap_ns": gap.from_ns,
+            "gap_end_ns": gap.to_ns,
+        }
+        text = (
+            f"camera minus air was {before_K:.2f} K at {before_degC:g} degC before the gap, "
+            f"and is {after_K:.2f} K at {after_degC:g} degC after it"
+        )
+        changed = abs(after_K - before_K) > LIMIT_K
+        level, kind = ("warning", CHANGED) if changed else ("info", SAME)
+        self._hub.publish(Event(self._clock.now_ns(), level, kind, text, data))
+
+    def _receive(self, item: Item) -> None:
+        """The hub's subscriber."""
+        if isinstance(item, Event) and item.kind == LOST and self._gap is None:
+            self._gap = OffsetGap(self._settled_K, item.time_ns, item.time_ns)
+        if isinstance(item, Batch):
+            for reading in item.readings:
+                kept = self._readings.get(reading.channel)
+                if kept is not None and math.isfinite(reading.value):
+                    kept.append((reading.time_ns, reading.value))
+                    while kept[0][0] < reading.time_ns - seconds_ns(_WINDOW_S):
+                        kept.popleft()
+
+
+def settled_offsets(session: Session) -> dict[float, float]:
+    """Camera minus air (K) by set-point (degC), as it was last when a capture began there."""
+    found: dict[float, float] = {}
+    readings = [session.readings(channel) for channel in (CAMERA, AIR)]
+    for mark in session.steps():
+        chamber_degC, role = mark.parameters.get("chamber_degC"), mark.parameters.get("role")
+        if mark.kind != "Capture" or mark.state is not StepState.STARTED or role in _TRANSIENT_ROLES:
+            continue
+        means: list[float] = []
+        for times_ns, values in readings:
+            inside = (times_ns > mark.time_ns - _WINDOW_S * NS_PER_S) & (times_ns <= mark.time_ns) & np.isfinite(values)
+            means.append(float(values[inside].mean()) if inside.any() else math.nan)
+        if isinstance(chamber_degC, int | float) and math.isfinite(means[0] - means[1]):
+            found[float(chamber_degC)] = means[0] - means[1]
+    return found
+
 
 _SAME_K = 1.0  # a camera that is as warm as it was last has been on
 

@@ -28,7 +28,8 @@ Instants are ns on the stand's clock, so a run in virtual time has the same jour
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Literal, cast
 
 from foundation.errors import SessionError
@@ -192,6 +193,26 @@ _WRITTEN: dict[str, type[Written]] = {
 }
 
 
+_CHANGES: dict[object, type[Change]] = {kind.__name__: kind for kind in (Skipped, Extended, Edited)}
+
+
+def data_of(change: Change) -> dict[str, object]:
+    """The change of a plan as the recording has it, but for its instant."""
+    return {"change": type(change).__name__, **{name: v for name, v in asdict(change).items() if name != "time_ns"}}
+
+
+def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
+    """The change that `data_of` has given, among other fields; None when there is none."""
+    kind = _CHANGES.get(data.get("change"))
+    if kind is None:
+        return None
+    names = [each.name for each in fields(kind) if each.name != "time_ns"]
+    try:
+        return kind(time_ns, **{name: data[name] for name in names})  # pyright: ignore[reportArgumentType] - as written
+    except LookupError:
+        return None
+
+
 def encode_line(entry: Written) -> bytes:
     """The entry as a line."""
     return journal_line(json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode())
@@ -209,8 +230,8 @@ def read_lines(data: bytes) -> tuple[list[Written], int]:
 def decoded(text: bytes) -> Written:
     """The entry in a sound line; SessionError when it is not known here."""
     try:
-        fields = cast("dict[str, object]", json.loads(text))
-        kind = _WRITTEN[cast("str", fields.pop("entry"))]
-        return kind(**fields)  # pyright: ignore[reportArgumentType] - a CRC vouches for what was written here
+        values = cast("dict[str, object]", json.loads(text))
+        kind = _WRITTEN[cast("str", values.pop("entry"))]
+        return kind(**values)  # pyright: ignore[reportArgumentType] - a CRC vouches for what was written here
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({text[:80]!r})") from error

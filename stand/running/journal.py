@@ -1,33 +1,19 @@
 """What a run has done, durable: `journal.jsonl` in the session's folder, from which a killed run goes on.
 
-Append-only, one entry a line (recording/reading/journal_lines.py). A line is on the disk (fdatasync) when `write`
-returns. What follows the last sound line is cut off before anything is appended. A damaged line before it stays where
-it is, and the lines after it count; of a file with damaged lines a copy is kept as `journal.jsonl.damaged`.
-
-    Begun     the run, its plan and the texts it was made of; the first line and no other
-    Step      a step was started, or is done
-    Dwell     what a soak has earned so far
-    Held      a reason to wait appeared or went
-    Gap       nothing ran between two instants
-    Again     steps that were done are to be done again
-    Tripped   the guard has made the stand safe, and why
-    Cleared   an operator has seen to what had tripped
-    Ended     complete, stopped by the operator, tripped, or failed
-
-Instants are ns on the stand's clock, so a run in virtual time has the same journal each time.
+Append-only, one entry a line (stand/running/entries.py). A line is on the disk (fdatasync) when `write` returns. What
+follows the last sound line is cut off before anything is appended. A damaged line before it stays where it is, and the
+lines after it count; of a file with damaged lines a copy is kept as `journal.jsonl.damaged`.
 """
 
 from __future__ import annotations
 
-import json
+import errno
 import os
 from asyncio import Task, create_task, gather
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from itertools import count
 from pathlib import Path
-from typing import Literal, cast
 
 from foundation.clock import Clock
 from foundation.errors import SessionError
@@ -35,123 +21,14 @@ from foundation.helper import Line
 from foundation.lane import Lane
 from foundation.sink import sync_folder
 from foundation.whole_file import write_whole
-from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, journal_line, lines_of
+from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, lines_of
 from recording.writing.disk import JOURNAL_LINE, Disk
 from recording.writing.home import FolderLost
 from recording.writing.locks import lock
-from stand.running.journal_file import JournalFile, taken_over
+from stand.running.entries import Written, decoded, encode_line
 
 _DAMAGED = ".damaged"  # the ending of the copy of a journal with damaged lines
 _KEPT = "journal"  # its name in the disk process
-
-
-@dataclass(frozen=True, slots=True)
-class Begun:
-    """run: the session's name. plan: hash of the steps' ids. texts: hash of each attached text by its name.
-    seed: of the simulated laboratory, None when it was the configured one."""
-
-    time_ns: int
-    run: str
-    plan: str
-    texts: dict[str, str]
-    seed: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """A step of the plan; "done" is written when all it has recorded is on the disk."""
-
-    time_ns: int
-    step_id: str
-    state: Literal["started", "done"]
-
-
-@dataclass(frozen=True, slots=True)
-class Dwell:
-    """A soak has earned `earned_s` of its duration; also after its end, when it has to be earned anew."""
-
-    time_ns: int
-    step_id: str
-    earned_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Held:
-    """`reason` holds the run from now on, or (`held` false) does not any more."""
-
-    time_ns: int
-    reason: str
-    held: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """Nothing was recorded, and nobody watched the stand, between these instants."""
-
-    from_ns: int
-    time_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Again:
-    """These steps count as neither begun nor done from now on, and no frame of theirs before counts."""
-
-    time_ns: int
-    step_ids: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class Tripped:
-    """The guard has made the stand safe; nothing goes on before an operator has cleared it."""
-
-    time_ns: int
-    rule: str
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Cleared:
-    """An operator has seen to what had tripped."""
-
-    time_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """How the run ended, and why. `interrupted` is what journals of format 1 call `stopped`, by the operator."""
-
-    time_ns: int
-    status: Literal["complete", "stopped", "tripped", "failed", "interrupted"]
-    text: str
-
-
-Entry = Begun | Step | Dwell | Held | Gap | Again | Tripped | Cleared | Ended
-_ENTRIES: dict[str, type[Entry]] = {
-    kind.__name__: kind for kind in (Begun, Step, Dwell, Held, Gap, Again, Tripped, Cleared, Ended)
-}
-
-
-def encode_line(entry: Entry) -> bytes:
-    """The entry as a line."""
-    return journal_line(json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode())
-
-
-def read_lines(data: bytes) -> tuple[list[Entry], int]:
-    """The entries of all sound lines, and how many bytes there are up to the end of the last one.
-
-    SessionError when a sound line holds an entry that is not known here.
-    """
-    lines = lines_of(data)
-    return [_decoded(text) for text in lines.sound], lines.size_bytes
-
-
-def _decoded(text: bytes) -> Entry:
-    try:
-        fields = cast("dict[str, object]", json.loads(text))
-        kind = _ENTRIES[cast("str", fields.pop("entry"))]
-        return kind(**fields)  # pyright: ignore[reportArgumentType] - a CRC vouches for what was written here
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({text[:80]!r})") from error
 
 
 class Journal:
@@ -189,7 +66,7 @@ class Journal:
         return cls(path, fd, b"")
 
     @classmethod
-    def open(cls, directory: Path) -> tuple[Journal, list[Entry]]:
+    def open(cls, directory: Path) -> tuple[Journal, list[Written]]:
         """The journal of a session and the entries of its sound lines, none when not even the first was written; a torn
         tail is cut off. Of a journal with damaged lines a copy is kept, and its `damage` says so.
 
@@ -224,21 +101,32 @@ class Journal:
         self._trouble = trouble
         self._disk = disk
 
-    async def write(self, *entries: Entry) -> None:
+    async def write(self, *entries: Written) -> None:
         """The entries on the disk, or kept for the next time."""
+        self._take(entries)
+        await self._committed()
+
+    def note(self, entry: Written) -> None:
+        """As `write`, without waiting for the disk; its line comes before those of later calls. Nothing once closed."""
+        if self._lane is None:
+            return
+        self._take((entry,))
+        task = create_task(self._committed())
+        self._notes.add(task)
+        task.add_done_callback(self._notes.discard)
+
+    def _take(self, entries: Iterable[Written]) -> None:
         if self._lane is None:
             raise ValueError("a journal is started before it is written")
         self._waiting.extend(map(encode_line, entries))
+
+    async def _committed(self) -> None:
+        if self._lane is None:
+            return
         failure = await self._lane.call(self._commit)
         if failure is not None and not self._failing:
             self._trouble(f"{self.path.name} cannot be written ({failure.strerror}); its entries wait in memory")
         self._failing = failure is not None
-
-    def note(self, entry: Entry) -> None:
-        """As `write`, without waiting for the disk."""
-        task = create_task(self.write(entry))
-        self._notes.add(task)
-        task.add_done_callback(self._notes.discard)
 
     async def refound(self) -> bool:
         """Whether the file is at its place; else it is written there anew, whole. OSError when the disk refuses."""
@@ -302,14 +190,14 @@ class Journal:
         return getattr(self._file, method)(data)
 
 
-def _opened(fd: int, path: Path) -> tuple[list[Entry], bytes, str]:
+def _opened(fd: int, path: Path) -> tuple[list[Written], bytes, str]:
     """Lock, read, keep a copy when lines are damaged, and cut off what was not acknowledged: the entries, the bytes
     that stay and what is damaged; OSError, SessionError."""
     lock(fd)
     with open(fd, "rb", closefd=False) as file:
         data = file.read()
     lines = lines_of(data)
-    entries = [_decoded(text) for text in lines.sound]
+    entries = [decoded(text) for text in lines.sound]
     damage = ""
     if lines.damaged:
         kept = _kept(path, data, lines.damaged[-1])
@@ -336,3 +224,71 @@ def _kept(path: Path, data: bytes, last_damaged: int) -> Path:
 
 def _ignored(text: str) -> None:
     """Before `start` there is nothing to tell."""
+
+
+class JournalFile:
+    """The open, locked file `path`, of which `size_bytes` are acknowledged. Blocking; used from one thread."""
+
+    def __init__(self, path: Path, fd: int, size_bytes: int) -> None:
+        self._path = path
+        self._fd = fd
+        self._size_bytes = size_bytes
+
+    def append(self, data: bytes) -> None:
+        """The lines on the disk; on OSError the file is as it was, FolderLost when it is not at its place any more."""
+        if not self._is_there():
+            raise FolderLost(errno.ENOENT, f"the file {self._path} was removed or renamed while it was written")
+        try:
+            if os.pwrite(self._fd, data, self._size_bytes) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a part of it fitted
+            os.fdatasync(self._fd)
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(self._fd, self._size_bytes)
+            raise
+        self._size_bytes += len(data)
+
+    def refound(self, data: bytes) -> bool:
+        """Whether the file is at its place again; else one with all the lines, `data`, is made there."""
+        if self._is_there():
+            return True
+        part = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
+        fd = os.open(part, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        try:
+            lock(fd)
+            if os.pwrite(fd, data, 0) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(fd)
+            os.replace(part, self._path)
+            sync_folder(self._path.parent)
+        except OSError:
+            os.close(fd)
+            with suppress(OSError):
+                part.unlink()
+            raise
+        self.close()
+        self._fd, self._size_bytes = fd, len(data)
+        return False
+
+    def close(self) -> None:
+        """Unlock and close; may be called twice."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def _is_there(self) -> bool:
+        try:
+            return os.path.samestat(self._path.stat(), os.fstat(self._fd))
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+
+
+def taken_over(path: Path, size_bytes: int) -> JournalFile:
+    """The journal that another process has begun or read, and has just unlocked; OSError."""
+    fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    try:
+        lock(fd)
+    except OSError:
+        os.close(fd)
+        raise
+    return JournalFile(path, fd, size_bytes)

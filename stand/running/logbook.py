@@ -1,4 +1,4 @@
-"""What happens to a run, told to the hub and noted in its journal."""
+"""What happens to a run: told to the hub, folded into its state, noted in its journal."""
 
 from __future__ import annotations
 
@@ -12,24 +12,29 @@ from foundation.items import Event
 from recording.writing.disk import Disk
 from stand.fault import Fault
 from stand.gate import INTERLOCK, STOPPING
-from stand.running.journal import Cleared, Ended, Entry, Held, Journal, Tripped
+from stand.running.entries import Cleared, Ended, Entry, Held, Tripped, Written
+from stand.running.fold import after
+from stand.running.journal import Journal
+from stand.running.state import RunState
 
 _END_WITHIN_S, _COMPLETE_WITHIN_S = 1.0, 10.0  # real seconds that a disk may take for the last entry
 
 
 class Logbook:
-    """The hub, and from `begin` on the journal."""
+    """`state` is what the entries so far make of a run; from `begin` on those that are to outlive the daemon are in the
+    journal, too."""
 
-    def __init__(self, hub: Hub, clock: Clock) -> None:
+    def __init__(self, hub: Hub, clock: Clock, state: RunState) -> None:
+        self.state = state
         self._hub = hub
         self._clock = clock
         self._journal: Journal | None = None
 
-    async def begin(self, journal: Journal, *entries: Entry, disk: Disk | None = None) -> None:
+    async def begin(self, journal: Journal, *entries: Written, disk: Disk | None = None) -> None:
         """The journal's first entries of this run, on the disk when this returns; `disk` writes it."""
         self._journal = journal
         journal.start(self._clock, lambda text: self.tell("error", "journal_not_saved", text), disk)
-        await journal.write(*entries)
+        await self.write(*entries)
 
     async def end(self, ended: Ended) -> None:
         """The journal's last entry, at this instant; SessionError when the disk does not take it in time."""
@@ -39,12 +44,23 @@ class Logbook:
         within_s = _COMPLETE_WITHIN_S if ended.status == "complete" else _END_WITHIN_S
         try:
             async with asyncio.timeout(within_s):
-                await journal.write(Ended(self._clock.now_ns(), ended.status, ended.text))
+                await self.write(Ended(self._clock.now_ns(), ended.status, ended.text))
                 await journal.close()
         except TimeoutError as error:
             journal.abandon()
             text = f"the disk has not answered for {within_s:g} s; how the run ended is not in the journal"
             raise SessionError(f"{journal.path}: {text}") from error
+
+    def enter(self, entry: Entry) -> None:
+        """Into the state alone: what the recording proves, or the next gap makes void."""
+        self.state = after(self.state, entry)
+
+    async def write(self, *entries: Written) -> None:
+        """Into the state at once; on the disk when this returns, or kept for the next time."""
+        for entry in entries:
+            self.enter(entry)
+        if self._journal is not None:
+            await self._journal.write(*entries)
 
     def tell(self, level: str, kind: str, text: str, data: Mapping[str, object] | None = None) -> None:
         """An event, now."""
@@ -65,6 +81,7 @@ class Logbook:
             self._note(Cleared(now_ns))
         self._note(Held(now_ns, reason, held))
 
-    def _note(self, entry: Entry) -> None:
+    def _note(self, entry: Written) -> None:
+        self.enter(entry)
         if self._journal is not None:
             self._journal.note(entry)

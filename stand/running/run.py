@@ -24,9 +24,10 @@ from stand.config.safe_ranges import accepted_text
 from stand.one_cpu import one_cpu
 from stand.running.camera_temperature import check_temperature
 from stand.running.claim import claimed
-from stand.running.performance import Performance, perform
+from stand.running.guarded_run import GuardedRun, run_guarded
+from stand.running.order import Order
 from stand.running.resume import Interruption
-from stand.running.session_setup import Order, info_of, recorder_of, session_directory
+from stand.running.session_files import info_of, recorder_of, session_directory
 from stand.running.stop import Interrupted, Stop
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
@@ -61,7 +62,7 @@ class _Job:
         """The session's metadata; SessionError when the camera is another one than before the interruption."""
         if self.before is None:
             return info_of(self.order, directory, assembly)
-        if self.before.set_up.camera_on:
+        if self.before.kept.set_up.camera_on:
             answers, recorded = assembly.devices.camera.identity.serial_number, self.before.info.camera_serial
             if answers != recorded:
                 raise SessionError(f"{directory}: was recorded with camera {recorded}, now {answers} answers")
@@ -206,12 +207,12 @@ async def _performed(
         stack.callback(assembly.stand.gate.let_go)
         stack.push_async_callback(stop.settled)
         stop.watch(assembly.stand)
-        await _opened(assembly, background, stop, camera_on=job.before is None or job.before.set_up.camera_on)
+        await _opened(assembly, background, stop, camera_on=job.before is None or job.before.kept.set_up.camera_on)
         recorder = await _recording(job, directory, assembly, stop, early, disk)
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording, stop)
         tasks = (*background, recording)
-        await perform(Performance(job.order, job.seed, job.before, job.begun, assembly, recorder, stop, tasks))
+        await run_guarded(GuardedRun(job.order, job.seed, job.before, job.begun, assembly, recorder, stop, tasks))
     return recorder
 
 

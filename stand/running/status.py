@@ -14,7 +14,7 @@ from stand.estimating.eta import Eta
 from stand.estimating.follow import parameters_text
 from stand.fault import Fault
 from stand.gate import Gate, Phase
-from stand.running.scheduler import Progress
+from stand.running.state import RunState
 from stand.running.stop import OPERATOR, Stop
 from stand.serving.control import RunStatus
 
@@ -35,7 +35,7 @@ class StatusBoard:
         self,
         recipe: str,
         steps: Sequence[PricedStep],
-        progress: Progress,
+        state: RunState,
         gate: Gate,
         stop: Stop,
         held: Callable[[], Fault | None],
@@ -44,7 +44,7 @@ class StatusBoard:
     ) -> None:
         self._recipe = recipe
         self._count = len(steps)
-        self._eta = Eta(steps, progress.done, progress.earned_s)
+        self._eta = Eta(steps, state.done, state.earned_s)
         self._gate = gate
         self._stop = stop
         self._held = held

@@ -17,8 +17,8 @@ from foundation.errors import StandError
 from foundation.hub import Hub
 from foundation.items import Item
 from foundation.readings import Frame
+from stand.running.order import Order
 from stand.running.run import run_real
-from stand.running.session_setup import Order
 from stand.simulator import Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
 from tests.system.simulated_orders import simulated_order

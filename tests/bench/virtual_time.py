@@ -19,8 +19,8 @@ from foundation.errors import StandError
 from foundation.hub import Hub
 from foundation.items import Item, StepMark, StepState
 from stand.one_cpu import one_cpu
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
 from tests.system.simulated_orders import simulated_order

@@ -1,10 +1,11 @@
-"""A stand in memory, for the scheduler alone: a chamber, a flap, a camera and a disk, on a clock that goes on only
+"""A stand in memory, for the executor alone: a chamber, a flap, a camera and a disk, on a clock that goes on only
 while it is led. Each action takes a second; what is not allowed is noted in `wrong`."""
 
 import asyncio
-from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 
+from experiments.steps import Capture
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.errors import StandTripped, Unreachable
 from foundation.hub import Hub
@@ -14,11 +15,14 @@ from markers.target import Target
 from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
 from stand.imaging.equilibrium import LOST, CameraEquilibrium, EquilibriumLimits
 from stand.interlock import Interlocked
-from stand.running.camera_offset import OffsetWatch
-from stand.running.flap_care import keep_shut_in_holds
-from stand.running.journal import JOURNAL_NAME, Again, Journal
-from stand.running.resume import journaled
-from stand.running.scheduler import Progress, Scheduler
+from stand.running.camera_gap import OffsetWatch
+from stand.running.entries import Gap
+from stand.running.executor import Executor
+from stand.running.fold import fold
+from stand.running.holds import keep_shut_in_holds
+from stand.running.journal import JOURNAL_NAME, Journal
+from stand.running.logbook import Logbook
+from stand.running.resume import with_recorded
 from stand.running.settling_watch import SettlingWatch
 from stand.running.stop import Stop
 from stand.safety import Safety
@@ -30,7 +34,7 @@ COMMIT_EVERY_S = 1.0  # and what was published before that, it has in any case
 
 
 class SmallStand:
-    """As stand.stand.Stand towards the scheduler. broken: the next action fails; camera_back_ns: until then it is
+    """As stand.stand.Stand towards the executor. broken: the next action fails; camera_back_ns: until then it is
     lost; supplied: whether the camera is. It is its own chamber, imaging, camera supply and table."""
 
     def __init__(self, clock, hub, wrong):
@@ -157,42 +161,38 @@ class Life:
         self._plan, self._journal_path = plan, folder / JOURNAL_NAME
         self._disk, self._unsaved = disk, []
         self._resumes = self._journal_path.exists()
+        self._still = ExitStack()  # holds the clock
         self.publish_pv(chamber_degC)
         self._do(self._begin(folder))
 
     async def _begin(self, folder):
-        progress = None
+        first, told = (), ()
         if self._resumes:
             self._journal, entries = Journal.open(folder)
-            done, earned_s = journaled(entries)
-            marks = [item for item in self._disk if isinstance(item, StepMark)]
-            done |= {mark.step_id for mark in marks if mark.state is StepState.DONE}
-            frames = [item for item in self._disk if isinstance(item, Frame) and self._counts(item, entries)]
-            last_ns = max([item.time_ns for item in self._disk] + [entry.time_ns for entry in entries], default=None)
-            progress = Progress(done, earned_s, Counter(frame.step_id for frame in frames), last_ns)
+            frames = [(item.time_ns, item.step_id) for item in self._disk if isinstance(item, Frame)]
+            captures = {planned.step_id for planned in self._plan if isinstance(planned.step, Capture)}
+            told = with_recorded(entries, self._disk, [frame for frame in frames if frame[1] in captures])
+            last_ns = max([item.time_ns for item in self._disk] + [entry.time_ns for entry in entries], default=0)
+            first = (Gap(last_ns, self.clock.now_ns()),)
         else:
             self._journal = Journal.create(folder)
-        self._journal.start(self.clock, self.wrong.append)
+        self.log = Logbook(self.hub, self.clock, fold(self._plan, told))
+        self._time = asyncio.create_task(self.clock.run())
+        await self.log.begin(self._journal, *first)
+        self.stand.gate.subscribe(self.log.held)
         settling = SettlingWatch(self.stand, self.hub, self.clock, TARGET)
         watches = settling, OffsetWatch(self.hub, self.clock)
-        scheduler = Scheduler(self.stand, self.hub, self.clock, self._journal, self._flushed, *watches, progress)
-        self._time = asyncio.create_task(self.clock.run())
+        self.executor = Executor(self.stand, self.hub, self.clock, self.log, self._flushed, *watches)
         self._flap = asyncio.create_task(keep_shut_in_holds(self.stand, self.hub, self.clock))
-        self.run = asyncio.create_task(self._run(scheduler))
+        self.run = asyncio.create_task(self._run(self.executor))
 
-    @staticmethod
-    def _counts(frame, entries):
-        """Whether its capture was not begun anew after it."""
-        again = [entry.time_ns for entry in entries if isinstance(entry, Again) and frame.step_id in entry.step_ids]
-        return all(frame.time_ns >= time_ns for time_ns in again)
-
-    async def _run(self, scheduler):
-        """As a performance has it."""
+    async def _run(self, executor):
+        """As a guarded run has it."""
         async with self.stop:
             self.stop.watch(self.stand)
             self.stop.started()
             try:
-                await scheduler.run(self._plan)
+                await executor.run()
             except asyncio.CancelledError:
                 self.cancelled_before_safe = not self.stand.safe
                 raise
@@ -210,7 +210,16 @@ class Life:
         del self._unsaved[:published]
 
     def _do(self, work):
-        return self.loop.run_until_complete(work)
+        """Time goes on meanwhile and stands still before and after, or the last turns of the loop would let it jump."""
+
+        async def within():
+            self._still.close()
+            try:
+                return await work
+            finally:
+                self._still.enter_context(self.clock.hold())
+
+        return self.loop.run_until_complete(within())
 
     def passes(self, duration_s):
         """Let time go on; whatever is to happen meanwhile happens."""
@@ -273,5 +282,5 @@ class Life:
         self.disturbances += isinstance(item, Event) and item.kind == LOST
         if isinstance(item, StepMark):
             self.begun += item.state is StepState.STARTED
-        if isinstance(item, StepMark | Frame):
+        if isinstance(item, StepMark | Frame | Event):
             self._unsaved.append(item)

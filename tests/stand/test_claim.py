@@ -16,8 +16,7 @@ import yaml
 from foundation.documents import parse_document
 from foundation.errors import InUse, SessionError
 from stand.config.stand_config import StandConfig, packaged
-from stand.running.addresses import addresses
-from stand.running.claim import claimed
+from stand.running.claim import addresses, claimed
 
 
 def config(base: str = "simulated", **sections: dict[str, object]) -> StandConfig:

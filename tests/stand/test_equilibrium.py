@@ -12,8 +12,7 @@ from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from stand.imaging.camera_cooling import Cooling
 from stand.imaging.equilibrium import CameraEquilibrium, EquilibriumLimits
-from stand.running.camera_gap import CameraBefore, doubt
-from stand.running.camera_offset import OffsetGap, OffsetWatch
+from stand.running.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
 
 TIME_CONSTANT_S, RISE_K = 900.0, 20.0
 

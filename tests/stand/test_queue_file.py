@@ -15,8 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from foundation.errors import ConfigError, SessionError, StandTripped
 from stand.queueing import queue
 from stand.queueing.queue_file import LAST_NAME, QUEUE_NAME, State, working
-from stand.running.order_files import load_order
-from stand.running.session_setup import Order
+from stand.running.order import Order, load_order
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -225,7 +224,7 @@ ADDING = """
 import sys
 from pathlib import Path
 from stand.queueing import queue
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 order = load_order("warm-up", "simulated")
 print("ready", flush=True)
 sys.stdin.readline()

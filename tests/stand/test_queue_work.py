@@ -13,7 +13,7 @@ from foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Un
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry, working
 from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, work
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 from stand.running.stop import Interrupted
 
 ORDER = load_order("warm-up", "simulated")

@@ -28,8 +28,9 @@ from foundation.items import StepMark, StepState
 from foundation.readings import Frame
 from stand.fault import Fault
 from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
-from stand.running.journal import JOURNAL_NAME, Again, Dwell, Step, read_lines
-from stand.running.scheduler import BAND_K
+from stand.running.actions import CREDITED_WITHIN_K
+from stand.running.entries import Again, Dwell, Step, read_lines
+from stand.running.journal import JOURNAL_NAME
 from stand.running.stop import Interrupted
 from tests.stand.small_stand import Life
 
@@ -124,7 +125,7 @@ class RunMachine(RuleBasedStateMachine):
         """The chamber has soaked at the set-point, unless it was found there when it was set going again."""
         chamber_degC, soaked_s = PLACES[step_id]
         stand, now_ns = self.life.stand, self.life.clock.now_ns()
-        credited = stand.started_at_degC is not None and abs(stand.started_at_degC - chamber_degC) <= BAND_K
+        credited = stand.started_at_degC is not None and abs(stand.started_at_degC - chamber_degC) <= CREDITED_WITHIN_K
         if not credited and (now_ns - stand.set_ns) / NS_PER_S < soaked_s:
             self.life.wrong.append(f"a frame of {step_id} before the chamber had soaked")
         if stand.supplied_ns is not None and (now_ns - stand.supplied_ns) / NS_PER_S < soaked_s:

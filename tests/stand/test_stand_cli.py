@@ -13,7 +13,7 @@ from stand.commands.commands import app
 from stand.commands.run_cli import small_disk
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 
 runner = CliRunner()
 

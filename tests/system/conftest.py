@@ -11,7 +11,7 @@ from drivers.wires.aravis_library import library
 from foundation.errors import StandError
 from stand.config.recipe import load_recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from stand.simulator import Simulator, laboratory_of
 from tests.addresses import camera_address, free_port
 

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from tests.addresses import free_port
 
 

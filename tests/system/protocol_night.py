@@ -23,8 +23,8 @@ from pathlib import Path
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
 from foundation.items import Item
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 
 POLL_s = 1.0
 PROTOCOL = """

@@ -9,7 +9,7 @@ import yaml
 
 from stand.config.recipe import load_recipe
 from stand.config.stand_config import load_config, packaged
-from stand.running.session_setup import Order
+from stand.running.order import Order
 
 CAMERA_ADDRESS = "127.0.0.92"
 

@@ -8,8 +8,8 @@ import pytest
 
 from foundation.hub import Hub
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from stand.serving.control_client import ask, ask_status
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_guard_run import Watcher, check_safe

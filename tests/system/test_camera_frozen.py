@@ -9,8 +9,8 @@ import pytest
 from foundation.items import Batch
 from foundation.readings import Quality
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import break_now

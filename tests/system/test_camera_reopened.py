@@ -10,7 +10,7 @@ import pytest
 
 from foundation.items import Batch
 from recording.reading.session import Session
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault
 from tests.system.test_unrecorded_heat import FAST, SOAK, happens, heating

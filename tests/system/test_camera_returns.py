@@ -10,8 +10,8 @@ from foundation.items import Event, Item
 from foundation.readings import Frame
 from recording.reading.session import Session
 from recording.reading.superseded import begins_of, is_superseded
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_run_ends import SHORTER, break_now
 

@@ -11,9 +11,10 @@ import pytest
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
 from recording.reading.session import Session
-from stand.running.journal import JOURNAL_NAME, Dwell, Gap, read_lines
+from stand.running.entries import Dwell, Gap, read_lines
+from stand.running.journal import JOURNAL_NAME
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher

@@ -12,15 +12,16 @@ from typer.testing import CliRunner
 from experiments.steps import Capture, PlannedStep, Role, Soak
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepMark, StepState
+from foundation.items import Batch, Event, Item
 from foundation.readings import Reading, bad_reading
 from recording.reading.session import Session
 from stand.commands.commands import app
 from stand.config.stand_config import load_config, packaged
 from stand.guarding.rules import camera_measured
-from stand.running.camera_temperature import FramesToCome
+from stand.running.entries import Again, Step
+from stand.running.fold import after, fold
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_run import at_step, fault
 
@@ -145,18 +146,17 @@ def test_no_temperature_is_asked_of_a_camera_that_is_off_lost_or_has_taken_its_l
 
 
 def test_frames_are_to_come_until_the_last_capture_of_the_plan_is_done():
-    is_powered, capture = False, Capture(1, 1.0, 0.1, Role.CALIBRATION, 20.0)
+    capture = Capture(1, 1.0, 0.1, Role.CALIBRATION, 20.0)
     plan = [PlannedStep(0, "a", Soak(1.0)), PlannedStep(1, "b", capture), PlannedStep(2, "c", capture)]
-    frames = FramesToCome(lambda: is_powered, plan, {"b"})
-    assert not frames.is_due()
-    is_powered = True
-    assert frames.is_due()
-    frames(StepMark(0, "c", 2, "Capture", StepState.STARTED))
-    assert frames.is_due()
-    frames(StepMark(0, "c", 2, "Capture", StepState.DONE))
-    assert not frames.is_due()
-    frames(StepMark(0, "c", 2, "Capture", StepState.STARTED))  # done again
-    assert frames.is_due()
+    state = fold(plan, [Step(0, "a", "done"), Step(0, "b", "done")])
+    assert state.frames_to_come
+    state = after(state, Step(0, "c", "started"))
+    assert state.frames_to_come
+    state = after(state, Step(0, "c", "done"))
+    assert not state.frames_to_come
+    assert after(state, Again(0, ["c"])).frames_to_come
+    assert not after(state, Again(0, ["a"])).frames_to_come
+    assert not fold(plan[:1], []).frames_to_come
 
 
 def test_a_camera_without_a_temperature_must_not_say_where_it_is(tmp_path: Path):

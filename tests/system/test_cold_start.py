@@ -16,10 +16,12 @@ from foundation.items import Event, Item, StepMark, StepState
 from foundation.readings import Frame
 from recording.reading.session import Session
 from recording.reading.superseded import begins_of, is_superseded
-from stand.running.cold_start import cold_start
+from stand.running.actions import cold_start
+from stand.running.entries import Step
+from stand.running.fold import fold
+from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from stand.serving.control_client import ask
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
@@ -70,25 +72,31 @@ def test_a_warm_up_that_was_killed_begins_anew_from_a_cold_camera(tmp_path: Path
     assert marks[-1].time_ns > begins_ns[capture.step_id]
 
 
+def again(plan, done, begun):
+    """What is done again of a warm-up that was interrupted when so much was done and begun."""
+    entries = [Step(0, step_id, "started") for step_id in begun] + [Step(0, step_id, "done") for step_id in done]
+    return cold_start(fold(plan, entries))
+
+
 def test_only_what_follows_from_a_warm_camera_is_done_again(order: Callable[..., Order]):
     plan = tuple(order(WARM_UP).recipe.plan())
     ids = [planned.step_id for planned in plan]
     off = next(planned.index for planned in plan if planned.step == PowerCamera(False))
     on = next(planned.index for planned in plan if planned.step == PowerCamera(True))
-    assert cold_start(plan, ids[:on], ids[:on]) == ()  # killed while the camera cooled: it is off
-    again = cold_start(plan, ids[:on], ids[: on + 1])  # killed while it was switched on
-    assert [planned.index for planned in again] == list(range(off, on + 2))
-    assert cold_start(plan, ids[: on + 1], ids[: on + 2]) == again
-    assert cold_start(plan, ids[: on + 2], ids[: on + 2]) == ()
+    assert again(plan, ids[:on], ids[:on]) == ()  # killed while the camera cooled: it is off
+    steps = again(plan, ids[:on], ids[: on + 1])  # killed while it was switched on
+    assert [planned.index for planned in steps] == list(range(off, on + 2))
+    assert again(plan, ids[: on + 1], ids[: on + 2]) == steps
+    assert again(plan, ids[: on + 2], ids[: on + 2]) == ()
 
 
 def test_what_the_operator_did_is_not_asked_for_again(order: Callable[..., Order]):
     plan = tuple(order(WARM_UP.replace("band_K: 2", "band_K: 2, rolls_deg: [20]")).recipe.plan())
     ids = [planned.step_id for planned in plan]
     assert any(isinstance(planned.step, Prompt) for planned in plan)
-    again = cold_start(plan, ids[:-3], ids[:-3])
-    assert isinstance(again[-1].step, Capture)
-    assert not any(isinstance(planned.step, Prompt) for planned in again)
+    steps = again(plan, ids[:-3], ids[:-3])
+    assert isinstance(steps[-1].step, Capture)
+    assert not any(isinstance(planned.step, Prompt) for planned in steps)
 
 
 @pytest.mark.parametrize("attended", [True, False])
@@ -132,7 +140,7 @@ def test_nothing_is_superseded_in_a_run_that_was_not_interrupted(tmp_path: Path,
     daemon.kill()
     (directory,) = (tmp_path / "out").iterdir()
     before = interruption(directory)
-    assert (before.again, before.superseded) == ((), 0)
+    assert cold_start(before.state) == ()
     before.release()
     assert begins_of(Session.open(directory)) == {}
     asyncio.run(end_laboratory(ordered))

@@ -8,7 +8,7 @@ from pathlib import Path
 from foundation.clock import seconds_ns
 from stand.chamber.compressor import restored
 from stand.config.stand_config import CompressorConfig
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from tests.system.gateway import gateway
 from tests.system.test_guard_wire import Start, bench_from
 from tests.system.test_relay_keeper import COMPRESSOR, ON, RELAYS, another_master, seconds_until

@@ -12,8 +12,8 @@ from experiments.steps import Capture
 from foundation.items import Event, Item
 from foundation.readings import Frame
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

@@ -15,7 +15,8 @@ from foundation.errors import SessionError
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 from recording.writing.disk_process import LEFT_NAME
-from stand.running.journal import Ended, Journal, read_lines
+from stand.running.entries import Ended, read_lines
+from stand.running.journal import Journal
 from tests.recording.disks import ext4, run
 
 LIMIT_S = 60.0  # for what takes milliseconds, on a machine that has other things to do

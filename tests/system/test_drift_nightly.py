@@ -21,8 +21,8 @@ from foundation.hub import Hub
 from foundation.items import Item
 from foundation.progress import progress
 from foundation.readings import Frame
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

@@ -16,9 +16,9 @@ from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
+from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
@@ -100,7 +100,7 @@ async def test_the_time_left_of_a_run_that_goes_on_is_true(tmp_path: Path, order
     (directory,) = (tmp_path / "out").iterdir()
     before = interruption(directory)
     steps = price(ordered.recipe.plan(), ordered.config)
-    done, earned_s = before.progress.done, before.progress.earned_s
+    done, earned_s = before.kept.done, before.kept.earned_s
     watch, left = following(Follow(steps, lambda done, text: None, lambda line: None, done, earned_s))
     await resume(before, watch)
     assert len(left) > 100

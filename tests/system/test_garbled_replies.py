@@ -10,8 +10,8 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.readings import Quality
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import SHORTER, break_now

@@ -13,7 +13,7 @@ import pytest
 
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from stand.serving.control_client import ask_status
 from tests.recording.disks import ext4, run
 from tests.stand.test_door import connected

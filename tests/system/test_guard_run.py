@@ -16,10 +16,11 @@ from foundation.errors import SessionError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from recording.reading.session import Session
-from stand.running.journal import JOURNAL_NAME, Cleared, Tripped, read_lines
+from stand.running.entries import Cleared, Tripped, read_lines
+from stand.running.journal import JOURNAL_NAME
+from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_virtual
-from stand.running.session_setup import Order
 from stand.serving.control_client import ask, ask_status
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_wire import write_by_another_master

@@ -25,8 +25,8 @@ from stand.chamber.compressor import CompressorState, keep
 from stand.config.stand_config import CompressorConfig, StandConfig, packaged
 from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from stand.simulator import ControlSocket, Simulator
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 

@@ -25,8 +25,8 @@ from recording.format.utc_offsets import CLOCK_STEP
 from recording.reading.session import Session
 from stand.commands.session_cli import app
 from stand.config.stand_config import StandConfig
+from stand.running.order import Order
 from stand.running.run import run_real
-from stand.running.session_setup import Order
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.system.conftest import require_aravis
 

@@ -15,8 +15,8 @@ from foundation.items import Batch, Event, Item
 from foundation.readings import Frame
 from recording.reading.session import Session
 from recording.reading.superseded import begins_of, is_superseded
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from stand.serving.control_client import ask
 from tests.recording.disks import limit_files
 from tests.system.conftest import require_aravis

@@ -16,8 +16,8 @@ from foundation.errors import StandTripped
 from foundation.hub import Hub
 from foundation.items import Event
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, check_safe
 from tests.system.test_run import at_step, fault

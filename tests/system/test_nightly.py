@@ -12,8 +12,8 @@ from compensation.drift.evaluation import Evaluation
 from compensation.report.report import analyse
 from foundation.progress import progress
 from stand.config.stand_config import packaged
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

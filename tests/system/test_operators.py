@@ -13,9 +13,10 @@ from foundation.errors import SessionError, StandError
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from recording.reading.session import Session
-from stand.running.journal import JOURNAL_NAME, Held, read_lines
+from stand.running.entries import Held, read_lines
+from stand.running.journal import JOURNAL_NAME
+from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from stand.running.session_setup import Order
 from stand.serving.control_client import ask
 from tests.system.conftest import require_aravis
 from tests.system.test_attended import PROMPTED

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from recording.reading.session import Session
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from stand.serving.control import RunStatus, handlers
 from stand.serving.control_client import ask
 from tests.system.conftest import require_aravis

@@ -7,8 +7,8 @@ import pytest
 
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig, packaged
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from stand.simulator import Simulator
 from tests.stand.guarded_recipes import RECIPES
 from tests.system.conftest import require_aravis

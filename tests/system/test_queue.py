@@ -12,7 +12,7 @@ from recording.reading.session import Session
 from stand.estimating.learned import load_learned
 from stand.queueing import queue
 from stand.queueing.queue_work import MOST_FRUITLESS_STARTS
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

@@ -14,8 +14,8 @@ from foundation.errors import Unreachable
 from foundation.hub import Hub
 from foundation.items import Item, StepMark
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import Interrupted, run_real
-from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.system.conftest import require_aravis
 

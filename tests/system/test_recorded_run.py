@@ -11,8 +11,8 @@ from compensation.observations import observe_session, session_target
 from foundation.hub import Hub
 from foundation.items import Event
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

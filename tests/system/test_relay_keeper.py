@@ -10,7 +10,7 @@ from foundation.errors import DeviceFault, Unreachable
 from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
 from stand.imaging.camera_opening import CameraOpening
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from tests.system.test_guard_wire import Bench, Start, bench_of, write_by_another_master
 
 HEATER, COMPRESSOR = 0, 1  # coils

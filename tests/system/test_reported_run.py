@@ -15,7 +15,7 @@ from recording.reading.session import Session
 from recording.repair.verify import verify
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
-from stand.running.order_files import load_order
+from stand.running.order import load_order
 from stand.session_report import MODEL_NAME, REPORT_NAME
 from tests.system.conftest import require_aravis
 

@@ -20,10 +20,11 @@ from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.reading.superseded import begins_of, is_superseded
 from recording.repair.verify import verify
-from stand.running.journal import JOURNAL_NAME, Dwell, Gap, Step, encode_line, read_lines
+from stand.running.entries import Dwell, Gap, Step, encode_line, read_lines
+from stand.running.journal import JOURNAL_NAME
+from stand.running.order import Order
 from stand.running.resume import Interruption, interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.running.session_setup import Order
 from stand.serving.control_client import ask, ask_status
 from stand.simulator import ControlSocket
 from tests.system.conftest import SHORT_RECIPE, require_aravis

@@ -16,10 +16,10 @@ from recording.reading.session import Session
 from stand.commands.commands import app
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.queueing.queue_file import QUEUE_NAME
+from stand.running.order import Order
 from stand.running.own_stand import on_this_stand
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_real, run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 from tests.system.test_real_time import BRIEF
 from tests.system.test_resume import findable

@@ -20,8 +20,8 @@ from foundation.errors import ConfigError, SessionError, StandError, StandTrippe
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 

@@ -18,8 +18,8 @@ from foundation.errors import DeviceFault, StandTripped
 from foundation.items import Item, StepMark, StepState
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig
+from stand.running.order import Order
 from stand.running.run import Interrupted, run_real, run_virtual
-from stand.running.session_setup import Order
 from stand.simulator import Simulator
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon

@@ -10,8 +10,8 @@ from experiments.steps import Role
 from foundation.items import Event, StepMark, StepState
 from foundation.progress import progress
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

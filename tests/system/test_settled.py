@@ -11,9 +11,9 @@ from foundation.clock import NS_PER_S
 from foundation.items import StepState
 from foundation.progress import progress
 from recording.reading.session import Session
-from stand.running.journal import Dwell, read_lines
+from stand.running.entries import Dwell, read_lines
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 RECIPE = """

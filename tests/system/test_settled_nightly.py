@@ -28,8 +28,8 @@ from foundation.items import Item
 from foundation.progress import progress
 from foundation.readings import Frame
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

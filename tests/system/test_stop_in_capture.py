@@ -12,8 +12,8 @@ from foundation.hub import Hub
 from foundation.items import Item
 from foundation.readings import Frame
 from recording.reading.session import Session
+from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from recording.reading.session import Session
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from tests.system.conftest import require_aravis
 from tests.system.gateway import gateway
 from tests.system.test_unrecorded_heat import FAST, SOAK, heater_is, plant

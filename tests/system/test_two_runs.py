@@ -14,7 +14,7 @@ import pytest
 
 from foundation.errors import SessionError
 from stand.config.stand_config import load_config
-from stand.running.session_setup import Order
+from stand.running.order import Order
 from stand.serving.control_client import ask_status, running_sessions
 from stand.simulator import ControlSocket
 from tests.stand.test_door import connected

@@ -18,9 +18,9 @@ from foundation.errors import StandError, StandTripped
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 from recording.writing.disk_process import MODULE
+from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_real
-from stand.running.session_setup import Order
 from stand.simulator import ControlSocket
 from tests.recording.disks import ext4, run
 from tests.system.conftest import require_aravis
@@ -185,7 +185,7 @@ async def test_a_run_whose_disk_process_was_killed_ends_safe_with_all_that_was_a
     assert "run.start" in [event.kind for event in Session.open(directory).events()]
     before = interruption(directory)
     before.release()
-    assert before.progress.done or before.progress.earned_s
+    assert before.state.done or before.state.earned_s
 
 
 @pytest.mark.parametrize("how", ["removed", pytest.param("renamed", marks=pytest.mark.nightly)])

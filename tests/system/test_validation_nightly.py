@@ -15,8 +15,8 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation import cli
+from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.running.session_setup import Order
 from tests.system.conftest import require_aravis
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]

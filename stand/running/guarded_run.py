@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.steps import Capture
 from foundation.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
 from foundation.errors import SessionError, StandTripped
@@ -16,7 +15,6 @@ from foundation.instants import utc_text
 from foundation.items import Event, Item
 from foundation.tasks import cancelled, cause_of, failure_text, watched
 from markers.target import Target
-from recording.format.restarts import restarted
 from recording.reading.contents import RUN_END
 from recording.reading.run_word import Run
 from recording.writing.recorder import Recorder
@@ -27,19 +25,19 @@ from stand.fault import Fault
 from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.guarding.guard import Guard
 from stand.poller import Poller
-from stand.running.camera_gap import doubt
-from stand.running.camera_offset import OffsetGap, OffsetWatch
-from stand.running.camera_temperature import FramesToCome
-from stand.running.flap_care import keep_shut_in_holds
-from stand.running.journal import Again, Cleared, Ended, Entry, Gap, Journal
+from stand.running.camera_gap import OffsetGap, OffsetWatch, doubt
+from stand.running.entries import Cleared, Ended, Gap, Written
+from stand.running.executor import Executor
+from stand.running.fold import fold
+from stand.running.holds import end_endless_holds, keep_shut_in_holds
+from stand.running.journal import Journal
 from stand.running.logbook import Logbook
+from stand.running.order import Order
 from stand.running.resume import Interruption, begun, plan_hash
-from stand.running.scheduler import Progress, Scheduler
-from stand.running.session_setup import Order
 from stand.running.settling_watch import SettlingWatch
+from stand.running.state import RunState
 from stand.running.status import StatusBoard
 from stand.running.stop import OPERATOR, Stop
-from stand.running.virtual_hold import end_endless_holds
 from stand.serving.control import handlers, serve
 
 # The recorder's events that hold a run, and those that let it go on.
@@ -50,7 +48,7 @@ _RELEASING = {"frames_resumed": DISK_LOW, "telemetry_saved_again": NOT_RECORDED}
 
 
 @dataclass(frozen=True, slots=True)
-class Performance:
+class GuardedRun:
     """What is run, by what, and what it goes on from. `begun` is told the folder when its journal is on the disk,
     `background` are tasks without which nothing goes on."""
 
@@ -64,10 +62,11 @@ class Performance:
     background: tuple[asyncio.Task[None], ...]
 
 
-async def perform(work: Performance) -> None:
+async def run_guarded(work: GuardedRun) -> None:
     """The whole plan, or what is not done of it; the actuators are safe before anything else is taken down."""
     assembly, stop = work.assembly, work.stop
-    log = Logbook(assembly.hub, assembly.clock)
+    plan, before = work.order.recipe.plan(), work.before
+    log = Logbook(assembly.hub, assembly.clock, fold(plan, ()) if before is None else before.state)
     assembly.stand.attended = work.order.attended
     pollers, guard = assembly.pollers(), _guard(work, log)
     target = parse_document(work.order.target_text, Target, "target.yaml")
@@ -75,8 +74,8 @@ async def perform(work: Performance) -> None:
     watchers: list[asyncio.Task[None]] = []
     ended = Ended(0, "failed", "")
     try:
-        scheduler = await watched(_begun(work, pollers, guard, log, settling), work.background)
-        watchers.append(asyncio.create_task(_answer(work, await _board(work, guard), log)))
+        executor = await watched(_begun(work, pollers, guard, log, settling), work.background)
+        watchers.append(asyncio.create_task(_answer(work, await _board(work, guard, log.state), log)))
         watchers.extend(asyncio.create_task(poller.run()) for poller in pollers)
         watchers.append(asyncio.create_task(guard.run()))
         watchers.append(asyncio.create_task(assembly.stand.chamber.keeper.run()))
@@ -86,7 +85,7 @@ async def perform(work: Performance) -> None:
             limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
             watchers.append(asyncio.create_task(end_endless_holds(assembly.stand.gate, assembly.clock, limit_h)))
         stop.started()
-        await watched(scheduler.run(work.order.recipe.plan()), [*work.background, *watchers])
+        await watched(executor.run(), [*work.background, *watchers])
         ended = Ended(0, "complete", "complete")
     except BaseException as error:
         ended = _ending(stop.fault, error)
@@ -122,18 +121,15 @@ async def _taken_down(
 
 
 async def _begun(
-    work: Performance, pollers: Iterable[Poller], guard: Guard, log: Logbook, settling: SettlingWatch
-) -> Scheduler:
+    work: GuardedRun, pollers: Iterable[Poller], guard: Guard, log: Logbook, settling: SettlingWatch
+) -> Executor:
     """Everything read and judged once, and the journal begun or continued: nothing moves before that."""
     for poller in pollers:
         await poller.first()
     if work.before is None:
-        log.tell("info", "run.start", f"recipe {work.order.recipe.name}", _begin_data(work))
+        log.tell("info", "run.start", f"recipe {work.order.recipe.name}", _begin_data(work, log.state))
     else:
         _tell_interruption(work, work.before, log)
-        if work.before.again:
-            step_id, frames = work.before.again[-1], work.before.superseded
-            work.assembly.hub.publish(restarted(work.assembly.clock.now_ns(), step_id, frames, "from a cold camera"))
     if not guard.look():
         raise StandTripped("the rules do not hold")
     await work.recorder.flushed()  # a session with a journal can be opened and resumed
@@ -151,11 +147,11 @@ async def _begun(
     work.assembly.hub.subscribe(_hold_while_not_recorded(gate))
     if before is not None:
         _judge_camera(before, work.assembly)
-    progress = None if before is None else before.progress
-    assembly = work.assembly
+    assembly, config = work.assembly, work.order.config
     offsets = OffsetWatch(assembly.hub, assembly.clock, None if before is None else _gap(before, assembly.clock))
-    return Scheduler(
-        assembly.stand, assembly.hub, assembly.clock, journal, work.recorder.flushed, settling, offsets, progress
+    flushed = work.recorder.flushed
+    return Executor(
+        assembly.stand, assembly.hub, assembly.clock, log, flushed, settling, offsets, lambda plan: price(plan, config)
     )
 
 
@@ -166,7 +162,7 @@ def _gap(before: Interruption, clock: Clock) -> OffsetGap:
 def _judge_camera(before: Interruption, assembly: Assembly) -> None:
     """A camera that the plan has on, and that may have been off since, has lost its equilibrium."""
     stand, boot = assembly.stand, boot_of(assembly.clock)
-    if not before.set_up.camera_on:
+    if not before.kept.set_up.camera_on:
         stand.imaging.supply.last = before.camera.last
     elif reason := doubt(
         before.camera,
@@ -177,30 +173,29 @@ def _judge_camera(before: Interruption, assembly: Assembly) -> None:
         stand.imaging.supply.equilibrium.lose(reason)
 
 
-def _begin_data(work: Performance) -> dict[str, object]:
+def _begin_data(work: GuardedRun, state: RunState) -> dict[str, object]:
     """For whoever resumes the run: whether the host has run on since, and which plan it is, should the journal have
     lost that. For whoever counts what is done: how many steps and frames the plan has."""
-    plan, boot = tuple(work.order.recipe.plan()), boot_of(work.assembly.clock)
-    frames = sum(planned.step.frames for planned in plan if isinstance(planned.step, Capture))
-    data: dict[str, object] = {"steps": len(plan), "frames": frames, "plan": plan_hash(plan), "seed": work.seed}
+    plan, boot = plan_hash(work.order.recipe.plan()), boot_of(work.assembly.clock)
+    data: dict[str, object] = {**state.size, "plan": plan, "seed": work.seed}
     return data if boot is None else {**data, "boot_id": boot.id}
 
 
-async def _board(work: Performance, guard: Guard) -> StatusBoard:
+async def _board(work: GuardedRun, guard: Guard, state: RunState) -> StatusBoard:
     """What tells the state of the run, from before its first step on."""
-    assembly, before = work.assembly, work.before
-    progress = Progress() if before is None else before.progress
+    assembly = work.assembly
+    kept = state if work.before is None else work.before.kept
     with assembly.clock.hold():  # nothing moves yet: the disk may take its time
         learned = await asyncio.to_thread(load_learned, work.recorder.directory.parent)
-    steps = price(work.order.recipe.plan(), work.order.config, learned)
+    steps = price(state.plan, work.order.config, learned)
     gate, recorder, clock = assembly.stand.gate, work.recorder, assembly.clock
     name = work.order.recipe.name
-    board = StatusBoard(name, steps, progress, gate, work.stop, lambda: guard.held, recorder, clock)
+    board = StatusBoard(name, steps, kept, gate, work.stop, lambda: guard.held, recorder, clock)
     assembly.hub.subscribe(board)
     return board
 
 
-async def _answer(work: Performance, board: StatusBoard, log: Logbook) -> None:
+async def _answer(work: GuardedRun, board: StatusBoard, log: Logbook) -> None:
     """Answer at the control socket until cancelled; a run goes on without one."""
     stand = work.assembly.stand
     table = handlers(stand.gate, work.stop, board.status, lambda: stand.motions.texts)
@@ -212,37 +207,36 @@ async def _answer(work: Performance, board: StatusBoard, log: Logbook) -> None:
         await asyncio.Event().wait()
 
 
-def _first_entries(work: Performance) -> tuple[Entry, ...]:
+def _first_entries(work: GuardedRun) -> tuple[Written, ...]:
     now_ns = work.assembly.clock.now_ns()
     if work.before is None:
         return (begun(work.order, work.recorder.directory.name, now_ns, work.seed),)
-    cleared = (Cleared(now_ns),) if work.before.tripped else ()
-    again = (Again(now_ns, list(work.before.again)),) if work.before.again else ()
-    return (*cleared, Gap(work.before.last_ns, now_ns), *again)
+    cleared = (Cleared(now_ns),) if work.before.state.tripped else ()
+    return (*cleared, Gap(work.before.last_ns, now_ns))
 
 
-def _tell_interruption(work: Performance, before: Interruption, log: Logbook) -> None:
+def _tell_interruption(work: GuardedRun, before: Interruption, log: Logbook) -> None:
     """The end of the run that was interrupted, the gap since, and that it goes on."""
     clock = work.assembly.clock
     now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
-    if not before.ended:
+    if before.state.ended is None:
         log.tell("error", RUN_END, f"interrupted: killed after {utc_text(last_utc_ns)}", {"status": Run.INTERRUPTED})
     gap_s = (now_ns - before.last_ns) / NS_PER_S
     span = f"from {utc_text(last_utc_ns)} to {utc_text(now_ns + utc_offset_ns(clock))}"
     log.tell("warning", "gap", f"nothing was recorded and nobody watched the stand {span} ({gap_s:.3f} s)")
-    if before.tripped:
-        log.tell("warning", "cleared", f"an operator cleared: {before.tripped}")
+    if before.state.tripped:
+        log.tell("warning", "cleared", f"an operator cleared: {before.state.tripped}")
     version = importlib.metadata.version("thermostand")
-    done = f"{len(before.progress.done)} steps are done"
+    done = f"{len(before.kept.done)} steps are done"
     log.tell(
         "info",
         "run.resume",
         f"recipe {before.order.recipe.name} goes on, {done}; thermostand {version}",
-        _begin_data(work),
+        _begin_data(work, before.state),
     )
 
 
-def _guard(work: Performance, log: Logbook) -> Guard:
+def _guard(work: GuardedRun, log: Logbook) -> Guard:
     """On a fault it ends the run, or makes the stand safe and lets the run wait for an operator, or for a disk."""
     gate = work.assembly.stand.gate
 
@@ -254,14 +248,14 @@ def _guard(work: Performance, log: Logbook) -> Guard:
         gate.hold(INTERLOCK)
         log.tripped(fault)
 
-    done = frozenset[str]() if work.before is None else work.before.progress.done
-    stand = work.assembly.stand
-    frames = FramesToCome(lambda: stand.imaging.supply.is_on, work.order.recipe.plan(), done)
-    work.assembly.hub.subscribe(frames)
-    return work.assembly.guard(trip, hold, lambda: gate.clear(INTERLOCK), work.recorder, frames.is_due)
+    def frames_are_due() -> bool:
+        """From the camera, which is powered."""
+        return work.assembly.stand.imaging.supply.is_on and log.state.frames_to_come
+
+    return work.assembly.guard(trip, hold, lambda: gate.clear(INTERLOCK), work.recorder, frames_are_due)
 
 
-def _forget_cleared(guard: Guard, work: Performance, reason: str, held: bool) -> None:
+def _forget_cleared(guard: Guard, work: GuardedRun, reason: str, held: bool) -> None:
     """An operator has cleared the interlock: the guard's hold is over. Of a folder that is lost another one is made."""
     if reason == INTERLOCK and not held:
         work.assembly.stand.chamber.permits.forgive()

@@ -1,7 +1,7 @@
-"""Shuts the flap in every hold that lasts, whatever the hold is and wherever the run waits in it.
+"""What is seen to while something holds a run, wherever it waits.
 
-Through an open flap the chamber breathes the laboratory's air: frost in the cold, and no equilibrium. A capture that
-waits for a disk, a camera or an operator would leave it open.
+The flap is shut in every hold that lasts: through an open one the chamber breathes the laboratory's air (frost in the
+cold, and no equilibrium). And in virtual time, where no operator is there, a hold that lasts for ever ends the run.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 
 from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError
+from foundation.errors import DeviceError, StandError
 from foundation.hub import Hub
 from foundation.items import Event
 from stand.gate import STOPPING, Gate
@@ -59,3 +59,23 @@ async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
     finally:
         sleeping.cancel()
         opening.cancel()
+
+
+async def end_endless_holds(gate: Gate, clock: Clock, limit_h: float) -> None:
+    """Raises StandError when the gate has been closed for `limit_h` without interruption; else runs until cancelled."""
+    since_ns: int | None = None
+
+    def follow(_reason: str, held: bool) -> None:
+        nonlocal since_ns
+        since_ns = None if not gate.reasons else clock.now_ns() if since_ns is None and held else since_ns
+
+    gate.subscribe(follow)
+    while True:
+        await gate.closed()
+        if since_ns is None:  # it was closed before anybody listened
+            since_ns = clock.now_ns()
+        ends_ns = since_ns + seconds_ns(3600.0 * limit_h)
+        if clock.now_ns() >= ends_ns:
+            reasons = ", ".join(sorted(gate.reasons))
+            raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody let it go on")
+        await clock.sleep_until(ends_ns)

@@ -1,8 +1,9 @@
-"""Orders from files: the one place where configuration, recipe and target are found, read and checked together."""
+"""What to run: the one place where configuration, recipe and target are found, read and checked together."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from drivers.wires.registers import load_register_map
 from foundation.documents import parse_document, read_document
@@ -10,7 +11,25 @@ from markers.target import Target
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.estimate import price
-from stand.running.session_setup import Order
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What to run: the checked files and their texts (they are attached to the recording). attended: somebody is there
+    to do what the plan prompts for. at_configured_addresses: the laboratory of a virtual run answers there instead of
+    at free addresses, for a program that has to find it."""
+
+    config: StandConfig
+    recipe: Recipe
+    config_text: str
+    recipe_text: str
+    target_text: str
+    attended: bool = False
+    at_configured_addresses: bool = False
+
+    def attachments(self) -> dict[str, str]:
+        """The texts by the names under which a session has them."""
+        return {"config.yaml": self.config_text, "recipe.yaml": self.recipe_text, "target.yaml": self.target_text}
 
 
 def load_order(recipe: str, config: str) -> Order:

@@ -1,4 +1,4 @@
-"""What a run is asked for, and the recording that follows from it: its folder, its recorder."""
+"""The recording of a run: its folder, what is known of it beforehand, and its recorder."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import importlib.metadata
 import itertools
 import os
 import platform
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -19,27 +18,8 @@ from recording.writing.disk import Disk
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from recording.writing.settings import VIRTUAL_COMMIT_S
 from stand.assembly import Assembly
-from stand.config.recipe import Recipe
 from stand.config.stand_config import RecordingConfig, StandConfig
-
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """What to run: the checked files and their texts (they are attached to the recording). attended: somebody is there
-    to do what the plan prompts for. at_configured_addresses: the laboratory of a virtual run answers there instead of
-    at free addresses, for a program that has to find it."""
-
-    config: StandConfig
-    recipe: Recipe
-    config_text: str
-    recipe_text: str
-    target_text: str
-    attended: bool = False
-    at_configured_addresses: bool = False
-
-    def attachments(self) -> dict[str, str]:
-        """The texts by the names under which a session has them."""
-        return {"config.yaml": self.config_text, "recipe.yaml": self.recipe_text, "target.yaml": self.target_text}
+from stand.running.order import Order
 
 
 def session_directory(out: Path, order: Order, clock: Clock) -> Path:
@@ -99,6 +79,8 @@ def _partial_frames(order: Order) -> RoiEncoder | None:
     if recording.frame_encoding != "roi":
         return None
     target = parse_document(order.target_text, Target, order.config.target)
+    from markers.windows import marker_windows  # scipy takes half a second that other runs need not wait for
+
     from markers.windows import marker_windows  # scipy takes half a second that other runs need not wait for
 
     return RoiEncoder(partial(marker_windows, target=target), recording.whole_every_s)

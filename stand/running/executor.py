@@ -1,0 +1,385 @@
+"""Performs what the table of a run says (stand/running/actions.py), and enters what came of it.
+
+One loop for a run that goes on, was held, tripped, killed or resumed: what it remembers is the logbook's state and
+nothing else. What an action raises ends the run, unless something has undone the set-up meanwhile: then the table says
+what is next.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
+from contextlib import contextmanager
+
+from experiments.steps import (
+    Capture,
+    CheckHome,
+    CloseFlap,
+    CoolDown,
+    MoveTo,
+    OpenFlap,
+    PlannedStep,
+    PowerCamera,
+    Prompt,
+    Role,
+    SetTemperature,
+    Soak,
+    SoakUntilSettled,
+    StartChamber,
+    StopChamber,
+    kind_of,
+    parameters_of,
+)
+from experiments.steps import Step as PlanStep
+from foundation.clock import NS_PER_S, Clock
+from foundation.errors import ConfigError, DeviceError
+from foundation.hub import Hub
+from foundation.items import StepMark, StepState
+from foundation.tasks import cancelled
+from recording.format.restarts import restarted
+from recording.reading.contents import PLAN_CHANGED
+from stand.interlock import Interlocked
+from stand.running.actions import (
+    Action,
+    Aim,
+    Begin,
+    Complete,
+    Earn,
+    Equilibrate,
+    OpenAgain,
+    Perform,
+    Readies,
+    Restore,
+    Sleep,
+    StartCold,
+    Surroundings,
+    TakeAgain,
+    TakeFrame,
+    Wait,
+    due_after_ns,
+    next_action,
+    next_due_ns,
+    worth_of_soaks,
+)
+from stand.running.camera_gap import OffsetWatch
+from stand.running.entries import (
+    Again,
+    Change,
+    Cooled,
+    Due,
+    Dwell,
+    Edited,
+    Extended,
+    Readying,
+    Restored,
+    Skipped,
+    Step,
+    Taken,
+    data_of,
+)
+from stand.running.fold import after, change_text, refusal
+from stand.running.logbook import Logbook
+from stand.running.settling_watch import SettlingWatch
+from stand.running.state import Plan, RunState, SetUp, duration_of
+from stand.stand import Stand
+
+_JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
+
+
+class Executor:
+    """Performs the plan of the logbook's state.
+
+    `flushed` returns when all that was published is on the disk. `settling` tells when a soak may end early, `offsets`
+    is told what has settled. `allowed` raises ConfigError when this stand may not do a plan.
+    """
+
+    def __init__(
+        self,
+        stand: Stand,
+        hub: Hub,
+        clock: Clock,
+        log: Logbook,
+        flushed: Callable[[], Awaitable[None]],
+        settling: SettlingWatch,
+        offsets: OffsetWatch,
+        allowed: Callable[[Plan], object] = len,
+    ) -> None:
+        self._stand = stand
+        self._hub = hub
+        self._clock = clock
+        self._log = log
+        self._flushed = flushed
+        self._settling = settling
+        self._offsets = offsets
+        self._allowed = allowed
+        self._changed = asyncio.Event()  # set, and replaced, when the plan was changed
+        if stand.imaging.supply.equilibrium.is_lost:
+            self._on_lost_equilibrium()
+        stand.imaging.supply.equilibrium.subscribe(self._on_lost_equilibrium)
+
+    async def run(self) -> None:
+        """What is not done of the plan."""
+        while (action := next_action(self._state, self._surroundings())) is not None:
+            with self._failing():
+                is_done = await self._tried(action)
+            if is_done:
+                await self._conclude(action)
+
+    async def skip(self, step_id: str) -> None:
+        """Leave the step out, or break it off: a soak, capture, cool-down or prompt under way ends at once. Durable
+        when this returns; ConfigError when it cannot be left out."""
+        await self._change(Skipped(self._clock.now_ns(), step_id))
+
+    async def extend(self, step_id: str, by_s: float) -> None:
+        """Soak for so much longer; else as `skip`."""
+        await self._change(Extended(self._clock.now_ns(), step_id, by_s))
+
+    async def edit(self, from_index: int, steps: Sequence[PlanStep]) -> None:
+        """Replace the steps from the place `from_index` on, none of which was begun; else as `skip`."""
+        data: list[dict[str, object]] = [{"kind": kind_of(step), "parameters": parameters_of(step)} for step in steps]
+        await self._change(Edited(self._clock.now_ns(), from_index, data))
+
+    async def _change(self, change: Change) -> None:
+        """Told before it is journaled, as everything that the recording has to know."""
+        if reason := refusal(self._state, change):
+            raise ConfigError(reason)
+        changed = after(self._state, change)
+        self._allowed(changed.plan)
+        if isinstance(change, Skipped) and (planned := self._state.step(change.step_id)):
+            self._mark(planned, StepState.SKIPPED)
+        self._log.tell("warning", PLAN_CHANGED, change_text(self._state, change), {**data_of(change), **changed.size})
+        self._changed.set()
+        self._changed = asyncio.Event()
+        await self._log.write(change)
+
+    @property
+    def _state(self) -> RunState:
+        return self._log.state
+
+    def _surroundings(self) -> Surroundings:
+        stand, pv = self._stand, self._hub.known("regulator.pv")  # one lost reply costs no soak
+        return Surroundings(
+            now_ns=self._clock.now_ns(),
+            lead_ns=self._clock.lead_ns,
+            held=bool(stand.gate.reasons),
+            flap_open=stand.imaging.flap_open,
+            lost_equilibrium=stand.imaging.supply.equilibrium.is_lost,
+            pv_degC=math.nan if pv is None else pv.value,
+        )
+
+    @contextmanager
+    def _failing(self) -> Generator[None]:
+        """What ends the run inside is the failure of the step under way."""
+        try:
+            yield
+        except (Exception, asyncio.CancelledError):
+            if planned := self._state.step(self._state.under_way):
+                self._mark(planned, StepState.FAILED)
+            raise
+
+    async def _tried(self, action: Action) -> bool:
+        """Whether the action came to its end; not so when something has undone the set-up meanwhile."""
+        state = self._state
+        is_readying = isinstance(action, Readies) or (
+            isinstance(action, Earn) and action.soak.step_id != state.plan[state.index].step_id
+        )
+        if is_readying != state.readying and not isinstance(action, Sleep):
+            self._log.enter(Readying(self._clock.now_ns(), is_readying))
+        try:
+            await self._act(action)
+        except (DeviceError, Interlocked) as error:
+            if self._state.disturbances == state.disturbances:
+                raise
+            planned = self._state.step(self._state.under_way)
+            if planned is not None and not is_readying:
+                text = f"{kind_of(planned.step)} was broken off by an interlock ({error})"
+                self._log.tell("warning", "step_broken_off", text)
+                self._log.enter(Due(self._clock.now_ns(), None))
+            return False
+        return True
+
+    async def _act(self, action: Action) -> None:
+        stand = self._stand
+        match action:
+            case Sleep(until_ns):
+                await self._first_of(self._clock.sleep_until(until_ns), self._changed.wait())
+            case Wait():
+                await stand.gate.passed()
+            case Restore(set_up):
+                await self._restore(set_up)
+            case Earn(soak):
+                await self._earn(soak.step_id)
+            case Equilibrate():
+                changes = self._state.changes
+                await stand.imaging.supply.equilibrium.regained(
+                    lambda: self._state.is_disturbed or self._state.changes != changes
+                )
+            case OpenAgain():
+                await stand.imaging.open_flap()
+            case Begin(planned):
+                await self._log.write(Step(self._clock.now_ns(), planned.step_id, "started"))
+                self._mark(planned, StepState.STARTED)
+            case Aim(capture):
+                await self._aim(capture)
+            case TakeAgain(planned, outage_ns):
+                await self._begin_anew((planned,), f"it was interrupted for {outage_ns / NS_PER_S:.0f} s")
+                await self._log.write(Step(self._clock.now_ns(), planned.step_id, "started"))
+            case TakeFrame():
+                await self._take(action)
+            case Perform(planned):
+                await self._perform(planned)
+            case Complete(planned):
+                if isinstance(planned.step, Capture):
+                    await self._flushed()
+            case StartCold():
+                pass  # what is under way has failed
+
+    async def _conclude(self, action: Action) -> None:
+        """What follows when the step under way is done, or has to wait for those before it."""
+        match action:
+            case Complete(planned) | Perform(planned) if planned.step_id == self._state.under_way:
+                self._mark(planned, StepState.DONE)
+                await self._flushed()
+                await self._log.write(Step(self._clock.now_ns(), planned.step_id, "done"))
+            case StartCold(again):
+                if planned := self._state.step(self._state.under_way):
+                    self._mark(planned, StepState.FAILED)
+                await self._begin_anew(again, "from a cold camera")
+            case _:
+                pass
+
+    async def _begin_anew(self, again: Plan, how: str) -> None:
+        """These steps count as neither begun nor done, and no frame of theirs so far: told before it is journaled, so
+        that no frame is ever left out that nobody was told of."""
+        now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]
+        self._hub.publish(restarted(now_ns, step_ids[-1], self._state.frames.get(step_ids[-1], 0), how))
+        await self._flushed()
+        await self._log.write(Again(now_ns, step_ids))
+
+    async def _perform(self, planned: PlannedStep) -> None:
+        stand = self._stand
+        match planned.step:
+            case StartChamber(chamber_degC):
+                await stand.chamber.start(chamber_degC)
+            case SetTemperature(chamber_degC):
+                await stand.chamber.set_temperature(chamber_degC)
+            case StopChamber():
+                await stand.chamber.stop()
+            case OpenFlap():
+                await stand.imaging.open_flap()
+            case CloseFlap():
+                await stand.imaging.close_flap()
+            case MoveTo(axis, position):
+                await stand.table.move_to(axis, position)
+            case PowerCamera(on):
+                supply = stand.imaging.supply
+                supply.equilibrium.forget()
+                await (supply.switch_on() if on else supply.switch_off())
+            case CoolDown(band_K, time_constant_s, max_s):
+                cooling = stand.imaging.supply.cool_down(band_K, time_constant_s, max_s)
+                await self._unless_skipped(planned.step_id, cooling)
+            case CheckHome(axis):
+                await stand.table.check_home(axis)
+            case Prompt(text):
+                await self._unless_skipped(planned.step_id, stand.prompt(text))
+            case Soak() | SoakUntilSettled() | Capture():
+                pass  # are earned and taken
+
+    async def _aim(self, capture: Capture) -> None:
+        await self._stand.table.approach_again()
+        state = self._state
+        due_ns = next_due_ns(state.due_ns, capture, self._surroundings(), is_lost=state.is_lost)
+        self._log.enter(Due(self._clock.now_ns(), due_ns))
+
+    async def _take(self, frame: TakeFrame) -> None:
+        capture, step_id = frame.capture, frame.planned.step_id
+        if frame.is_settled:
+            self._offsets.settled(capture.chamber_degC)
+        if self._state.was_held and capture.role is Role.WARM_UP:
+            # A camera goes on warming up while the run is held: what was not seen of it is told.
+            missing_s = (self._clock.now_ns() - self._state.seen_ns) / NS_PER_S
+            text = f"the run was held: the camera has warmed up for {missing_s:.1f} s without a frame"
+            self._log.tell("warning", "warm_up_gap", text)
+        is_taken = await self._stand.imaging.take_frame(capture.exposure_s, step_id, frame.due_ns)
+        now_ns = self._clock.now_ns()
+        if is_taken:
+            self._log.enter(Taken(now_ns, step_id))
+        self._log.enter(Due(now_ns, due_after_ns(frame.due_ns, capture, now_ns), lost=not is_taken))
+
+    async def _earn(self, step_id: str) -> None:
+        """Earn what a soak still owes while nothing holds the run; returns early when the set-up was disturbed."""
+        self._settling.restart()
+        while (soak := self._state.step(step_id)) and (owed_ns := self._state.owed_ns(soak)):
+            if self._is_kept():
+                return
+            begin_ns, earned_ns = self._clock.now_ns(), duration_of(soak) - owed_ns
+            slept = self._clock.sleep_until(begin_ns + min(owed_ns, _JOURNAL_NS))
+            await self._first_of(slept, self._stand.gate.closed(), self._changed.wait())
+            soak = self._state.step(step_id) or soak  # it may be longer now
+            is_settled = False
+            if isinstance(soak.step, SoakUntilSettled) and not self._is_kept() and self._state.owed_ns(soak):
+                soaked_s = (earned_ns + self._clock.now_ns() - begin_ns) / NS_PER_S
+                is_settled = await self._settling.is_settled(soak.step, step_id, soaked_s)
+            now_ns, whole_ns = self._clock.now_ns(), duration_of(self._state.step(step_id) or soak)
+            earned_ns = whole_ns if is_settled else min(earned_ns + now_ns - begin_ns, whole_ns)
+            if step_id not in self._state.skipped:
+                await self._log.write(Dwell(now_ns, step_id, earned_ns / NS_PER_S))
+
+    def _is_kept(self) -> bool:
+        """From earning anything."""
+        return bool(self._stand.gate.reasons) or self._state.is_disturbed
+
+    async def _unless_skipped(self, step_id: str, work: Coroutine[None, None, None]) -> None:
+        """The work of a step, broken off when that is left out."""
+        task = asyncio.create_task(work)
+        try:
+            while not task.done() and step_id not in self._state.skipped:
+                changed = asyncio.ensure_future(self._changed.wait())
+                await asyncio.wait((task, changed), return_when=asyncio.FIRST_COMPLETED)
+                changed.cancel()
+            if task.done():
+                task.result()
+        finally:
+            await cancelled([task])
+
+    async def _first_of(self, *waits: Coroutine[None, None, object]) -> None:
+        """Until the first of these is over."""
+        tasks = [asyncio.ensure_future(wait) for wait in waits]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    async def _restore(self, set_up: SetUp) -> None:
+        """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
+        stand, disturbances = self._stand, self._state.disturbances
+        await stand.imaging.close_flap()
+        for axis, position in set_up.positions.items():
+            await stand.gate.passed()
+            await stand.table.move_to(axis, position)
+        await stand.gate.passed()
+        if set_up.camera_on:
+            await stand.imaging.supply.restore()
+        else:
+            stand.imaging.supply.equilibrium.forget()
+            await stand.imaging.supply.switch_off()
+        if set_up.chamber_degC is not None:
+            await stand.gate.passed()
+            worth, now_ns = worth_of_soaks(self._state, set_up, self._surroundings()), self._clock.now_ns()
+            if worth.lost:
+                await self._log.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in worth.lost))
+            if worth.kind:
+                self._log.tell("warning" if worth.lost else "info", worth.kind, worth.text)
+            await stand.chamber.start(set_up.chamber_degC)
+        self._log.enter(Restored(self._clock.now_ns(), disturbances))
+        self._log.tell("info", "restored", set_up.text)
+
+    def _on_lost_equilibrium(self) -> None:
+        """The camera has to be brought back as well; in a plan that has it off that is nothing."""
+        self._log.enter(Cooled(self._clock.now_ns()))
+
+    def _mark(self, planned: PlannedStep, state: StepState) -> None:
+        now_ns, kind = self._clock.now_ns(), kind_of(planned.step)
+        self._hub.publish(StepMark(now_ns, planned.step_id, planned.index, kind, state, parameters_of(planned.step)))

@@ -1,0 +1,271 @@
+"""The state of a run, folded from its entries.
+
+    state = fold(plan, entries)         the same for a run that goes on and for one that is resumed
+    state = after(state, entry)
+
+Pure: no clock, no disk, no device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+from experiments.steps import (
+    AnySoak,
+    CheckHome,
+    PlannedStep,
+    PowerCamera,
+    Soak,
+    is_setup,
+    kind_of,
+    number_steps,
+    step_of,
+)
+from foundation.clock import seconds_ns
+from stand.gate import INTERLOCK
+from stand.running.entries import (
+    Again,
+    Change,
+    Cleared,
+    Cooled,
+    Due,
+    Dwell,
+    Edited,
+    Ended,
+    Entry,
+    Extended,
+    Gap,
+    Held,
+    Readying,
+    Restored,
+    Skipped,
+    Step,
+    Taken,
+    Tripped,
+)
+from stand.running.state import RunState, SetUp
+
+
+def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
+    """The state of a run of that plan after these entries. ConfigError when the plan was edited to steps that are not
+    known here."""
+    state = RunState(tuple(plan))
+    for entry in entries:
+        state = after(state, entry)
+    return state
+
+
+def after(state: RunState, entry: Entry) -> RunState:
+    """What the state is after one more entry. What does not fit, such as a change of a step that is done, changes
+    nothing."""
+    match entry:
+        case Step():
+            return _begun(state, entry) if entry.state == "started" else _done(state, entry)
+        case Dwell(_, step_id, earned_s):
+            if step_id in state.skipped:
+                return state
+            return replace(state, earned_ns=_with(state.earned_ns, step_id, seconds_ns(earned_s)))
+        case Taken():
+            return _taken(state, entry)
+        case Due(_, due_ns, lost):
+            return replace(state, due_ns=due_ns, is_lost=lost)
+        case Held():
+            return _held(state, entry)
+        case Readying(time_ns, begins):
+            return _counted(state, time_ns, state.reasons, readying=begins)
+        case Gap():
+            return _gap(state, entry)
+        case Again():
+            return _again(state, entry)
+        case Cooled():
+            return replace(state, disturbances=state.disturbances + 1, is_cold=True)
+        case Restored(_, disturbances):
+            is_cold = state.is_cold and disturbances < state.disturbances
+            return replace(state, restored=max(state.restored, disturbances), is_cold=is_cold)
+        case Skipped() | Extended() | Edited():
+            return state if refusal(state, entry) else _changed(state, entry)
+        case Tripped(_, _, text):
+            return replace(state, tripped=state.tripped or text)
+        case Cleared():
+            return replace(state, tripped="")
+        case Ended():
+            return replace(state, ended=entry)
+        case _:
+            return state
+
+
+def refusal(state: RunState, change: Change) -> str:
+    """Why the plan cannot be changed so, "" when it can."""
+    if isinstance(change, Edited):
+        first = _first_free(state)
+        if not first <= change.from_index <= len(state.plan):
+            return f"the steps from {first} to {len(state.plan)} can be replaced, not those from {change.from_index}"
+        return ""
+    planned = state.step(change.step_id)
+    if planned is None:
+        return f"the plan has no step {change.step_id}"
+    name = f"step {planned.index} ({kind_of(planned.step)})"
+    if change.step_id in state.done:
+        return f"{name} is done"
+    if isinstance(change, Extended):
+        if not isinstance(planned.step, AnySoak):
+            return f"{name} is no soak"
+        return "" if 0.0 < change.by_s < float("inf") else f"{name} cannot be extended by {change.by_s:g} s"
+    if is_setup(planned.step):
+        return f"{name} sets up what later steps rely on; replace those from it on"
+    is_moving = isinstance(planned.step, CheckHome) and state.under_way == change.step_id
+    return f"{name} is under way and ends by itself" if is_moving else ""
+
+
+def change_text(state: RunState, change: Change) -> str:
+    """The change of a plan, in words."""
+    if isinstance(change, Edited):
+        return f"the steps from {change.from_index} on are replaced by {len(change.steps)} others by an operator"
+    planned = state.step(change.step_id)
+    name = change.step_id if planned is None else f"step {planned.index} ({kind_of(planned.step)})"
+    if isinstance(change, Extended):
+        return f"{name} takes {change.by_s:g} s longer, by an operator"
+    return f"{name} is left out, by an operator"
+
+
+def _first_free(state: RunState) -> int:
+    """The place of the first step that is neither done nor begun, nor before one that is."""
+    used = state.done | state.begun
+    return max((planned.index + 1 for planned in state.plan if planned.step_id in used), default=0)
+
+
+def _changed(state: RunState, change: Change) -> RunState:
+    state = replace(state, changes=(*state.changes, change))
+    match change:
+        case Skipped(_, step_id):
+            state = replace(state, skipped=state.skipped | {step_id}, done=state.done | {step_id})
+            if state.under_way == step_id:
+                state = replace(state, under_way="", due_ns=None, is_lost=False)
+            return _placed(state)
+        case Extended(_, step_id, by_s):
+            return replace(state, plan=tuple(_longer(each, step_id, by_s) for each in state.plan))
+        case Edited(_, first, steps):
+            made = (step_of(str(each.get("kind")), _mapping(each.get("parameters"))) for each in steps)
+            return _placed(replace(state, plan=(*state.plan[:first], *number_steps(made, first))))
+
+
+def _mapping(value: object) -> Mapping[str, object]:
+    return {str(name): each for name, each in value.items()} if isinstance(value, dict) else {}
+
+
+def _longer(planned: PlannedStep, step_id: str, by_s: float) -> PlannedStep:
+    """One that waits for the camera waits longer at the least and at the most."""
+    step = planned.step
+    if planned.step_id != step_id or not isinstance(step, AnySoak):
+        return planned
+    if isinstance(step, Soak):
+        return replace(planned, step=replace(step, duration_s=step.duration_s + by_s))
+    return replace(planned, step=replace(step, min_s=step.min_s + by_s, max_s=step.max_s + by_s))
+
+
+def _placed(state: RunState) -> RunState:
+    """The first step to do, and what those before it have set up."""
+    set_up = SetUp()
+    for index, planned in enumerate(state.plan):
+        if planned.step_id not in state.done:
+            return replace(state, index=index, set_up=set_up)
+        set_up = set_up if planned.step_id in state.skipped else set_up.after(planned)
+    return replace(state, index=len(state.plan), set_up=set_up)
+
+
+def _begun(state: RunState, entry: Step) -> RunState:
+    """A camera that the plan switches is seen from then on: what follows in the plan is made for that."""
+    is_anew = state.under_way != entry.step_id
+    state = replace(
+        state,
+        begun=state.begun | {entry.step_id},
+        under_way=entry.step_id,
+        due_ns=None if is_anew else state.due_ns,
+        is_lost=state.is_lost and not is_anew,
+    )
+    planned = state.step(entry.step_id)
+    if planned is None or not isinstance(planned.step, PowerCamera):
+        return state
+    return replace(_seen(state, entry.time_ns), was_held=False, is_cold=False)
+
+
+def _done(state: RunState, entry: Step) -> RunState:
+    is_under_way = state.under_way == entry.step_id
+    return _placed(
+        replace(
+            state,
+            done=state.done | {entry.step_id},
+            under_way="" if is_under_way else state.under_way,
+            earned_ns=_without(state.earned_ns, entry.step_id),
+            frames=_without(state.frames, entry.step_id),
+            due_ns=None if is_under_way else state.due_ns,
+            is_lost=state.is_lost and not is_under_way,
+        )
+    )
+
+
+def _taken(state: RunState, entry: Taken) -> RunState:
+    if entry.step_id in state.done:
+        return state
+    frames = _with(state.frames, entry.step_id, state.frames.get(entry.step_id, 0) + 1)
+    return replace(_seen(state, entry.time_ns), frames=frames, was_held=bool(state.reasons))
+
+
+def _seen(state: RunState, time_ns: int) -> RunState:
+    return replace(state, seen_ns=time_ns, out_ns=0, out_since_ns=None if state.out_since_ns is None else time_ns)
+
+
+def _held(state: RunState, entry: Held) -> RunState:
+    reasons = state.reasons | {entry.reason} if entry.held else state.reasons - {entry.reason}
+    undone = entry.held and entry.reason == INTERLOCK  # an interlock makes the stand safe: nothing is as it was
+    state = replace(state, was_held=state.was_held or entry.held, disturbances=state.disturbances + undone)
+    return _counted(state, entry.time_ns, reasons, readying=state.readying)
+
+
+def _counted(state: RunState, time_ns: int, reasons: frozenset[str], *, readying: bool) -> RunState:
+    """The time during which the run is held or made ready counts; when it is both, once."""
+    return replace(
+        state,
+        reasons=reasons,
+        readying=readying,
+        out_ns=state.outage_ns(time_ns),
+        out_since_ns=time_ns if reasons or readying else None,
+    )
+
+
+def _gap(state: RunState, entry: Gap) -> RunState:
+    """Another daemon goes on: nothing holds it yet, nothing is under way, and nobody knows how the stand is."""
+    return replace(
+        state,
+        under_way="",
+        disturbances=state.disturbances + 1,
+        reasons=frozenset[str](),
+        readying=False,
+        out_ns=state.outage_ns(entry.from_ns) + entry.time_ns - entry.from_ns,
+        out_since_ns=None,
+        due_ns=None,
+        is_lost=False,
+        ended=None,
+    )
+
+
+def _again(state: RunState, entry: Again) -> RunState:
+    """A capture under way begins anew where it is; for other steps what those before them set up is needed again."""
+    ids = frozenset(entry.step_ids)
+    frames = MappingProxyType({each: count for each, count in state.frames.items() if each not in ids})
+    kept = replace(state, done=state.done - ids, begun=state.begun - ids, skipped=state.skipped - ids, frames=frames)
+    if ids != frozenset((state.under_way,)):
+        kept = replace(kept, under_way="", due_ns=None, is_lost=False, disturbances=state.disturbances + 1)
+    return _placed(kept)
+
+
+def _with(values: Mapping[str, int], name: str, value: int) -> Mapping[str, int]:
+    return MappingProxyType({**values, name: value})
+
+
+def _without(values: Mapping[str, int], name: str) -> Mapping[str, int]:
+    return (
+        MappingProxyType({each: value for each, value in values.items() if each != name}) if name in values else values
+    )
