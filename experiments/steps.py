@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from typing import get_args
 
@@ -227,6 +227,8 @@ def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
     """The step that `kind_of` and `parameters_of` have given; ConfigError when there is none such."""
     if kind not in _KINDS:
         raise ConfigError(f"no step is called {kind!r}; there are {', '.join(_KINDS)}")
+    if unknown := sorted(set(parameters) - {each.name for each in fields(_KINDS[kind])}):
+        raise ConfigError(f"{kind} has no {', '.join(unknown)}")
     try:
         step = TypeAdapter(_KINDS[kind]).validate_python(dict(parameters))
     except ValidationError as error:

@@ -114,7 +114,7 @@ class Edited:
 
     time_ns: int
     from_index: int
-    steps: list[dict[str, object]]
+    by: list[dict[str, object]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -122,7 +122,7 @@ def refusal(state: RunState, change: Change) -> str:
 def change_text(state: RunState, change: Change) -> str:
     """The change of a plan, in words."""
     if isinstance(change, Edited):
-        return f"the steps from {change.from_index} on are replaced by {len(change.steps)} others by an operator"
+        return f"the steps from {change.from_index} on are replaced by {len(change.by)} others by an operator"
     planned = state.step(change.step_id)
     name = change.step_id if planned is None else f"step {planned.index} ({kind_of(planned.step)})"
     if isinstance(change, Extended):
@@ -146,8 +146,8 @@ def _changed(state: RunState, change: Change) -> RunState:
             return _placed(state)
         case Extended(_, step_id, by_s):
             return replace(state, plan=tuple(_longer(each, step_id, by_s) for each in state.plan))
-        case Edited(_, first, steps):
-            made = (step_of(str(each.get("kind")), _mapping(each.get("parameters"))) for each in steps)
+        case Edited(_, first, by):
+            made = (step_of(str(each.get("kind")), _mapping(each.get("parameters"))) for each in by)
             return _placed(replace(state, plan=(*state.plan[:first], *number_steps(made, first))))
 
 

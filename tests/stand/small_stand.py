@@ -12,7 +12,7 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading
 from markers.target import Target
-from stand.gate import CAMERA_LOST, INTERLOCK, STOPPING, Gate
+from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
 from stand.imaging.equilibrium import LOST, CameraEquilibrium, EquilibriumLimits
 from stand.interlock import Interlocked
 from stand.running.camera_gap import OffsetWatch
@@ -136,6 +136,18 @@ class SmallStand:
         self._hub.publish(frame)
         return frame
 
+    async def cool_down(self, band_K, time_constant_s, max_s):
+        self._check()
+        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(max_s))
+
+    async def prompt(self, text):
+        self._check()
+        self.gate.hold(OPERATOR)
+        await self.gate.passed()
+
+    async def check_home(self, axis):
+        await self._act("check_home")
+
     async def make_safe(self):
         self.heating = self.flap_open = False
         await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
@@ -163,7 +175,7 @@ class Life:
         self._resumes = self._journal_path.exists()
         self._still = ExitStack()  # holds the clock
         self.publish_pv(chamber_degC)
-        self._do(self._begin(folder))
+        self.do(self._begin(folder))
 
     async def _begin(self, folder):
         first, told = (), ()
@@ -209,7 +221,7 @@ class Life:
         self._disk.extend(self._unsaved[:published])
         del self._unsaved[:published]
 
-    def _do(self, work):
+    def do(self, work):
         """Time goes on meanwhile and stands still before and after, or the last turns of the loop would let it jump."""
 
         async def within():
@@ -223,7 +235,7 @@ class Life:
 
     def passes(self, duration_s):
         """Let time go on; whatever is to happen meanwhile happens."""
-        self._do(self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s)))
+        self.do(self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s)))
 
     def call(self, action):
         """`action()` within the daemon."""
@@ -231,7 +243,7 @@ class Life:
         async def work():
             return action()
 
-        return self._do(work())
+        return self.do(work())
 
     def publish_pv(self, pv_degC):
         reading = Reading("regulator.pv", pv_degC, "degC", self.clock.now_ns())
@@ -240,7 +252,7 @@ class Life:
     def interlock(self):
         """As the guard does: hold, then make safe; the run waits."""
         self.call(lambda: (self.stand.gate.hold(INTERLOCK), self.stand.safety.demand()))
-        self._do(self.stand.safety.tried())
+        self.do(self.stand.safety.tried())
 
     def kill(self):
         """Nothing that happens from now on, here the end of its tasks, reaches the disk. The next life begins then."""
@@ -251,8 +263,8 @@ class Life:
         self.passes(30.0)
         self._time.cancel()
         self._flap.cancel()
-        self._do(asyncio.gather(self._time, self._flap, self.run, return_exceptions=True))
-        self._do(self._journal.close())
+        self.do(asyncio.gather(self._time, self._flap, self.run, return_exceptions=True))
+        self.do(self._journal.close())
         self.loop.close()
         self._journal_path.write_bytes(journal)
         return now_ns

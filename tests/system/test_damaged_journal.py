@@ -117,5 +117,5 @@ async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path
         with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --clear"):
             await asyncio.to_thread(interruption, directory)
     before = await asyncio.to_thread(partial(interruption, directory, clear=True))
-    assert before.tripped
+    assert before.state.tripped
     before.release()

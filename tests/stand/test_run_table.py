@@ -1,0 +1,334 @@
+"""A run as a table: for every state and everything that may happen in it, what is done next."""
+
+import math
+
+import pytest
+
+from experiments.steps import (
+    Capture,
+    CheckHome,
+    CloseFlap,
+    CoolDown,
+    MoveTo,
+    OpenFlap,
+    PowerCamera,
+    Prompt,
+    Role,
+    SetTemperature,
+    Soak,
+    SoakUntilSettled,
+    StartChamber,
+    StopChamber,
+    number_steps,
+)
+from foundation.clock import NS_PER_S
+from stand.gate import INTERLOCK, OPERATOR
+from stand.running.actions import (
+    Aim,
+    Begin,
+    Complete,
+    Earn,
+    Equilibrate,
+    OpenAgain,
+    Perform,
+    Restore,
+    Sleep,
+    StartCold,
+    Surroundings,
+    TakeAgain,
+    TakeFrame,
+    Wait,
+    due_after_ns,
+    next_action,
+    next_due_ns,
+    worth_of_soaks,
+)
+from stand.running.entries import (
+    Again,
+    Cleared,
+    Cooled,
+    Due,
+    Dwell,
+    Ended,
+    Gap,
+    Held,
+    Readying,
+    Restored,
+    Skipped,
+    Step,
+    Taken,
+    Tripped,
+)
+from stand.running.fold import after, fold
+from stand.running.state import RunState, SetUp
+
+S = NS_PER_S
+FIT = Capture(2, 10.0, 0.1, Role.FIT, 30.0)
+WARM_UP = Capture(3, 10.0, 0.1, Role.WARM_UP, 30.0)
+PLAN = tuple(
+    number_steps(
+        [
+            CloseFlap(),
+            MoveTo("linear", 2.0),
+            StartChamber(30.0),
+            Soak(100.0),
+            OpenFlap(),
+            FIT,
+            CloseFlap(),
+            PowerCamera(False),
+            CoolDown(2.0, 100.0, 500.0),
+            Prompt("turn it"),
+            PowerCamera(True),
+            WARM_UP,
+            CheckHome("linear"),
+            StopChamber(),
+        ]
+    )
+)
+ID = [planned.step_id for planned in PLAN]
+MOVE, START, SOAK, OPEN, CAPTURE, OFF, COOL, PROMPT, ON, WARM, HOME = (
+    ID[i] for i in (1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12)
+)
+
+
+def done(index: int) -> list[Step]:
+    """All steps before that place."""
+    return [entry for step_id in ID[:index] for entry in (Step(0, step_id, "started"), Step(0, step_id, "done"))]
+
+
+def begun(step_id: str) -> list[Step]:
+    return [*done(ID.index(step_id)), Step(0, step_id, "started")]
+
+
+# By name: the entries so far, all at 0 s. `now` is 20 s.
+STATES = {
+    "fresh": [],
+    "begun": begun(START),
+    "soak begun": begun(SOAK),
+    "half soaked": [*begun(SOAK), Dwell(0, SOAK, 50.0)],
+    "soaked": [*begun(SOAK), Dwell(0, SOAK, 100.0)],
+    "before opening": done(4),
+    "opened": done(5),
+    "capture begun": begun(CAPTURE),
+    "next is due": [*begun(CAPTURE), Due(0, 20 * S)],
+    "next is ahead": [*begun(CAPTURE), Taken(0, CAPTURE), Due(0, 30 * S)],
+    "one frame": [*begun(CAPTURE), Taken(0, CAPTURE), Due(0, 20 * S)],
+    "one was lost": [*begun(CAPTURE), Taken(0, CAPTURE), Due(0, 20 * S, lost=True)],
+    "all frames": [*begun(CAPTURE), Taken(0, CAPTURE), Taken(0, CAPTURE), Due(0, 30 * S)],
+    "camera off": begun(COOL),
+    "asked": begun(PROMPT),
+    "camera on": done(11),
+    "warming up": [*begun(WARM), Taken(0, WARM), Due(0, 20 * S)],
+    "checking": begun(HOME),
+    "complete": done(len(ID)),
+}
+FLAP_OPEN = {"opened", "capture begun", "next is due", "next is ahead", "one frame", "one was lost", "all frames"}
+
+
+def held_for(begin_s: float, end_s: float, reason: str = OPERATOR) -> list[Held]:
+    return [Held(int(begin_s * S), reason, True), Held(int(end_s * S), reason, False)]
+
+
+# By name: what happens (its entries), and what of the surroundings is then another. `{}` of a step is the first to do.
+EVENTS = {
+    "nothing": ([], {}),
+    "held": ([Held(10 * S, OPERATOR, True)], {"held": True}),
+    "tripped": ([Tripped(10 * S, "over_temperature", "too hot")], {"held": True}),
+    "held 5 s": (held_for(10, 15), {}),
+    "flap shut": (held_for(-60, 15), {"flap_open": False}),
+    "ready": ([*held_for(0, 70), Readying(70 * S, True)], {"now_ns": 80 * S}),
+    "held 70 s": (held_for(0, 70), {"now_ns": 80 * S}),
+    "interlock": ([Held(10 * S, INTERLOCK, True)], {"held": True}),
+    "cleared": (held_for(10, 15, INTERLOCK), {"flap_open": False}),
+    "restored": ([*held_for(10, 15, INTERLOCK), Restored(16 * S, 1)], {"flap_open": False}),
+    "camera off": ([Cooled(10 * S)], {"lost_equilibrium": True}),
+    "camera back": ([Cooled(10 * S), Restored(15 * S, 1)], {"lost_equilibrium": True}),
+    "killed": ([Gap(10 * S, 15 * S)], {"flap_open": False}),
+    "left out": ([Skipped(10 * S, "{}")], {}),
+}
+
+# What is done next: a row for each state, a column for each event, both in the order above.
+NEXT = """
+                 no  he  tr  h5  fs  re  h7  in  cl  rs  co  cb  ki  lo
+fresh            Be  Wa  Wa  Be  Be  Be  Be  Wa  Re  Be  Re  Be  Re  Be
+begun            Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Pe
+soak begun       Ea  Wa  Wa  Ea  Ea  Ea  Ea  Wa  Re  Ea  Re  Ea  Re  Be
+half soaked      Ea  Wa  Wa  Ea  Ea  Ea  Ea  Wa  Re  Ea  Re  Ea  Re  Be
+soaked           Co  Wa  Wa  Co  Co  Co  Co  Wa  Co  Co  Co  Co  Re  Be
+before opening   Be  Wa  Wa  Be  Be  Be  Be  Wa  Re  Be  Re  Eq  Re  Be
+opened           Be  Wa  Wa  Be  OA  Be  Be  Wa  Re  OA  Re  Eq  Re  Be
+capture begun    Ai  Wa  Wa  Ai  OA  Ai  Ai  Wa  Re  OA  Re  Eq  Re  Be
+next is due      TF  Wa  Wa  TF  OA  Ai  TF  Wa  Re  OA  Re  Eq  Re  Be
+next is ahead    Sl  Sl  Sl  Sl  Sl  Ai  TA  Sl  Sl  Sl  Sl  Sl  Re  Be
+one frame        TF  Wa  Wa  TF  OA  Ai  TA  Wa  Re  OA  Re  Eq  Re  Be
+one was lost     Ai  Wa  Wa  Ai  OA  Ai  Ai  Wa  Re  OA  Re  Eq  Re  Be
+all frames       Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Re  Be
+camera off       Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Be
+asked            Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Be
+camera on        Be  Wa  Wa  Be  Be  Be  Be  Wa  SC  Be  SC  Eq  SC  Be
+warming up       TF  Wa  Wa  TF  SC  Ai  SC  Wa  SC  TF  SC  Eq  SC  Be
+checking         Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Pe
+complete         --  --  --  --  --  --  --  --  --  --  --  --  --  --
+"""
+CODES = {
+    "Ai": Aim,
+    "Be": Begin,
+    "Co": Complete,
+    "Ea": Earn,
+    "Eq": Equilibrate,
+    "OA": OpenAgain,
+    "Pe": Perform,
+    "Re": Restore,
+    "SC": StartCold,
+    "Sl": Sleep,
+    "TA": TakeAgain,
+    "TF": TakeFrame,
+    "Wa": Wait,
+    "--": type(None),
+}
+ROWS = [line[:16].strip() for line in NEXT.splitlines()[2:]]
+CELLS = [
+    pytest.param(state, event, CODES[code], id=f"{state}, {event}")
+    for state, line in zip(ROWS, NEXT.splitlines()[2:], strict=True)
+    for event, code in zip(EVENTS, line[16:].split(), strict=True)
+]
+
+
+def met(state: str, event: str) -> tuple[RunState, Surroundings]:
+    """The state after the event, and its surroundings."""
+    entries, around = EVENTS[event]
+    before = fold(PLAN, STATES[state])
+    current = before.plan[before.index].step_id if before.index < len(PLAN) else ""
+    now = [Skipped(entry.time_ns, current) if isinstance(entry, Skipped) else entry for entry in entries]
+    found = {"now_ns": 20 * S, "flap_open": state in FLAP_OPEN, **around}
+    return fold(PLAN, [*STATES[state], *now]), Surroundings(**found)
+
+
+def test_the_table_has_a_row_for_each_state():
+    assert list(STATES) == ROWS
+
+
+@pytest.mark.parametrize(("state", "event", "expected"), CELLS)
+def test_what_is_done_next(state: str, event: str, expected: type):
+    assert type(next_action(*met(state, event))) is expected
+
+
+def test_nothing_moves_while_something_holds_the_run():
+    still = Wait | Sleep | Complete | None
+    for state in STATES:
+        for event, (_, around) in EVENTS.items():
+            if around.get("held"):
+                assert isinstance(next_action(*met(state, event)), still)
+
+
+def test_what_is_restored_is_what_the_steps_before_have_set_up():
+    restore = next_action(*met("half soaked", "killed"))
+    assert restore == Restore(SetUp(30.0, (PLAN[3],), True, False, {"linear": 2.0}))
+    assert next_action(*met("one frame", "killed")) == Restore(SetUp(30.0, (PLAN[3],), True, True, {"linear": 2.0}))
+    assert next_action(*met("camera off", "killed")).set_up.camera_on is False
+
+
+def test_a_warm_up_begins_anew_from_the_switch_that_made_it_cold_without_what_the_operator_did():
+    again = next_action(*met("warming up", "killed")).again
+    assert [planned.step_id for planned in again] == [OFF, COOL, ON, WARM]
+    state = after(met("warming up", "killed")[0], Again(0, [OFF, COOL, ON, WARM]))
+    assert (state.index, state.frames, state.is_disturbed, state.under_way) == (7, {}, True, "")
+    assert isinstance(next_action(state, Surroundings(20 * S)), Restore)
+
+
+def walk(state: RunState, around: dict[str, object], *entries_and_actions) -> RunState:
+    """After each entry, or change of the surroundings, the action named behind it comes next."""
+    for given, expected in entries_and_actions:
+        around |= given if isinstance(given, dict) else {}
+        state = state if isinstance(given, dict) else after(state, given)
+        assert type(next_action(state, Surroundings(**around))) is expected, given
+    return state
+
+
+def test_a_capture_that_was_killed_and_stood_for_a_minute_is_taken_again():
+    state = walk(
+        fold(PLAN, STATES["one frame"]),
+        {"now_ns": 90 * S},
+        (Gap(20 * S, 81 * S), Restore),
+        (Readying(81 * S, True), Restore),
+        (Restored(85 * S, 1), OpenAgain),
+        ({"flap_open": True}, Begin),
+        (Readying(86 * S, False), Begin),
+        (Step(87 * S, CAPTURE, "started"), Aim),
+        (Due(88 * S, 88 * S), TakeAgain),
+        (Again(90 * S, [CAPTURE]), TakeFrame),
+        (Step(90 * S, CAPTURE, "started"), TakeFrame),
+        (Taken(91 * S, CAPTURE), TakeFrame),
+        (Due(91 * S, 98 * S), Sleep),
+        ({"now_ns": 98 * S}, TakeFrame),
+        (Taken(98 * S, CAPTURE), Complete),
+    )
+    assert not state.is_disturbed
+
+
+def test_a_frame_is_settled_when_it_is_the_first_after_a_soak_and_no_warm_up():
+    assert next_action(*met("next is due", "nothing")).is_settled
+    assert not next_action(*met("one frame", "nothing")).is_settled
+    assert not next_action(*met("warming up", "nothing")).is_settled
+
+
+def test_soaks_are_credited_only_in_the_band_and_when_the_camera_was_on():
+    state, set_up = fold(PLAN, STATES["half soaked"]), SetUp(30.0, (PLAN[3],))
+    for pv_degC, kind in ((29.1, "soak_credited"), (31.0, "soak_credited"), (28.9, "soak_restarted")):
+        worth = worth_of_soaks(state, set_up, Surroundings(0, pv_degC=pv_degC))
+        assert (worth.kind, worth.lost) == (kind, () if kind == "soak_credited" else (PLAN[3],))
+    assert worth_of_soaks(state, set_up, Surroundings(0, pv_degC=math.nan)).lost
+    cold = after(state, Cooled(0))
+    assert worth_of_soaks(cold, set_up, Surroundings(0, pv_degC=30.0)).lost
+    assert not worth_of_soaks(cold, SetUp(30.0, (PLAN[3],), camera_on=False), Surroundings(0, pv_degC=30.0)).lost
+    assert worth_of_soaks(fold(PLAN, begun(SOAK)), set_up, Surroundings(0, pv_degC=20.0)).kind == ""
+    assert not after(cold, Restored(0, 1)).is_cold
+    assert after(after(cold, Cooled(0)), Restored(0, 1)).is_cold  # once more meanwhile
+
+
+def test_deadlines_are_a_grid_of_which_those_missed_are_skipped():
+    around = Surroundings(47 * S, lead_ns=S)
+    assert next_due_ns(None, FIT, around, is_lost=False) == 48 * S
+    assert next_due_ns(20 * S, FIT, around, is_lost=False) == 50 * S
+    assert next_due_ns(50 * S, FIT, around, is_lost=False) == 50 * S
+    assert next_due_ns(50 * S, FIT, around, is_lost=True) == 60 * S
+    assert due_after_ns(20 * S, FIT, 20 * S) == 30 * S
+    assert due_after_ns(20 * S, FIT, 47 * S) == 40 * S  # the latest that has passed
+
+
+def test_an_outage_is_what_was_held_or_made_ready_since_the_last_frame_and_counts_once():
+    entries = [
+        *begun(CAPTURE),
+        Taken(0, CAPTURE),
+        *held_for(5, 15),
+        Held(20 * S, OPERATOR, True),
+        Readying(25 * S, True),
+        Held(30 * S, OPERATOR, False),
+        Readying(32 * S, False),
+    ]
+    assert fold(PLAN, entries).outage_ns(50 * S) == 22 * S
+    assert fold(PLAN, entries[:-1]).outage_ns(50 * S) == 40 * S
+    assert fold(PLAN, [*entries[:-1], Gap(40 * S, 100 * S)]).outage_ns(120 * S) == 90 * S
+    assert after(fold(PLAN, entries), Taken(60 * S, CAPTURE)).outage_ns(90 * S) == 0
+
+
+def test_a_trip_stays_until_it_is_cleared_and_an_end_until_the_run_goes_on():
+    state = fold(PLAN, [Tripped(0, "a", "first"), Tripped(0, "b", "second"), Ended(1, "tripped", "aborted")])
+    assert (state.tripped, state.ended.status) == ("first", "tripped")
+    assert after(state, Gap(1, 2)).ended is None
+    assert after(state, Cleared(2)).tripped == ""
+
+
+def test_a_soak_longer_than_its_time_and_one_that_was_lost_owe_what_they_say():
+    state = fold(PLAN, STATES["half soaked"])
+    assert state.owed_ns(PLAN[3]) == 50 * S
+    assert after(state, Step(0, SOAK, "done")).owed_ns(PLAN[3]) == 0
+    assert after(after(state, Step(0, SOAK, "done")), Dwell(0, SOAK, 0.0)).owed_ns(PLAN[3]) == 100 * S
+    settled = next(number_steps([SoakUntilSettled(900.0, 60.0, 240.0, 60.0, 0.2, 0.003, 0.1, 24.0)]))
+    assert fold([settled], []).owed_ns(settled) == 900 * S
+
+
+def test_a_new_set_point_is_another_set_up():
+    set_up = SetUp(30.0, (PLAN[3],)).after(next(number_steps([SetTemperature(20.0)])))
+    assert set_up == SetUp(20.0)
+    assert SetUp(30.0, (PLAN[3],)).after(PLAN[13]).chamber_degC is None
