@@ -81,8 +81,6 @@ def _partial_frames(order: Order) -> RoiEncoder | None:
     target = parse_document(order.target_text, Target, order.config.target)
     from markers.windows import marker_windows  # scipy takes half a second that other runs need not wait for
 
-    from markers.windows import marker_windows  # scipy takes half a second that other runs need not wait for
-
     return RoiEncoder(partial(marker_windows, target=target), recording.whole_every_s)
 
 
