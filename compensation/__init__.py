@@ -3,7 +3,7 @@
 observations = observe(session_folder)          or observations_of(centres_px, camera_degC, ...)
 model = fit(observations)
 evaluation = evaluate(model, observations)
-write_report("report.html", observations, model, evaluation)
+report("report.html", observations, model, evaluation)
 """
 
 from foundation.lazy_names import lazy_names

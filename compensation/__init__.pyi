@@ -13,5 +13,7 @@ from compensation.drift.model_file import save_model as save_model
 from compensation.finding.found import finder as finder
 from compensation.observations import Observations as Observations
 from compensation.observations import observe as observe
-from compensation.report.report import write_report as write_report
+from compensation.reporting.report import write_report as write_report
 from experiments.steps import Role as Role
+
+report = write_report

@@ -32,7 +32,7 @@ def report_session(session: Path, folder: Path) -> list[str]:
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
     from compensation.drift.evaluation import table
-    from compensation.report.report import analyse
+    from compensation.reporting.report import analyse
 
     model, report = folder / MODEL_NAME, folder / REPORT_NAME
     try:

@@ -16,7 +16,7 @@ from compensation.calibration.positions import observe_positions
 from compensation.calibration.stages import TableSigma
 from compensation.commands.options import Incomplete, TargetOption, named_target, said_if
 from compensation.observations import session_target
-from compensation.report.calibration_report import report_page
+from compensation.reporting.calibration_report import report_page
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable, check_writable, write_whole
 from foundation.progress import progress

@@ -25,9 +25,9 @@ from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
 from compensation.finding.found import finder
 from compensation.observations import observe
-from compensation.report.extras import Extras
-from compensation.report.report import can_be_fitted, check_report_writable, write_report
-from compensation.report.table_positions import table_positions
+from compensation.reporting.extras import Extras
+from compensation.reporting.report import can_be_fitted, check_report_writable, write_report
+from compensation.reporting.table_positions import table_positions
 from compensation.validation3d.reading import load_validation
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable

@@ -22,7 +22,7 @@ from compensation.commands.options import (
 from compensation.drift.model_file import load_model
 from compensation.finding.found import finder
 from compensation.observations import Float, observe
-from compensation.report.validation_report import validation_page
+from compensation.reporting.validation_report import validation_page
 from compensation.validation3d.document import as_json
 from compensation.validation3d.positions import validation_frames
 from compensation.validation3d.stand_part import StandPart, stand_part

@@ -18,7 +18,7 @@ from compensation import cli
 from compensation.drift.evaluation import table
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
-from compensation.report.report import analyse
+from compensation.reporting.report import analyse
 from foundation.errors import SessionError
 from foundation.progress import progress
 from markers.table import COLUMNS

@@ -56,6 +56,7 @@ def test_a_name_of_thermostand_is_that_of_its_package():
     assert thermostand.session is recording.open_whole
     assert thermostand.detect is markers.detect
     assert thermostand.fit is compensation.fit
+    assert thermostand.report is compensation.report
     assert thermostand.__version__ == importlib.metadata.version("thermostand")
 
 

@@ -18,13 +18,13 @@ from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
 from compensation.observations import Observations
-from compensation.report.compensation_section import uncertainty_section
-from compensation.report.extras import Extras
-from compensation.report.gather import numbers_of
-from compensation.report.numbers import Numbers, as_json
-from compensation.report.page import page as page_of
-from compensation.report.report import can_be_fitted, check_report_writable, report_page, write_report
-from compensation.report.result_section import result_section
+from compensation.reporting.compensation_section import uncertainty_section
+from compensation.reporting.extras import Extras
+from compensation.reporting.gather import numbers_of
+from compensation.reporting.numbers import Numbers, as_json
+from compensation.reporting.page import page as page_of
+from compensation.reporting.report import can_be_fitted, check_report_writable, report_page, write_report
+from compensation.reporting.result_section import result_section
 from foundation.errors import SessionError
 
 from .synthetic import facts, observations, places_px, quadratic

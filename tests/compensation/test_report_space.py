@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.report.extras import Extras
-from compensation.report.gather import numbers_of
-from compensation.report.page import page as page_of
-from compensation.report.report import report_page
-from compensation.report.space_section import space_section
-from compensation.report.table_positions import TablePositions, table_positions
+from compensation.reporting.extras import Extras
+from compensation.reporting.gather import numbers_of
+from compensation.reporting.page import page as page_of
+from compensation.reporting.report import report_page
+from compensation.reporting.space_section import space_section
+from compensation.reporting.table_positions import TablePositions, table_positions
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.document import as_json
 from compensation.validation3d.reading import load_validation

@@ -9,10 +9,10 @@ import pytest
 
 from compensation.history.history import History
 from compensation.observations import OTHER, Observations, concatenate
-from compensation.report import drift_figures
-from compensation.report.figures import as_svg
-from compensation.report.path_figures import Paths, trajectories
-from compensation.report.tracks import cycle, moved_px, thinned, visits, warm_ups
+from compensation.reporting import drift_figures
+from compensation.reporting.figures import as_svg
+from compensation.reporting.path_figures import Paths, trajectories
+from compensation.reporting.tracks import cycle, moved_px, thinned, visits, warm_ups
 from experiments.steps import Role
 
 from .synthetic import Float, facts, observations, places_px, quadratic

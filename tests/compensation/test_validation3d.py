@@ -19,7 +19,7 @@ from compensation.drift.drift_model import Outside
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
 from compensation.observations import Float
-from compensation.report.validation_report import validation_page
+from compensation.reporting.validation_report import validation_page
 from compensation.validation3d.deviations import Camera, Deviations, deviations
 from compensation.validation3d.document import as_json
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm

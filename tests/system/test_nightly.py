@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from compensation.drift.evaluation import Evaluation
-from compensation.report.report import analyse
+from compensation.reporting.report import analyse
 from foundation.progress import progress
 from stand.config.stand_config import packaged
 from stand.running.order import Order

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from compensation.budget.budget import Budget
-from compensation.report.table_positions import TablePositions
+from compensation.reporting.table_positions import TablePositions
 from compensation.validation3d.validation import Validation
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from compensation.calibration.calibrate import Calibration
 from compensation.calibration.camera_file import CameraFile
-from compensation.report import calibration_figures as figures
-from compensation.report.figures import as_svg
-from compensation.report.page import Drawing, Facts, Heading, Paragraph, Table, page
+from compensation.reporting import calibration_figures as figures
+from compensation.reporting.figures import as_svg
+from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Table, page
 
 _FIGURES = (
     (

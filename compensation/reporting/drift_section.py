@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from compensation.observations import Observations
-from compensation.report import drift_figures as figures
-from compensation.report.figures import as_svg
-from compensation.report.numbers import HysteresisNumbers, Numbers
-from compensation.report.page import Drawing, Heading, Paragraph, Part, Table
-from compensation.report.path_figures import EXAGGERATION, Paths, trajectories
-from compensation.report.result_section import ours
-from compensation.report.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
+from compensation.reporting import drift_figures as figures
+from compensation.reporting.figures import as_svg
+from compensation.reporting.numbers import HysteresisNumbers, Numbers
+from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
+from compensation.reporting.path_figures import EXAGGERATION, Paths, trajectories
+from compensation.reporting.result_section import ours
+from compensation.reporting.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
 from experiments.steps import Role
 
 _ROLLED_DEG = 1.0

@@ -1,6 +1,6 @@
 """Every number of the report, as report.json has them: the page is written from these, so that both say the same.
 
-Pairs are along I and J. What is not known is NaN here and null there. compensation/report/gather.py fills them.
+Pairs are along I and J. What is not known is NaN here and null there. compensation/reporting/gather.py fills them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from compensation.drift.candidates import Candidate
 from compensation.drift.evaluation import TemperatureRms
 from compensation.drift.hysteresis import Gap
 from compensation.observations import Float
-from compensation.report.table_positions import TablePositions
+from compensation.reporting.table_positions import TablePositions
 
 FORMAT = "thermostand report 1"
 Pair = tuple[float, float]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from compensation.report.numbers import Numbers, SessionNumbers, UnusableFrames
-from compensation.report.page import Facts, Heading, Paragraph, Part, Table
+from compensation.reporting.numbers import Numbers, SessionNumbers, UnusableFrames
+from compensation.reporting.page import Facts, Heading, Paragraph, Part, Table
 
 _LISTED_REASONS, _LISTED_FRAMES = 30, 8
 

@@ -10,9 +10,9 @@ import numpy as np
 from compensation.drift.drift_model import Outside
 from compensation.drift.evaluation import improvement_percent
 from compensation.observations import Float
-from compensation.report import validation_figures as figures
-from compensation.report.figures import as_svg
-from compensation.report.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
+from compensation.reporting import validation_figures as figures
+from compensation.reporting.figures import as_svg
+from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
 from compensation.validation3d.summary import flagged, reason_names
 from compensation.validation3d.validation import Validation

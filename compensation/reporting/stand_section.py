@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator
 
 from compensation.budget.budget import Budget, Contribution
-from compensation.report.numbers import Numbers
-from compensation.report.page import Heading, Paragraph, Part, Table
+from compensation.reporting.numbers import Numbers
+from compensation.reporting.page import Heading, Paragraph, Part, Table
 
 
 def stand_section(numbers: Numbers) -> Iterator[Part]:

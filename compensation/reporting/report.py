@@ -1,6 +1,6 @@
 """The report of a compensation: one HTML file that needs nothing else, its numbers beside it, and the whole way there.
 
-report.json has every number of report.html under the names of compensation/report/numbers.py.
+report.json has every number of report.html under the names of compensation/reporting/numbers.py.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.model_file import save_model
 from compensation.observations import Observations, Progress, observe
-from compensation.report.compensation_section import compensation_section, model_section, uncertainty_section
-from compensation.report.data_section import data_section, utc
-from compensation.report.drift_section import drift_section
-from compensation.report.extras import Extras
-from compensation.report.gather import numbers_of
-from compensation.report.numbers import Numbers, as_json
-from compensation.report.page import Heading, Paragraph, Part, page
-from compensation.report.result_section import result_section
-from compensation.report.space_section import space_section
-from compensation.report.stand_section import stand_section
-from compensation.report.table_positions import table_positions
+from compensation.reporting.compensation_section import compensation_section, model_section, uncertainty_section
+from compensation.reporting.data_section import data_section, utc
+from compensation.reporting.drift_section import drift_section
+from compensation.reporting.extras import Extras
+from compensation.reporting.gather import numbers_of
+from compensation.reporting.numbers import Numbers, as_json
+from compensation.reporting.page import Heading, Paragraph, Part, page
+from compensation.reporting.result_section import result_section
+from compensation.reporting.space_section import space_section
+from compensation.reporting.stand_section import stand_section
+from compensation.reporting.table_positions import table_positions
 from experiments.steps import Role
 from foundation.errors import SessionError
 from foundation.files import check_writable, write_whole

@@ -14,8 +14,8 @@ from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from compensation.observations import Float, Observations
-from compensation.report.figures import FULL_WIDTH_IN, new_figure, style
-from compensation.report.tracks import thinned
+from compensation.reporting.figures import FULL_WIDTH_IN, new_figure, style
+from compensation.reporting.tracks import thinned
 
 EXAGGERATION = 100
 _PATH_POINTS = 600

@@ -17,8 +17,8 @@ from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evalu
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.training import frame_states
 from compensation.observations import OTHER, Float, Mask, Observations
-from compensation.report.extras import Extras
-from compensation.report.numbers import (
+from compensation.reporting.extras import Extras
+from compensation.reporting.numbers import (
     FORMAT,
     HysteresisNumbers,
     ModelNumbers,
@@ -29,7 +29,7 @@ from compensation.report.numbers import (
     UnusableFrames,
     WarmUpNumbers,
 )
-from compensation.report.tracks import WarmUp, warm_ups
+from compensation.reporting.tracks import WarmUp, warm_ups
 from compensation.validation3d.document import as_json as validation_json
 from experiments.steps import Role
 from markers.detection import Flag

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from compensation.drift.candidates import Candidate
 from compensation.drift.evaluation import Evaluation
 from compensation.observations import Observations
-from compensation.report import fit_figures as figures
-from compensation.report.figures import as_svg
-from compensation.report.numbers import ModelNumbers, Numbers, ScoreNumbers
-from compensation.report.page import Drawing, Facts, Heading, Paragraph, Part, Table
-from compensation.report.path_figures import EXAGGERATION
+from compensation.reporting import fit_figures as figures
+from compensation.reporting.figures import as_svg
+from compensation.reporting.numbers import ModelNumbers, Numbers, ScoreNumbers
+from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table
+from compensation.reporting.path_figures import EXAGGERATION
 
 _FORMS = {
     "paper": "displacement to the reference = P(I, J, T), one polynomial per coordinate; T is the camera's temperature",

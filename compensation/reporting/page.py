@@ -62,7 +62,7 @@ def page(title: str, parts: Sequence[Part]) -> str:
 
 @cache
 def _template() -> Template:
-    loader = PackageLoader("compensation", "report")
+    loader = PackageLoader("compensation", "reporting")
     made = Environment(
         loader=loader,
         autoescape=True,

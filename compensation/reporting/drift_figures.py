@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from compensation.drift.hysteresis import Gap
 from compensation.observations import Float, Observations
-from compensation.report.figures import (
+from compensation.reporting.figures import (
     CAMERA_COLOUR,
     COORDINATES,
     FULL_WIDTH_IN,
@@ -21,7 +21,7 @@ from compensation.report.figures import (
     new_figure,
     style,
 )
-from compensation.report.tracks import Rows, Visit, WarmUp, mean_over_markers, moved_px, thinned
+from compensation.reporting.tracks import Rows, Visit, WarmUp, mean_over_markers, moved_px, thinned
 from experiments.steps import Role
 
 CURVE_POINTS = 400

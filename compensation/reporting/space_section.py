@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from compensation.report.figures import as_svg
-from compensation.report.page import Drawing, Heading, Paragraph, Part
-from compensation.report.table_positions import TablePositions, positions_figure
-from compensation.report.validation_report import validation_parts
+from compensation.reporting.figures import as_svg
+from compensation.reporting.page import Drawing, Heading, Paragraph, Part
+from compensation.reporting.table_positions import TablePositions, positions_figure
+from compensation.reporting.validation_report import validation_parts
 from compensation.validation3d.validation import Validation
 from markers.target import Target
 

@@ -9,9 +9,9 @@ from matplotlib.ticker import StrMethodFormatter
 
 from compensation.drift.evaluation import Evaluation, improvement_percent
 from compensation.observations import Float, Observations
-from compensation.report.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
-from compensation.report.path_figures import Paths, trajectories
-from compensation.report.tracks import thinned
+from compensation.reporting.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
+from compensation.reporting.path_figures import Paths, trajectories
+from compensation.reporting.tracks import thinned
 
 _SIGMA_95 = 1.959964
 _MOST_DOTS = 20_000

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from compensation.drift.evaluation import improvement_percent
-from compensation.report.numbers import Numbers, Pair, ScoreNumbers
-from compensation.report.page import Heading, Paragraph, Part, Table
-from compensation.report.validation_report import gains_table
+from compensation.reporting.numbers import Numbers, Pair, ScoreNumbers
+from compensation.reporting.page import Heading, Paragraph, Part, Table
+from compensation.reporting.validation_report import gains_table
 from compensation.validation3d.validation import Validation
 
 PAPER = (
