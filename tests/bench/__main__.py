@@ -26,6 +26,7 @@ from tests.bench import (
     reading,
     recorder,
     simulator,
+    start,
     virtual_time,
     warp,
     ximc,
@@ -51,6 +52,7 @@ BENCHMARKS = {
     "pipeline": pipeline.figures,
     "identification": identification.figures,
     "simulator": simulator.figures,
+    "start": start.figures,
 }
 
 

@@ -1,0 +1,35 @@
+"""How long a command or an import takes to begin, against the libraries that reading a session cannot do without."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.bench.figures import Figure, Measurement, in_turns, milliseconds, ratio_at_most, side_by_side
+
+ROUNDS = 5
+PEER = ("-c", "import numpy, google.protobuf, mcap")
+OURS = {
+    "stand --help": ("-m", "stand.cli", "--help"),
+    "compensate --help": ("-m", "compensation.cli", "--help"),
+    "import recording": ("-c", "import recording"),
+    "import thermostand": ("-c", "import thermostand"),
+}
+MOST = 2.0  # 0.3 s where the peer takes 0.15 s
+
+
+def started(words: Sequence[str]) -> Measurement:
+    """A process of its own, from its start to its end, ms."""
+    command = [sys.executable, *words]
+    return lambda: milliseconds(lambda: subprocess.run(command, stdout=subprocess.DEVNULL, check=True))
+
+
+def figures(folder: Path) -> list[Figure]:
+    """Each beside the import of numpy, protobuf and mcap."""
+    found: list[Figure] = []
+    for what, words in OURS.items():
+        ours, others = in_turns(started(words), started(PEER), ROUNDS)
+        found.append(ratio_at_most(MOST, side_by_side(what, "ms", "import numpy, google.protobuf, mcap", ours, others)))
+    return found
