@@ -22,7 +22,6 @@ from foundation.clock import Clock, VirtualClock
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from stand.chamber.chamber import ChamberLimits
-from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import StandConfig, packaged
 from stand.fault import Fault
@@ -32,7 +31,6 @@ from stand.guarding.interlocks import Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
 from stand.guarding.rules import CAMERA, VITAL, Announcements, camera_measured, camera_stale, recorded, watches
 from stand.imaging.camera_supply import SupplyLimits
-from stand.imaging.equilibrium import EquilibriumLimits
 from stand.poller import Poller
 from stand.stand import Devices, Stand
 
@@ -126,14 +124,12 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         flap=_flap(config, clock),
         camera=Camera("camera", config.camera, clock),
     )
-    compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
     state_file = config.compressor.state_file
     if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces
         state_file = config.recording.directory / "compressor.json"
-    permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, compressor)
-    equilibrium = EquilibriumLimits(**config.camera.equilibrium.model_dump())
+    permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, config.compressor)
     chamber = ChamberLimits(config.limits.chamber_degC, permits, config.guard.heater_renew_s, state_file)
-    supply = SupplyLimits(config.camera.boot_s, config.guard.heater_hold_s, equilibrium)
+    supply = SupplyLimits(config.camera.boot_s, config.guard.heater_hold_s, config.camera.equilibrium)
     return Assembly(config, hub, clock, bus, devices, Stand(devices, chamber, supply, hub, clock), notifier)
 
 

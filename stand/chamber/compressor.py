@@ -24,22 +24,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from foundation.clock import Boot, seconds_ns
 from foundation.sink import sync_folder
+from stand.config.stand_config import CompressorConfig
 
 # Calls of `keep`, and of which of them the file at a path is.
 _calls = itertools.count(1)
 _placed: dict[Path, int] = {}
 _placing = threading.Lock()
-
-
-@dataclass(frozen=True, slots=True)
-class CompressorLimits:
-    """Minimum off and on times (s), starts per hour, and the regulator outputs (%) that start and stop it."""
-
-    min_off_s: float
-    min_on_s: float
-    max_starts_per_h: int
-    start_above_cool_percent: float
-    stop_above_heat_percent: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +42,7 @@ class CompressorState:
 
 
 def decide(
-    state: CompressorState, limits: CompressorLimits, mv_heat: float, mv_cool: float, now_ns: int
+    state: CompressorState, limits: CompressorConfig, mv_heat: float, mv_cool: float, now_ns: int
 ) -> CompressorState:
     """The compressor's state from now on; outputs in %, NaN (an unknown output) never starts it."""
     hour_ago_ns = now_ns - seconds_ns(3600)

@@ -18,7 +18,8 @@ from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault
 from foundation.hub import Hub
 from foundation.items import Event
-from stand.chamber.compressor import CompressorLimits, CompressorState, decide
+from stand.chamber.compressor import CompressorState, decide
+from stand.config.stand_config import CompressorConfig
 
 HEATER, COMPRESSOR = "heater_enable", "compressor"
 _EARLY_S = 1.0  # a relay that is off so shortly before its time may just have dropped by itself
@@ -33,7 +34,7 @@ class PermitLimits:
 
     hold_s: float
     self_test_s: float
-    compressor: CompressorLimits
+    compressor: CompressorConfig
 
 
 class Permission(StrEnum):

@@ -13,22 +13,12 @@ from dataclasses import dataclass, replace
 from statistics import fmean, median
 
 from foundation.clock import NS_PER_S, seconds_ns
+from stand.config.looks import CameraFeelsConfig, GraniteFeelsConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
 _GAP_S = 60.0  # between two readings; after a longer one the window begins anew
-
-
-@dataclass(frozen=True, slots=True)
-class FeltLimits:
-    """lag_s: of the body. window_s: of rate and means. limit_K, share: how far the air that is felt may be above the
-    one that is shown, in K and as a share of what lies between the latter and the body."""
-
-    lag_s: float
-    window_s: float
-    limit_K: float
-    share: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +40,7 @@ class Felt:
     body_degC: float
     probe_risen_K: float
 
-    def excess_K(self, limits: FeltLimits) -> float:
+    def excess_K(self, limits: GraniteFeelsConfig | CameraFeelsConfig) -> float:
         """How far the air that is felt is above all that is allowed; below 0 all is well. A probe that rises fast has a
         lag of its own, and is neither stuck nor outside."""
         apart_K = abs(self.probe_degC - self.body_degC)
@@ -58,9 +48,10 @@ class Felt:
         return self.air_degC - self.probe_degC - allowed_K
 
 
-def felt(looks: Sequence[Look], limits: FeltLimits) -> Felt | None:
-    """What a window tells; None before it is full. One wild value of the body changes nothing: medians of three."""
-    if len(looks) < 5 or looks[-1].time_ns - looks[0].time_ns < 0.9 * seconds_ns(limits.window_s):
+def felt(looks: Sequence[Look], window_s: float, lag_s: float) -> Felt | None:
+    """What a window tells of the air around a body of that lag; None before it is full. One wild value of the body
+    changes nothing: medians of three."""
+    if len(looks) < 5 or looks[-1].time_ns - looks[0].time_ns < 0.9 * seconds_ns(window_s):
         return None
     bodies_degC = [median(look.body_degC for look in looks[at - 1 : at + 2]) for at in range(1, len(looks) - 1)]
     times_s = [(look.time_ns - looks[0].time_ns) / NS_PER_S for look in looks[1:-1]]
@@ -68,7 +59,7 @@ def felt(looks: Sequence[Look], limits: FeltLimits) -> Felt | None:
     product = sum((at - middle_s) * (each - body_degC) for at, each in zip(times_s, bodies_degC, strict=True))
     rate_K_s = product / sum((at - middle_s) ** 2 for at in times_s)
     probe_degC, risen_K = fmean(look.probe_degC for look in looks), looks[-1].probe_degC - looks[0].probe_degC
-    return Felt(body_degC + limits.lag_s * rate_K_s, probe_degC, body_degC, risen_K)
+    return Felt(body_degC + lag_s * rate_K_s, probe_degC, body_degC, risen_K)
 
 
 def looked(looks: tuple[Look, ...], readings: Readings, body: str, probe: str, window_s: float) -> tuple[Look, ...]:
@@ -83,15 +74,6 @@ def looked(looks: tuple[Look, ...], readings: Readings, body: str, probe: str, w
     oldest_ns = reading.time_ns - seconds_ns(window_s)
     kept = tuple(look for look in looks if look.time_ns >= oldest_ns)
     return (*kept, Look(reading.time_ns, reading.value, probe_degC))
-
-
-@dataclass(frozen=True, slots=True)
-class GraniteLimits:
-    """felt: as for every body. change_K: the same, but against what was felt lately, over change_s."""
-
-    felt: FeltLimits
-    change_K: float
-    change_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,26 +94,26 @@ class GraniteSeen:
         lately_K = self.lately_K + share * (above_K - self.lately_K)
         return GraniteSeen(looks, lately_K, self.lately_apart_K + share * (apart_K - self.lately_apart_K))
 
-    def change_K(self, found: Felt, limits: GraniteLimits) -> float:
+    def change_K(self, found: Felt, limits: GraniteFeelsConfig) -> float:
         """How far the air that is felt has gone from the probe lately, beyond what is allowed. The error of the lag has
         been there before, and so does not count."""
         if self.lately_K is None:
             return -math.inf
         apart_K = abs(found.probe_degC - found.body_degC - self.lately_apart_K)
-        allowed_K = limits.change_K + limits.felt.share * apart_K + max(0.0, found.probe_risen_K)
+        allowed_K = limits.change_K + limits.share * apart_K + max(0.0, found.probe_risen_K)
         return found.air_degC - found.probe_degC - self.lately_K - allowed_K
 
 
-def granite_feels(limits: GraniteLimits, granite: str, probe: str) -> Rule:
+def granite_feels(limits: GraniteFeelsConfig, lag_s: float, granite: str, probe: str) -> Rule:
     """The granite warms as in air that is warmer than `probe` shows, which is stuck, drifts, or hangs outside."""
 
     def step(last: GraniteSeen | None, readings: Readings, now_ns: int) -> tuple[GraniteSeen | None, Fault | None]:
         last = last or GraniteSeen()
-        looks = looked(last.looks, readings, granite, probe, limits.felt.window_s)
-        found = felt(looks, limits.felt)
+        looks = looked(last.looks, readings, granite, probe, limits.window_s)
+        found = felt(looks, limits.window_s, lag_s)
         if found is None:
             return replace(last, looks=looks), None
-        if found.excess_K(limits.felt) > 0 or last.change_K(found, limits) > 0:
+        if found.excess_K(limits) > 0 or last.change_K(found, limits) > 0:
             return replace(last, looks=looks), _objection(found, granite, probe)
         return last.then(looks, found, limits.change_s), None
 
@@ -141,17 +123,6 @@ def granite_feels(limits: GraniteLimits, granite: str, probe: str) -> Rule:
 def _objection(found: Felt, body: str, probe: str) -> Fault:
     text = f"{body} warms as in air of {found.air_degC:.1f} degC, but {probe} shows {found.probe_degC:.1f} degC"
     return Fault("air_warmer_than_shown", text)
-
-
-@dataclass(frozen=True, slots=True)
-class CameraLimits:
-    """felt: as for every body. settle_s: how long the camera has to be on before its excess over the air is learned.
-    still_s, air_moves_K: a temperature that stays exactly the same for so long while the air goes so far is doubted."""
-
-    felt: FeltLimits
-    settle_s: float
-    still_s: float
-    air_moves_K: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,23 +137,23 @@ class CameraSeen:
     excesses_K: tuple[float, ...] = ()
     excess_K: float | None = None
 
-    def is_doubted(self, limits: CameraLimits, air_degC: float) -> bool:
+    def is_doubted(self, limits: CameraFeelsConfig, air_degC: float) -> bool:
         """Whether the camera did not notice what the air did."""
         still_ns = self.looks[-1].time_ns - self.changed_ns if self.looks else 0
         moved_K = abs(air_degC - self.changed_air_degC)
-        return still_ns >= seconds_ns(limits.still_s) and moved_K >= limits.air_moves_K
+        return still_ns >= seconds_ns(limits.window_s) and moved_K >= limits.still_air_K
 
 
 _EXCESSES = 100  # looks from which the camera's excess is learned
 
 
-def camera_feels(limits: CameraLimits, camera: str, air: str) -> Rule:
+def camera_feels(limits: CameraFeelsConfig, lag_s: float, camera: str, air: str) -> Rule:
     """The camera, which heats itself by what was learned when it had been on for a while, warms as in air that is
     warmer than `air` shows. Blind while it is off and warms up, and while it does not move though the air does."""
 
     def step(last: CameraSeen | None, readings: Readings, now_ns: int) -> tuple[CameraSeen | None, Fault | None]:
         air_degC = value_of(readings, air)
-        looks = looked(last.looks if last else (), readings, camera, air, limits.felt.window_s)
+        looks = looked(last.looks if last else (), readings, camera, air, limits.window_s)
         if not looks:
             return None, None
         if last is None or len(looks) == 1:  # also after it was off
@@ -190,13 +161,13 @@ def camera_feels(limits: CameraLimits, camera: str, air: str) -> Rule:
         seen = _seen(last, looks)
         if seen.is_doubted(limits, air_degC):
             return seen, None
-        found = felt(looks, limits.felt)
+        found = felt(looks, limits.window_s, lag_s)
         if found is None or looks[-1].time_ns - seen.on_since_ns < seconds_ns(limits.settle_s):
             return seen, None
         if seen.excess_K is None:
             return (seen if seen is last else _learned(seen, found)), None
         own = replace(found, air_degC=found.air_degC - seen.excess_K, body_degC=found.body_degC - seen.excess_K)
-        return seen, _objection(own, camera, air) if own.excess_K(limits.felt) > 0 else None
+        return seen, _objection(own, camera, air) if own.excess_K(limits) > 0 else None
 
     return remembering(step)
 

@@ -6,21 +6,13 @@ import math
 from dataclasses import dataclass, replace
 
 from foundation.clock import seconds_ns
+from stand.config.looks import FirstHeatConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
 _LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds
-
-
-@dataclass(frozen=True, slots=True)
-class FirstHeatLimits:
-    """within_s: after so long with an output of output_percent on average, both must have risen by rise_K."""
-
-    within_s: float
-    output_percent: float
-    rise_K: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +28,7 @@ class Begin:
     is_passed: bool = False
 
 
-def first_heat(limits: FirstHeatLimits, air: str, regulator: str, permit: str) -> Rule:
+def first_heat(limits: FirstHeatConfig, air: str, regulator: str, permit: str) -> Rule:
     """The regulator heats for the first time, and its value or the chamber's air does not rise: two identical
     regulators with exchanged addresses pass every other probe."""
     pv = f"{regulator}.pv"

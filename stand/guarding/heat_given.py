@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from foundation.clock import NS_PER_S, seconds_ns
+from stand.config.looks import ChamberConfig, HeatFeltConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
@@ -53,20 +54,6 @@ def too_much_heat(max_Wh_per_h: float, heater_W: float, regulator: str, permit: 
 
 
 @dataclass(frozen=True, slots=True)
-class HeatFeltLimits:
-    """output_percent: from here on the regulator heats. fall_K: what a probe may fall meanwhile. rise_share: what it
-    must rise in each window_s, once heat was given for settle_s, of what the heat makes of heat_capacity_Wh_K."""
-
-    output_percent: float
-    fall_K: float
-    rise_share: float
-    window_s: float
-    settle_s: float
-    heater_W: float
-    heat_capacity_Wh_K: float
-
-
-@dataclass(frozen=True, slots=True)
 class Moment:
     """One look at heat and probe."""
 
@@ -84,7 +71,7 @@ class Stretch:
     highest_degC: float = -math.inf
 
 
-def heat_not_felt(limits: HeatFeltLimits, probe: str, regulator: str, permit: str) -> Rule:
+def heat_not_felt(limits: HeatFeltConfig, chamber: ChamberConfig, probe: str, regulator: str, permit: str) -> Rule:
     """The regulator heats hard, and yet `probe` falls, or does not rise as that heat makes it: it hangs outside, or is
     stuck. Near the set-point, where the heat only keeps what is there, a rise is not asked for."""
     kept_ns = seconds_ns(max(limits.window_s, _BEFORE_S))
@@ -101,12 +88,14 @@ def heat_not_felt(limits: HeatFeltLimits, probe: str, regulator: str, permit: st
         stretch = _stretch(last, moments, limits)
         if stretch.since_ns is None:
             return stretch, None
-        return stretch, _fallen(stretch, limits, probe) or _not_risen(stretch, limits, probe, readings, regulator)
+        return stretch, _fallen(stretch, limits, probe) or _not_risen(
+            stretch, limits, chamber, probe, readings, regulator
+        )
 
     return remembering(step)
 
 
-def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatFeltLimits) -> Stretch:
+def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatFeltConfig) -> Stretch:
     now = moments[-1]
     if now.percent < limits.output_percent:
         return Stretch(moments)
@@ -116,7 +105,7 @@ def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatFelt
     return Stretch(moments, last.since_ns, max(last.highest_degC, now.probe_degC))
 
 
-def _fallen(stretch: Stretch, limits: HeatFeltLimits, probe: str) -> Fault | None:
+def _fallen(stretch: Stretch, limits: HeatFeltConfig, probe: str) -> Fault | None:
     now = stretch.moments[-1]
     if stretch.highest_degC - now.probe_degC < limits.fall_K:
         return None
@@ -125,7 +114,7 @@ def _fallen(stretch: Stretch, limits: HeatFeltLimits, probe: str) -> Fault | Non
 
 
 def _not_risen(
-    stretch: Stretch, limits: HeatFeltLimits, probe: str, readings: Readings, regulator: str
+    stretch: Stretch, limits: HeatFeltConfig, chamber: ChamberConfig, probe: str, readings: Readings, regulator: str
 ) -> Fault | None:
     first, now = stretch.moments[0], stretch.moments[-1]
     lasted_s = (now.time_ns - first.time_ns) / NS_PER_S
@@ -136,8 +125,8 @@ def _not_risen(
     if not lacking_K > 1.0:
         return None
     percent = sum(each.percent for each in stretch.moments) / len(stretch.moments)
-    given_Wh = percent / 100 * limits.heater_W * lasted_s / 3600
-    needed_K = limits.rise_share * given_Wh / limits.heat_capacity_Wh_K
+    given_Wh = percent / 100 * chamber.heater_W * lasted_s / 3600
+    needed_K = limits.rise_share * given_Wh / chamber.heat_capacity_Wh_K
     risen_K = now.probe_degC - first.probe_degC
     if risen_K >= needed_K:
         return None

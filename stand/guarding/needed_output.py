@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from foundation.clock import seconds_ns
+from stand.config.looks import NeededOutputConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
 from stand.guarding.interlocks import Rule
@@ -14,18 +15,6 @@ from stand.guarding.plausibility import remembering
 
 _FLAP_OPEN_ABOVE = 0.05
 _LEARNING = 0.25  # share of a new mean; the first is taken whole
-
-
-@dataclass(frozen=True, slots=True)
-class NeededLimits:
-    """settle_s: at rest for so long before it is looked at. mean_s: of a mean. limit_percent: how far it may be from
-    what was learned at a set-point up to near_K away. band_K: at rest is a value that near to the set-point."""
-
-    settle_s: float
-    mean_s: float
-    limit_percent: float
-    band_K: float
-    near_K: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +47,7 @@ def nearest(learned: Mapping[Rest, float], rest: Rest, near_K: float) -> float |
     return min(found)[1] if found else None
 
 
-def output_not_as_needed(limits: NeededLimits, regulator: str, permit: str, compressor: str, flap: str) -> Rule:
+def output_not_as_needed(limits: NeededOutputConfig, regulator: str, permit: str, compressor: str, flap: str) -> Rule:
     """The chamber needs far more, or far less, than it did at about this set-point: a probe that shows too little, or
     holds still, makes the regulator heat on."""
 
@@ -91,7 +80,7 @@ def output_not_as_needed(limits: NeededLimits, regulator: str, permit: str, comp
     return remembering(step)
 
 
-def _judged(needs: Needs, rest: Rest, limits: NeededLimits, regulator: str) -> tuple[Needs, Fault | None]:
+def _judged(needs: Needs, rest: Rest, limits: NeededOutputConfig, regulator: str) -> tuple[Needs, Fault | None]:
     mean_percent = needs.sum_percent / needs.count
     needed_percent = nearest(needs.learned, rest, limits.near_K)
     state = replace(needs, sum_percent=0.0, count=0)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from foundation.clock import NS_PER_S, seconds_ns
+from stand.config.guard import CoolingConfig, HeaterOffConfig, HeatingConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 
@@ -30,20 +31,6 @@ def remembering(step: Callable[[Memory | None, Readings, int], tuple[Memory | No
 
 
 @dataclass(frozen=True, slots=True)
-class HeatingLimits:
-    """output_percent: from here on the regulator counts as heating. hysteresis_K: this far below the set-point all is
-    well. gain_K, window_s: while the temperature approaches, it must rise this much in each such time.
-    max_error_K_s: sum over time of what it lacks, that is allowed when it does not approach.
-    """
-
-    output_percent: float
-    hysteresis_K: float
-    gain_K: float
-    window_s: float
-    max_error_K_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class Heating:
     """Where the check of one stretch of heating stands."""
 
@@ -57,7 +44,7 @@ class Heating:
 
 
 def heating(
-    last: Heating | None, limits: HeatingLimits, set_point_degC: float, pv_degC: float, now_ns: int
+    last: Heating | None, limits: HeatingConfig, set_point_degC: float, pv_degC: float, now_ns: int
 ) -> Heating | None:
     """The check after one more look at a heater that is on; None near the set-point, where all is well.
 
@@ -82,7 +69,7 @@ def heating(
     )
 
 
-def heater_not_warming(limits: HeatingLimits, regulator: str, permit: str) -> Rule:
+def heater_not_warming(limits: HeatingConfig, regulator: str, permit: str) -> Rule:
     """`regulator` heats, the relay `permit` lets the heat through, and the temperature does not rise: a dead heater, an
     open thermal cut-out, a detached sensor.
 
@@ -105,16 +92,6 @@ def heater_not_warming(limits: HeatingLimits, regulator: str, permit: str) -> Ru
 
 
 @dataclass(frozen=True, slots=True)
-class OffLimits:
-    """settle_s: how long a heater that was switched off still gives heat. rise_K: what the air may rise after that.
-    above_surroundings_K: how far it may end above everything that could warm it."""
-
-    settle_s: float
-    rise_K: float
-    above_surroundings_K: float
-
-
-@dataclass(frozen=True, slots=True)
 class Off:
     """Heat is off since `since_ns`; the lowest air since it settled, None until then."""
 
@@ -122,7 +99,9 @@ class Off:
     lowest_degC: float | None = None
 
 
-def warming_while_off(limits: OffLimits, air: str, regulator: str, permit: str, surroundings: tuple[str, ...]) -> Rule:
+def warming_while_off(
+    limits: HeaterOffConfig, air: str, regulator: str, permit: str, surroundings: tuple[str, ...]
+) -> Rule:
     """The air rises though the regulator's output is 0 or the permit is off: a welded relay or a shorted SSR.
 
     The heater's power cannot be seen. What else can warm the air, the laboratory and what was warm before, cannot bring
@@ -156,16 +135,6 @@ def warming_while_off(limits: OffLimits, air: str, regulator: str, permit: str, 
 
 
 @dataclass(frozen=True, slots=True)
-class VainLimits:
-    """In window_s of cooling without heat the air must fall by fall_K, unless the laboratory or the granite is warmer
-    than margin_K below it."""
-
-    window_s: float
-    fall_K: float
-    margin_K: float
-
-
-@dataclass(frozen=True, slots=True)
 class Cooling:
     """The compressor has run without heat since `since_ns`, when the air was at `air_degC`."""
 
@@ -174,7 +143,7 @@ class Cooling:
 
 
 def cooling_in_vain(
-    limits: VainLimits, air: str, regulator: str, compressor: str, surroundings: tuple[str, ...]
+    limits: CoolingConfig, air: str, regulator: str, compressor: str, surroundings: tuple[str, ...]
 ) -> Rule:
     """The compressor runs, the regulator's heating output is 0, and yet the air, which nothing around it warms, does
     not fall: a welded relay that heats as much as is cooled, or a compressor that does not cool. The two look alike.

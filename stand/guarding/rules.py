@@ -8,10 +8,10 @@ from experiments.steps import Capture
 from foundation.items import Event, Item, StepMark, StepState
 from stand.config.stand_config import StandConfig
 from stand.gate import OPERATOR
-from stand.guarding.felt_air import CameraLimits, FeltLimits, GraniteLimits, camera_feels, granite_feels
-from stand.guarding.first_heat import FirstHeatLimits, first_heat
+from stand.guarding.felt_air import camera_feels, granite_feels
+from stand.guarding.first_heat import first_heat
 from stand.guarding.frozen import frozen, stale_by_air
-from stand.guarding.heat_given import HeatFeltLimits, heat_not_felt, too_much_heat
+from stand.guarding.heat_given import heat_not_felt, too_much_heat
 from stand.guarding.interlocks import (
     Recording,
     Rule,
@@ -31,11 +31,8 @@ from stand.guarding.interlocks import (
     stopped_while_permitted,
     trustworthy,
 )
-from stand.guarding.needed_output import NeededLimits, output_not_as_needed
+from stand.guarding.needed_output import output_not_as_needed
 from stand.guarding.plausibility import (
-    HeatingLimits,
-    OffLimits,
-    VainLimits,
     cooling_in_vain,
     heater_not_warming,
     stuck,
@@ -106,12 +103,10 @@ def _heat(config: StandConfig) -> tuple[Watch, ...]:
     """Heat that does not come, comes unasked, or is held back. The first may be a detached sensor, the second is out
     of control; a relay that does not close or answer, or a compressor that does not cool, can be put right."""
     limits = config.guard
-    heating, heater_off = HeatingLimits(**limits.heating.model_dump()), OffLimits(**limits.heater_off.model_dump())
-    vain = VainLimits(**limits.cooling.model_dump())
     return (
-        Watch(heater_not_warming(heating, "regulator", PERMIT)),
-        Watch(warming_while_off(heater_off, AIR, "regulator", PERMIT, (LABORATORY, GRANITE))),
-        Watch(cooling_in_vain(vain, AIR, "regulator", COMPRESSOR, (LABORATORY, GRANITE)), action="hold"),
+        Watch(heater_not_warming(limits.heating, "regulator", PERMIT)),
+        Watch(warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, (LABORATORY, GRANITE))),
+        Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, (LABORATORY, GRANITE)), action="hold"),
         Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
         Watch(trustworthy(PERMIT, limits.keys_s), limits.keys_s, "hold"),
     )
@@ -136,24 +131,20 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
     for how warm it is nobody knows; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
     found before anything is warm. The camera's own temperature is not required: one that is stale is told."""
     limits, chamber = config.guard, config.chamber
-    felt = HeatFeltLimits(
-        **limits.heat_felt.model_dump(), heater_W=chamber.heater_W, heat_capacity_Wh_K=chamber.heat_capacity_Wh_K
-    )
-    needed, frost = NeededLimits(**limits.needed_output.model_dump()), limits.frozen
+    granite, camera, frost = limits.granite_feels, limits.camera_feels, limits.frozen
     module = tuple(f"thermometers.{name}" for name in config.thermometers.channels)
     return (
         Watch(too_much_heat(limits.heat_max_Wh_per_h, chamber.heater_W, "regulator", PERMIT)),
-        *(Watch(heat_not_felt(felt, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
-        *(Watch(granite_feels(_granite_limits(config), GRANITE, probe)) for probe in (PV, AIR)),
-        Watch(camera_feels(_camera_limits(config), CAMERA, AIR)),
-        Watch(camera_feels(_camera_limits(config), CAMERA, PV)),
-        Watch(output_not_as_needed(needed, "regulator", PERMIT, COMPRESSOR, FLAP)),
+        *(Watch(heat_not_felt(limits.heat_felt, chamber, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
+        *(Watch(granite_feels(granite, chamber.granite_lag_s, GRANITE, probe)) for probe in (PV, AIR)),
+        *(Watch(camera_feels(camera, chamber.camera_lag_s, CAMERA, probe)) for probe in (AIR, PV)),
+        Watch(output_not_as_needed(limits.needed_output, "regulator", PERMIT, COMPRESSOR, FLAP)),
         *(
             Watch(frozen(channel, module, frost.step_K, frost.after_s, "regulator"), action="hold")
             for channel in (AIR, GRANITE)
         ),
         Watch(camera_stale(config), action="warn"),
-        Watch(first_heat(FirstHeatLimits(**limits.first_heat.model_dump()), AIR, "regulator", PERMIT), action="hold"),
+        Watch(first_heat(limits.first_heat, AIR, "regulator", PERMIT), action="hold"),
     )
 
 
@@ -161,18 +152,6 @@ def camera_stale(config: StandConfig) -> Rule:
     """A frozen temperature of the camera: told, and recorded as STALE."""
     frost = config.guard.frozen
     return stale_by_air(CAMERA, AIR, frost.air_moves_K, frost.camera_after_s)
-
-
-def _granite_limits(config: StandConfig) -> GraniteLimits:
-    limits = config.guard.granite_feels
-    felt = FeltLimits(config.chamber.granite_lag_s, limits.window_s, limits.limit_K, limits.share)
-    return GraniteLimits(felt, limits.change_K, limits.change_s)
-
-
-def _camera_limits(config: StandConfig) -> CameraLimits:
-    limits = config.guard.camera_feels
-    felt = FeltLimits(config.chamber.camera_lag_s, limits.window_s, limits.limit_K, limits.share)
-    return CameraLimits(felt, limits.settle_s, limits.window_s, limits.still_air_K)
 
 
 def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:

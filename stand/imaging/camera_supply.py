@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from drivers.devices.camera import Camera
 from drivers.devices.relays import CAMERA_POWER, Relays
+from drivers.settings import EquilibriumSettings
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
 from foundation.hub import Hub
@@ -17,7 +18,7 @@ from foundation.tasks import cancelled
 from stand.gate import CAMERA_LOST, Gate
 from stand.imaging.camera_cooling import Cooling, cool_down, last_word
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
-from stand.imaging.equilibrium import CameraEquilibrium, EquilibriumLimits
+from stand.imaging.equilibrium import CameraEquilibrium
 from stand.interlock import Interlock
 
 _BOOT_LIMIT_S = 60.0
@@ -30,7 +31,7 @@ class SupplyLimits:
 
     boot_s: float
     hold_s: float
-    equilibrium: EquilibriumLimits = field(default_factory=EquilibriumLimits)
+    equilibrium: EquilibriumSettings = field(default_factory=EquilibriumSettings)
 
 
 class CameraSupply:

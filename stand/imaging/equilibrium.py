@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
+from drivers.settings import EquilibriumSettings
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
@@ -29,19 +29,10 @@ _UNKNOWN_S = 60.0  # without a reading; a longer gap leaves open what happened i
 _KEPT = 20_000  # readings: hours
 
 
-@dataclass(frozen=True, slots=True)
-class EquilibriumLimits:
-    """Reached below `rate_K_per_min` for `duration_s`, or after 5 x `time_constant_s` without a temperature."""
-
-    rate_K_per_min: float = 0.2
-    duration_s: float = 600.0
-    time_constant_s: float = 1500.0
-
-
 class CameraEquilibrium:
     """Of one camera; `is_lost` from `lose` until `regained` has returned, or `forget`."""
 
-    def __init__(self, limits: EquilibriumLimits, hub: Hub, clock: Clock) -> None:
+    def __init__(self, limits: EquilibriumSettings, hub: Hub, clock: Clock) -> None:
         self.is_lost = False
         self._limits = limits
         self._hub = hub

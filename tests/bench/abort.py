@@ -27,7 +27,6 @@ from foundation.hub import Hub
 from foundation.tasks import cancelled
 from stand.assembly import Assembly, assemble
 from stand.chamber.chamber import ChamberLimits
-from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import StandConfig, packaged
 from stand.guarding.guard import Guard
@@ -95,8 +94,7 @@ async def _trip_ms(assembly: Assembly, control: ControlSocket, trip: Trip, delay
     """One trip, `delay_s` after a stand never tripped before has begun to heat."""
     relays = assembly.devices.relays
     config = assembly.config
-    compressor = CompressorLimits(**config.compressor.model_dump(exclude={"state_file"}))
-    permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, compressor)
+    permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, config.compressor)
     chamber = ChamberLimits(config.limits.chamber_degC, permits, config.guard.heater_renew_s)
     supply = SupplyLimits(config.camera.boot_s, config.guard.heater_hold_s)
     stand = Stand(assembly.devices, chamber, supply, assembly.hub, assembly.clock)

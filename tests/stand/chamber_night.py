@@ -9,12 +9,12 @@ from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch
 from foundation.readings import Reading
-from stand.chamber.compressor import CompressorLimits, CompressorState, decide
+from stand.chamber.compressor import CompressorState, decide
 from stand.config.stand_config import CompressorConfig
 
 START_NS = 1_767_290_400 * NS_PER_S
 POLL_S = 5.0
-COMPRESSOR = CompressorLimits(**CompressorConfig().model_dump(exclude={"state_file"}))
+COMPRESSOR = CompressorConfig()
 OPEN_BEFORE_END_S = 60.0  # the flap, at the end of every dwell
 
 

@@ -16,7 +16,7 @@ from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch
 from foundation.readings import Reading, bad_reading
-from stand.chamber.compressor import CompressorLimits, CompressorState, decide
+from stand.chamber.compressor import CompressorState, decide
 from stand.config.stand_config import CompressorConfig
 
 START_NS = 1_767_290_400 * NS_PER_S
@@ -24,7 +24,7 @@ POLL_S, SLOW_POLL_S = 5.0, 10.0
 CHANNELS = {"granite_inside": 0, "granite_outside": 1, "artifact": 2, "air": 3, "laboratory": 4}
 AIR, GRANITE = CHANNELS["air"], CHANNELS["granite_inside"]
 CAMERA_STEP_K = 0.25
-COMPRESSOR = CompressorLimits(**CompressorConfig().model_dump(exclude={"state_file"}))
+COMPRESSOR = CompressorConfig()
 
 
 @dataclass

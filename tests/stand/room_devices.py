@@ -15,12 +15,12 @@ from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.readings import Frame, Quality, Reading
 from stand.chamber.chamber import ChamberLimits
-from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import COMPRESSOR, HEATER, PermitLimits
+from stand.config.stand_config import CompressorConfig
 from stand.imaging.camera_supply import SupplyLimits
 from stand.stand import Devices, Stand
 
-COMPRESSOR_LIMITS = CompressorLimits(300, 180, 6, 20, 60)
+COMPRESSOR_LIMITS = CompressorConfig(start_above_cool_percent=20)
 
 
 @dataclass

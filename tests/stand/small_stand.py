@@ -5,6 +5,7 @@ import asyncio
 from contextlib import ExitStack
 from pathlib import Path
 
+from drivers.settings import EquilibriumSettings
 from experiments.steps import Capture
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.errors import StandTripped, Unreachable
@@ -13,7 +14,7 @@ from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading
 from markers.target import Target
 from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
-from stand.imaging.equilibrium import LOST, CameraEquilibrium, EquilibriumLimits
+from stand.imaging.equilibrium import LOST, CameraEquilibrium
 from stand.interlock import Interlocked
 from stand.running.camera_gap import OffsetWatch
 from stand.running.entries import Gap
@@ -40,7 +41,10 @@ class SmallStand:
     def __init__(self, clock, hub, wrong):
         self.gate = Gate()
         self.chamber = self.imaging = self.supply = self.table = self
-        self.equilibrium = CameraEquilibrium(EquilibriumLimits(0.2, 600.0, TIME_CONSTANT_S), hub, clock)
+        limits = EquilibriumSettings().model_copy(
+            update={"time_constant_s": TIME_CONSTANT_S}
+        )  # shorter than any camera's
+        self.equilibrium = CameraEquilibrium(limits, hub, clock)
         self.safety = Safety(lambda: None, hub, clock)
         self.safety.take(self)
         self.fault = None

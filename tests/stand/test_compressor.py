@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.clock import Boot, seconds_ns
-from stand.chamber.compressor import CompressorLimits, CompressorState, decide, keep, restored
+from stand.chamber.compressor import CompressorState, decide, keep, restored
+from stand.config.stand_config import CompressorConfig
 
-LIMITS = CompressorLimits(
+LIMITS = CompressorConfig(
     min_off_s=300, min_on_s=180, max_starts_per_h=6, start_above_cool_percent=20, stop_above_heat_percent=60
 )
 

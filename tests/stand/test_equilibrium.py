@@ -6,12 +6,13 @@ import math
 
 import pytest
 
+from drivers.settings import EquilibriumSettings
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from stand.imaging.camera_cooling import Cooling
-from stand.imaging.equilibrium import CameraEquilibrium, EquilibriumLimits
+from stand.imaging.equilibrium import CameraEquilibrium
 from stand.running.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
 
 TIME_CONSTANT_S, RISE_K = 900.0, 20.0
@@ -56,7 +57,7 @@ async def test_a_camera_is_soaked_until_it_has_moved_slowly_for_ten_minutes(digi
     def shown(time_s):
         return round(warming(time_s) / digit_K) * digit_K if digit_K else warming(time_s)
 
-    lost, reached = await soaked(shown, EquilibriumLimits(time_constant_s=5000.0))
+    lost, reached = await soaked(shown, EquilibriumSettings(time_constant_s=5000.0))
     assert (lost.kind, lost.data) == ("camera_equilibrium_lost", {"reason": "it was off"})
     assert reached.kind == "camera_equilibrium"
     at_s = reached.time_ns / NS_PER_S
@@ -67,13 +68,13 @@ async def test_a_camera_is_soaked_until_it_has_moved_slowly_for_ten_minutes(digi
 
 
 async def test_a_camera_that_tells_no_temperature_is_soaked_for_five_time_constants():
-    _, reached = await soaked(lambda _: math.nan, EquilibriumLimits(time_constant_s=600.0))
+    _, reached = await soaked(lambda _: math.nan, EquilibriumSettings(time_constant_s=600.0))
     assert reached.kind == "camera_equilibrium"
     assert reached.data == {"soaked_s": 3000.0, "rate_K_per_min": None}
 
 
 async def test_a_camera_that_goes_on_moving_is_told_and_waited_for():
-    events = await soaked(lambda time_s: 24.0 + time_s / 120.0, EquilibriumLimits(time_constant_s=600.0), 7000.0)
+    events = await soaked(lambda time_s: 24.0 + time_s / 120.0, EquilibriumSettings(time_constant_s=600.0), 7000.0)
     assert [event.kind for event in events] == ["camera_equilibrium_lost"] + 2 * ["camera_equilibrium_late"]
 
 

@@ -7,22 +7,31 @@ from foundation.clock import seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch
 from foundation.readings import Reading, bad_reading
-from stand.guarding.felt_air import CameraLimits, FeltLimits, GraniteLimits, camera_feels, granite_feels
-from stand.guarding.first_heat import FirstHeatLimits, first_heat
+from stand.config.looks import (
+    CameraFeelsConfig,
+    ChamberConfig,
+    FirstHeatConfig,
+    GraniteFeelsConfig,
+    HeatFeltConfig,
+    NeededOutputConfig,
+)
+from stand.guarding.felt_air import camera_feels, granite_feels
+from stand.guarding.first_heat import first_heat
 from stand.guarding.frozen import frozen, stale_by_air
-from stand.guarding.heat_given import HeatFeltLimits, heat_not_felt, too_much_heat
+from stand.guarding.heat_given import heat_not_felt, too_much_heat
 from stand.guarding.interlocks import Rule
-from stand.guarding.needed_output import NeededLimits, output_not_as_needed
+from stand.guarding.needed_output import output_not_as_needed
 
 POLL_S = 5
 PV, AIR, GRANITE, CAMERA = "regulator.pv", "thermometers.air", "thermometers.granite_inside", "camera.temperature"
 PERMIT, COMPRESSOR, FLAP = "relays.heater_enable", "relays.compressor", "flap.position"
-FELT = FeltLimits(lag_s=4000, window_s=60, limit_K=4, share=0.4)
-GRANITE_LIMITS = GraniteLimits(FELT, change_K=3, change_s=900)
-CAMERA_LIMITS = CameraLimits(FeltLimits(600, 120, 6, 0.5), settle_s=1200, still_s=120, air_moves_K=3)
-HEAT = HeatFeltLimits(50, 4, 0.15, window_s=120, settle_s=60, heater_W=2000, heat_capacity_Wh_K=13)
-NEEDED = NeededLimits(settle_s=600, mean_s=300, limit_percent=25, band_K=2, near_K=3)
-FIRST = FirstHeatLimits(within_s=120, output_percent=40, rise_K=0.5)
+GRANITE_LAG_S, CAMERA_LAG_S = 4000, 600
+GRANITE_LIMITS = GraniteFeelsConfig(window_s=60, limit_K=4, share=0.4, change_K=3, change_s=900)
+CAMERA_LIMITS = CameraFeelsConfig(settle_s=1200, window_s=120, limit_K=6, share=0.5, still_air_K=3)
+HEAT = HeatFeltConfig(output_percent=50, fall_K=4, rise_share=0.15, window_s=120, settle_s=60)
+CHAMBER = ChamberConfig(heater_W=2000, heat_capacity_Wh_K=13)
+NEEDED = NeededOutputConfig(settle_s=600, mean_s=300, limit_percent=25, band_K=2, near_K=3)
+FIRST = FirstHeatConfig(within_s=120, output_percent=40, rise_K=0.5)
 AT_REST = {
     PV: 40.0,
     AIR: 40.0,
@@ -73,21 +82,21 @@ def constant(value: float) -> Callable[[float], float]:
 
 
 def test_granite_that_warms_tells_of_air_that_no_probe_shows():
-    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE, PV))
+    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
     assert feed.run(1200, thermometers_granite_inside=lambda s: 40 + noise_K(s)) is None
-    warmed_s = feed.run(600, thermometers_granite_inside=lambda s: 40 + noise_K(s) + 8 * s / FELT.lag_s)  # air of 48
+    warmed_s = feed.run(600, thermometers_granite_inside=lambda s: 40 + noise_K(s) + 8 * s / GRANITE_LAG_S)  # air of 48
     assert warmed_s is not None
     assert warmed_s <= 60
 
 
 def test_one_wild_value_of_the_granite_is_no_warming():
-    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE, PV))
+    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
     assert feed.run(600, thermometers_granite_inside=lambda s: 40 + noise_K(s) + 30 * (s == 300)) is None
 
 
 def test_granite_in_a_ramp_is_forgiven_a_lag_that_is_a_third_off():
-    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE, PV))
-    true_lag_s, ramp_K_s = 0.7 * FELT.lag_s, 0.05
+    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
+    true_lag_s, ramp_K_s = 0.7 * GRANITE_LAG_S, 0.05
 
     def granite(s: float) -> float:
         return 40 + noise_K(s) + ramp_K_s * (s - true_lag_s * (1 - math.exp(-s / true_lag_s)))
@@ -96,7 +105,7 @@ def test_granite_in_a_ramp_is_forgiven_a_lag_that_is_a_third_off():
 
 
 def test_a_camera_that_warms_tells_when_its_own_excess_is_known():
-    feed = Feed(camera_feels(CAMERA_LIMITS, CAMERA, AIR))
+    feed = Feed(camera_feels(CAMERA_LIMITS, CAMERA_LAG_S, CAMERA, AIR))
     assert feed.run(1000, camera_temperature=lambda s: 60 - 20 * math.exp(-s / 300)) is None  # it warms itself up
     assert feed.run(1500) is None
     warmed_s = feed.run(900, camera_temperature=lambda s: 0.25 * round(4 * (60 + 15 * (1 - math.exp(-s / 600)))))
@@ -105,7 +114,7 @@ def test_a_camera_that_warms_tells_when_its_own_excess_is_known():
 
 
 def test_a_camera_that_was_off_is_learned_anew_and_one_that_does_not_move_is_not_believed():
-    feed = Feed(camera_feels(CAMERA_LIMITS, CAMERA, AIR))
+    feed = Feed(camera_feels(CAMERA_LIMITS, CAMERA_LAG_S, CAMERA, AIR))
     assert feed.run(2500) is None
     assert feed.run(120, camera_temperature=constant(math.nan)) is None
     assert feed.run(2500, camera_temperature=constant(75.0)) is None
@@ -124,7 +133,7 @@ def test_more_heat_within_an_hour_than_the_chamber_ever_needs():
 
 def test_a_probe_that_falls_or_stays_while_the_regulator_heats():
     def heated(pv: Callable[[float], float], set_point_degC: float = 60.0) -> int | None:
-        feed = Feed(heat_not_felt(HEAT, PV, "regulator", PERMIT))
+        feed = Feed(heat_not_felt(HEAT, CHAMBER, PV, "regulator", PERMIT))
         assert feed.run(300) is None
         return feed.run(600, regulator_pv=pv, regulator_sp=constant(set_point_degC), regulator_mv_heat=constant(100.0))
 

@@ -9,12 +9,11 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch
 from foundation.readings import Reading, bad_reading
+from stand.config.guard import HeaterOffConfig, HeatingConfig
 from stand.config.stand_config import load_config, packaged
 from stand.fault import Fault
 from stand.guarding.plausibility import (
     Heating,
-    HeatingLimits,
-    OffLimits,
     heater_not_warming,
     heating,
     stuck,
@@ -24,7 +23,7 @@ from stand.guarding.plausibility import (
 from stand.guarding.rules import Announcements, watches
 from tests.stand.chamber_night import START_NS, Night
 
-LIMITS = HeatingLimits(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)
+LIMITS = HeatingConfig(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)
 LOOK_S = 10.0
 
 
@@ -332,7 +331,13 @@ def test_air_that_rises_with_the_heater_off_was_heated_unless_something_else_can
 ):
     """From 30 to 36 degC in 500 s, with one look, the first that counts, in which the air could not be read."""
     hub = Hub()
-    rule = warming_while_off(OffLimits(120, 2.0, 5.0), AIR, "regulator", PERMIT, (LABORATORY, GRANITE))
+    rule = warming_while_off(
+        HeaterOffConfig(settle_s=120, rise_K=2.0, above_surroundings_K=5.0),
+        AIR,
+        "regulator",
+        PERMIT,
+        (LABORATORY, GRANITE),
+    )
     publish_all(hub, WELDED | changed)
     found_s: list[int] = []
     for second in range(0, 500, 10):

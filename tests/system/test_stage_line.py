@@ -21,7 +21,6 @@ from foundation.errors import DeviceError, DeviceFault, Refused, Superseded, Unr
 from foundation.hub import Hub
 from foundation.readings import Quality
 from stand.chamber.chamber import ChamberLimits
-from stand.chamber.compressor import CompressorLimits
 from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import CompressorConfig, packaged
 from stand.gate import INTERLOCK
@@ -329,8 +328,7 @@ def stand_with(axis: Axis, clock: Clock) -> Stand:
     regulator, flap = Regulator("regulator", bus, maps[0], clock), Flap("flap", FLAP, clock, None)
     camera = Camera("camera", GigeCameraSettings(address="127.0.0.1"), clock)
     thermometers = Thermometers("thermometers", bus, maps[0], {}, clock)
-    compressor = CompressorLimits(**CompressorConfig().model_dump(exclude={"state_file"}))
-    chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, compressor), 5.0)
+    chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, CompressorConfig()), 5.0)
     devices = Devices(regulator, relays, thermometers, {"linear": axis}, flap, camera)
     return Stand(devices, chamber, SupplyLimits(1.0, 15.0), Hub(), clock)
 
