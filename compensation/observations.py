@@ -40,10 +40,6 @@ _NOISE_FRAMES = 4
 _PREVIEW_WIDTH_PX = 816
 
 
-OTHER = "other"
-"""The role of a frame that no capture asked for, or one without a set-point."""
-
-
 @dataclass(frozen=True, slots=True)
 class SessionFacts:
     """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
@@ -98,6 +94,12 @@ class Observations:
     def simulated(self) -> bool:
         """Whether any of the frames are known to be of a simulated laboratory."""
         return any(session.simulated for session in self.sessions)
+
+    @property
+    def roles_text(self) -> str:
+        """How many usable frames there are of each role, as in `20 reference, 12 other`."""
+        counts = {role: int(self.of(role).sum()) for role in Role}
+        return ", ".join(f"{count} {role}" for role, count in counts.items() if count) or "none"
 
     def of(self, *roles: str) -> Mask:
         """(F,): usable frames taken for one of these purposes."""
@@ -238,7 +240,7 @@ def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: ND
 def _purpose(role: str, chamber_degC: float) -> tuple[str, float]:
     """Role and set-point of a frame, from those of its step; OTHER, and NaN, unless both are known."""
     if role not in set(Role) or math.isnan(chamber_degC):
-        return OTHER, math.nan
+        return Role.OTHER, math.nan
     return role, chamber_degC
 
 

@@ -16,7 +16,7 @@ from recording.reading.session import Session
 from recording.reading.superseded import begins_of, is_superseded
 
 CHANGED = "camera_offset_changed"
-_TRANSIENT_ROLES = frozenset({"warm_up", "settling"})  # of a camera that is not in equilibrium anyway
+_TRANSIENT_ROLES = frozenset({"warm_up", "settling", "other"})  # of a camera that is not in equilibrium anyway
 
 
 def check_one_equilibrium(session: Session) -> None:

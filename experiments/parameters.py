@@ -6,7 +6,8 @@ from typing import Annotated, Self, cast
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-Chamber_degC = Annotated[float, Field(ge=-10, le=70)]  # the paper's chamber, section 2
+COLDEST_degC, WARMEST_degC = -10.0, 70.0  # the paper's chamber, section 2
+Chamber_degC = Annotated[float, Field(ge=COLDEST_degC, le=WARMEST_degC)]
 Wait_s = Annotated[float, Field(ge=0, le=7 * 86400)]  # longer is a slip of the keyboard
 FrameCount = Annotated[int, Field(ge=1, le=1_000_000)]
 Linear_mm = Annotated[float, Field(ge=-300, le=300)]  # the linear table's travel is 300 mm
@@ -69,11 +70,11 @@ def _settled(value: object) -> object:
 Until = Annotated[Settled | None, BeforeValidator(_settled)]
 
 
-def check_until(until: Settled | None, dwell_s: float) -> None:
-    """ValueError when a dwell of at most `dwell_s` leaves no time to see that the camera has settled."""
+def check_until(until: Settled | None, dwell_s: float, name: str = "dwell_s") -> None:
+    """ValueError when a dwell of at most `dwell_s`, by that name, leaves no time to see that the camera has settled."""
     if until is not None and dwell_s < max(until.min_s, until.window_s):
         raise ValueError(
-            f"dwell_s {dwell_s} is the longest dwell; it must be at least until's min_s {until.min_s} "
+            f"{name} {dwell_s} is the longest dwell; it must be at least until's min_s {until.min_s} "
             f"and window_s {until.window_s}"
         )
 

@@ -24,7 +24,7 @@ class Role(StrEnum):
 
     CALIBRATION, POSE and REPEATABILITY frames show the target elsewhere than the drift's: no drift is fitted to them.
     POSE: the target at a validation position; REPEATABILITY: back at the first of them. SETTLING: a look during a soak,
-    when the camera is not at rest yet.
+    when the camera is not at rest yet. OTHER: for an evaluation of one's own; nothing here is fitted to them.
     """
 
     REFERENCE = "reference"
@@ -35,6 +35,7 @@ class Role(StrEnum):
     POSE = "pose"
     REPEATABILITY = "repeatability"
     SETTLING = "settling"
+    OTHER = "other"
 
 
 @dataclass(frozen=True, slots=True)

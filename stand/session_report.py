@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from experiments.steps import Capture, PlannedStep, Role
+from experiments.steps import Capture, PlannedStep
 from foundation.errors import ConfigError, StandError
 from foundation.progress import progress
 
@@ -17,26 +17,27 @@ class NotReported(StandError):
 
 
 def check_reportable(plan: Iterable[PlannedStep]) -> None:
-    """ConfigError when the plan leaves no drift to report, to be told before anything moves."""
-    roles = {planned.step.role for planned in plan if isinstance(planned.step, Capture)}
-    if Role.WARM_UP not in roles and not {Role.REFERENCE, Role.FIT} <= roles:
-        raise ConfigError("--report needs a recipe with a thermal_cycle or a warm_up: their frames show the drift")
+    """ConfigError when the plan takes no frames, before anything moves."""
+    if not any(isinstance(planned.step, Capture) for planned in plan):
+        raise ConfigError("--report needs a recipe that takes frames; this one has no capture")
 
 
 def report_session(session: Path, folder: Path) -> list[str]:
     """Fit and report a session into `folder`; the lines to show: the table beside the paper's and where the files are.
-    A session without a thermal cycle has a report of its drift, and no model.
+    Without reference and fit frames there is a report of the drift, and no model.
 
     The session's own folder will do: whatever reads a session looks only at what a run has left there. NotReported when
     the frames do not allow it or a file cannot be written; what was recorded is as it was.
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
     from compensation.drift.evaluation import table
-    from compensation.reporting.report import analyse
+    from compensation.reporting.report import NoModel, analyse
 
     model, report = folder / MODEL_NAME, folder / REPORT_NAME
     try:
         evaluation = analyse([session], model, report, progress)
+    except NoModel as error:
+        raise NotReported(f"{session} is recorded, but {error}") from error
     except (StandError, OSError) as error:
         remedy = f"`compensate report {session} -o report.html` tries again"
         raise NotReported(f"{session} is recorded, but not reported: {error}; {remedy}") from error

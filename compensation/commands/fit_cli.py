@@ -26,7 +26,7 @@ from compensation.drift.paper_model import MAX_DEGREE
 from compensation.finding.found import finder
 from compensation.observations import observe
 from compensation.reporting.extras import Extras
-from compensation.reporting.report import can_be_fitted, check_report_writable, write_report
+from compensation.reporting.report import NoModel, can_be_scored, check_report_writable, fitted, write_report
 from compensation.reporting.table_positions import table_positions
 from compensation.validation3d.reading import load_validation
 from foundation.exit_codes import one_line_errors
@@ -102,7 +102,7 @@ def report(
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
-    Its numbers are in a JSON file of the same name beside it. Sessions without a thermal cycle have their drift alone.
+    Its numbers are in a JSON file of the same name beside it. Without reference and fit frames: the drift alone.
 
     Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
     """
@@ -119,8 +119,13 @@ def report(
         observations = observe(
             sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said_if(incomplete)
         )
-        has_cycle = can_be_fitted(observations)
-        used = fit_model(observations) if given is None and has_cycle else given
-        evaluation = None if used is None or not has_cycle else evaluate(used, observations)
+        if given is None:
+            used, evaluation, refusal = fitted(observations)
+        else:
+            used, refusal = given, ""
+            evaluation = evaluate(given, observations) if can_be_scored(observations) else None
         write_report(out, observations, used, evaluation, extras)
-        typer.echo("no thermal cycle: no model, drift alone" if evaluation is None else table(evaluation))
+        if refusal:
+            raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
+        alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
+        typer.echo(alone if evaluation is None else table(evaluation))

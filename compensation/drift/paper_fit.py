@@ -71,7 +71,10 @@ def degrees_for(rows: Displacements, degree: int | None) -> range:
 def scaling_of(observations: Observations, rows: Displacements) -> Scaling:
     """The image and the range of the camera's temperature in these rows; SessionError when that hardly changes."""
     if len(rows.frame) == 0:
-        raise SessionError("the sessions have no usable frames for a fit")
+        raise SessionError(
+            "the sessions have no usable frames for a fit, which needs the roles reference and fit; usable frames: "
+            f"{observations.roles_text}"
+        )
     low, high = float(rows.camera_degC.min()), float(rows.camera_degC.max())
     if high - low < _LEAST_RANGE_K:
         raise SessionError(f"the camera's temperature hardly changes ({low:.2f} to {high:.2f} degC); nothing to fit")

@@ -16,7 +16,7 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.training import frame_states
-from compensation.observations import OTHER, Float, Mask, Observations
+from compensation.observations import Float, Mask, Observations
 from compensation.reporting.extras import Extras
 from compensation.reporting.numbers import (
     FORMAT,
@@ -75,7 +75,7 @@ def _session(observations: Observations, index: int) -> SessionNumbers:
     used = own & observations.usable
     flags = observations.flags[used]
     by_flag = {_words(flag.name or ""): int(((flags & flag) != 0).sum()) for flag in Flag}
-    by_role = {str(role): int((own & (observations.role == str(role))).sum()) for role in (*Role, OTHER)}
+    by_role = {str(role): int((own & (observations.role == str(role))).sum()) for role in Role}
     return SessionNumbers(
         session_id=facts.session_id,
         recipe=facts.recipe,

@@ -30,34 +30,55 @@ from foundation.files import check_writable, write_whole
 from recording.reading.session import Session
 
 
+class NoModel(SessionError):
+    """The frames allow no model; the report that was written shows the drift alone."""
+
+
 def analyse(
     session_paths: Sequence[Path], model_path: Path, report_path: Path, progress: Progress
 ) -> Evaluation | None:
     """Sessions in; model, report and its numbers out, each file whole or not there; the markers are looked for once.
 
-    Without a thermal cycle there is no model, and None. `progress` is foundation.progress.progress or alike. Raises
-    SessionError or ConfigError with a sentence.
+    Without reference and fit frames there is no model, and None; NoModel when there are, and they allow none.
+    `progress` is foundation.progress.progress or alike. Raises SessionError or ConfigError with a sentence.
     """
     check_writable(model_path)
     check_report_writable(report_path, model_path)
     observations = observe(session_paths, progress)
     extras = Extras(positions=table_positions([Session.open(path).steps() for path in session_paths]))
     with progress("fit and report", 3) as report:
-        report(0, "choosing the form")
-        model = fit(observations) if can_be_fitted(observations) else None
-        report(1, "scoring")
-        evaluation = None if model is None else evaluate(model, observations)
+        report(0, "choosing the form, scoring")
+        model, evaluation, refusal = fitted(observations)
         report(2, "drawing")
         write_report(report_path, observations, model, evaluation, extras)
         if model is not None:
             save_model(model, model_path)
         report(3, "written")
+    if refusal:
+        raise NoModel(f"no model: {refusal}; {report_path} shows the drift alone")
     return evaluation
 
 
+def fitted(observations: Observations) -> tuple[DriftModel | None, Evaluation | None, str]:
+    """Model and score, or neither; and why frames that are made for a model allow none, "" when there are no such."""
+    if not can_be_fitted(observations):
+        return None, None, ""
+    try:
+        model = fit(observations)
+        return model, evaluate(model, observations), ""
+    except SessionError as error:
+        return None, None, str(error)
+
+
 def can_be_fitted(observations: Observations) -> bool:
-    """Whether there is a thermal cycle at all; without one a report shows the drift alone."""
-    return bool(observations.of(Role.FIT, Role.VALIDATION).any())
+    """Whether there are a reference and set-points to fit; without them a report shows the drift alone."""
+    return can_be_scored(observations) and bool(observations.of(Role.FIT).any())
+
+
+def can_be_scored(observations: Observations) -> bool:
+    """Whether a model can be compared with frames at set-points, from a reference on."""
+    reference, set_points = observations.of(Role.REFERENCE), observations.of(Role.FIT, Role.VALIDATION)
+    return bool(reference.any() and set_points.any())
 
 
 def check_report_writable(path: Path, *inputs: Path | None) -> None:

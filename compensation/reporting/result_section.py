@@ -22,8 +22,8 @@ def result_section(numbers: Numbers, validation: Validation | None = None) -> It
     yield Heading("Result")
     if numbers.score is None:
         yield Paragraph(
-            "These sessions have no frames over a thermal cycle that a model could be fitted to: this report shows the "
-            "drift alone."
+            "These sessions have no frames over a thermal cycle that a model could be fitted to, which needs the roles "
+            "reference and fit: this report shows the drift alone."
         )
     else:
         yield from _gain(numbers, numbers.score)

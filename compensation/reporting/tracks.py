@@ -17,7 +17,7 @@ from experiments.steps import Role
 Rows = NDArray[np.int64]
 
 CYCLE = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
-_AT_ONE_PLACE = (*CYCLE, Role.WARM_UP, Role.SETTLING)
+_AT_ONE_PLACE = (*CYCLE, Role.WARM_UP, Role.SETTLING, Role.OTHER)
 _ELSEWHERE_PX = 10.0
 """No drift is as large: the camera was rolled, or the target moved."""
 _NS_PER_S = 1e9
@@ -82,6 +82,9 @@ def moved_px(observations: Observations) -> Float:
             moved[own] = observations.centres_px[own] - origin[index]
         elif own.any():
             moved[own] = _from_own_first(observations.centres_px[own])[1]
+    for frame in np.flatnonzero(observations.of(Role.OTHER)):  # which may show the target anywhere
+        if not _is_near(moved[frame]):
+            moved[frame] = np.nan
     for frames in _warm_up_frames(observations):
         if not _is_near(moved[frames[0]]):
             moved[frames] = _from_own_first(observations.centres_px[frames])[1]

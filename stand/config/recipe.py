@@ -1,77 +1,125 @@
-"""A recipe: which experiments run, one after another, with which parameters; YAML in, steps out."""
+"""A recipe: which experiments and steps, one after another, with which parameters; YAML in, steps out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import Self
+from typing import Self, cast
 
-from pydantic import Field, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from experiments.calibration import Calibration, calibration
+from experiments.sequence import checked
 from experiments.steps import PlannedStep, Step, number_steps
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
+from experiments.written import Place, PlanError, StepEntries, Written, set_point_after, unknown, written_steps
 from foundation.documents import Document, load_document
+from stand.config.added_experiments import added_names, added_steps
 
 _MOST_VISITS = 10_000  # captures; more than any camera lives through, and a plan is still listed within a second
 
 
 class Experiment(Document):
-    """One entry of the recipe: exactly one of the keys."""
+    """One entry of the recipe: exactly one of the keys, or the name of an experiment that another package adds."""
 
     warm_up: WarmUp | None = None
     thermal_cycle: ThermalCycle | None = None
     calibration: Calibration | None = None
     validation: Validation | None = None
+    steps: StepEntries | None = Field(default=None, min_length=1)
+    _added: tuple[str, tuple[Step, ...]] = PrivateAttr(("", ()))
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _known(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        entry = cast("dict[object, object]", data) if isinstance(data, dict) else {}
+        others = [name for name in entry if name not in cls.model_fields]
+        if not others:
+            return handler(data)
+        name, known = str(others[0]), [*cls.model_fields, *added_names()]
+        if name not in known:
+            raise ValueError(unknown("experiment", name, known))
+        if len(entry) > 1:
+            raise ValueError(f"give exactly one of {', '.join(known)}")
+        experiment = cls.model_construct()
+        experiment._added = (name, added_steps(name, entry[name]))
+        return experiment
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Self:
-        if len(self._given) != 1:
+        if len(self._given) + bool(self._added[0]) != 1:
             raise ValueError(f"give exactly one of {', '.join(type(self).model_fields)}")
         return self
 
     @property
     def visits(self) -> int:
-        """How many captures the entry asks for, the reference frames of a cycle apart."""
-        return self._given[0].visits
+        """How many captures the entry asks for, the reference frames of a cycle and written steps apart."""
+        return sum(parameters.visits for parameters in self._given if not isinstance(parameters, tuple))
 
-    def steps(self) -> Iterator[Step]:
-        """The steps of this entry."""
-        match self._given[0]:
-            case WarmUp() as parameters:
-                return warm_up(parameters)
-            case ThermalCycle() as parameters:
-                return thermal_cycle(parameters)
-            case Calibration() as parameters:
-                return calibration(parameters)
-            case Validation() as parameters:
-                return validation(parameters)
+    def sequence(self, place: Place = (), at_degC: float | None = None) -> Generator[Written, None, None]:
+        """The steps of this entry, which stands at `place`; at_degC: the set-point before them."""
+        match self._given:
+            case (WarmUp() as parameters,):
+                steps = warm_up(parameters)
+            case (ThermalCycle() as parameters,):
+                steps = thermal_cycle(parameters)
+            case (Calibration() as parameters,):
+                steps = calibration(parameters)
+            case (Validation() as parameters,):
+                steps = validation(parameters)
+            case (tuple() as entries,):
+                yield from written_steps(entries, (*place, "steps"), at_degC)
+                return
+            case _:
+                steps = iter(self._added[1])
+        name = self._added[0] or next(iter(self.model_fields_set))
+        yield from (Written((*place, name), step) for step in steps)
 
     @property
-    def _given(self) -> tuple[WarmUp | ThermalCycle | Calibration | Validation, ...]:
-        entries = (self.warm_up, self.thermal_cycle, self.calibration, self.validation)
+    def _given(self) -> tuple[WarmUp | ThermalCycle | Calibration | Validation | StepEntries, ...]:
+        entries = (self.warm_up, self.thermal_cycle, self.calibration, self.validation, self.steps)
         return tuple(entry for entry in entries if entry is not None)
 
 
 class Recipe(Document):
-    """A whole recipe file."""
+    """A whole recipe file: the experiments in their order, then the steps."""
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=100)
     description: str = ""
-    experiments: tuple[Experiment, ...] = Field(min_length=1, max_length=100)
+    experiments: tuple[Experiment, ...] = Field(default=(), max_length=100)
+    steps: StepEntries = ()
 
     @model_validator(mode="after")
-    def _ends(self) -> Self:
+    def _can_be_done(self) -> Self:
+        if not self.experiments and not self.steps:
+            raise ValueError("nothing to do; give experiments: with one entry or more, or steps:")
         visits = sum(experiment.visits for experiment in self.experiments)
         if visits > _MOST_VISITS:
             raise ValueError(f"{visits} visits of set-points and positions are more than {_MOST_VISITS}")
+        try:
+            for _ in checked(self._written()):
+                pass
+        except PlanError as error:
+            fault = PydanticCustomError("plan", "{text}", {"text": str(error)})
+            raise ValidationError.from_exception_data(
+                "recipe", [InitErrorDetails(type=fault, loc=error.place, input=None)]
+            ) from error
         return self
 
     def plan(self) -> Iterator[PlannedStep]:
         """Every step in order, numbered and identified."""
-        return number_steps(step for experiment in self.experiments for step in experiment.steps())
+        return number_steps(written.step for written in self._written())
+
+    def _written(self) -> Iterator[Written]:
+        at_degC: float | None = None
+        for number, experiment in enumerate(self.experiments):
+            for written in experiment.sequence(("experiments", number), at_degC):
+                yield written
+                at_degC = set_point_after(written.step, at_degC)
+        yield from written_steps(self.steps, ("steps",), at_degC)
 
 
 def load_recipe(path: Path) -> Recipe:

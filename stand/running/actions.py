@@ -211,7 +211,8 @@ def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capt
             return StartCold(again)
         if has_frames:
             return TakeAgain(planned, outage_ns)
-    return TakeFrame(planned, capture, state.due_ns, bool(state.set_up.soaks) and not is_warm_up and not has_frames)
+    may_settle = bool(state.set_up.soaks) and capture.role not in (Role.WARM_UP, Role.OTHER)
+    return TakeFrame(planned, capture, state.due_ns, may_settle and not has_frames)
 
 
 def next_due_ns(due_ns: int | None, capture: Capture, around: Surroundings, *, is_lost: bool) -> int:

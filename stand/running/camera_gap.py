@@ -27,7 +27,7 @@ AIR = "thermometers.air"
 CHANGED, SAME = "camera_offset_changed", "camera_offset_same"  # kinds of events
 LIMIT_K = 1.0
 _WINDOW_S = 120.0
-_TRANSIENT_ROLES = frozenset({"warm_up", "settling"})
+_TRANSIENT_ROLES = frozenset({"warm_up", "settling", "other"})
 
 
 @dataclass(frozen=True, slots=True)

@@ -220,7 +220,7 @@ def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving
     assert "one temperature left out at a time" in text
 
 
-@pytest.mark.parametrize("role", ["calibration", "other"])
+@pytest.mark.parametrize("role", ["calibration", "pose"])
 def test_a_session_without_any_drift_is_reported_all_the_same(role: str):
     text = report_page(warm_up_only(roles=(role,)), None, None)
     assert headings(text) == ["Result", "Recorded data"]

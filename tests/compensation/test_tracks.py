@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from compensation.history.history import History
-from compensation.observations import OTHER, Observations, concatenate
+from compensation.observations import Observations, concatenate
 from compensation.reporting import drift_figures
 from compensation.reporting.figures import as_svg
 from compensation.reporting.path_figures import Paths, trajectories
@@ -58,7 +58,7 @@ def test_the_drift_is_measured_from_the_reference_or_else_from_the_first_frame()
     np.testing.assert_allclose(moved[-3], expected, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("role", [Role.CALIBRATION, Role.POSE, Role.REPEATABILITY, OTHER])
+@pytest.mark.parametrize("role", [Role.CALIBRATION, Role.POSE, Role.REPEATABILITY, Role.OTHER])
 def test_a_target_that_was_moved_on_purpose_is_no_drift(role: Role):
     night = observations(quadratic)
     centres, roles = night.centres_px.copy(), night.role.astype("U16")

@@ -43,6 +43,7 @@ RECIPES = [
     "calibration",
     "demo",
     "overnight",
+    "ramps",
     "thermal-cycle",
     "thermal-cycle-settled",
     "validation",
@@ -409,7 +410,7 @@ def test_positions_count_towards_the_longest_recipe():
 
 def test_each_kind_of_entry_plans_its_own_steps():
     def steps(entry: dict[str, object]) -> Iterator[Step]:
-        return Experiment.model_validate(entry).steps()
+        return (written.step for written in Experiment.model_validate(entry).sequence())
 
     assert list(steps({"calibration": GRID})) == list(calibration(Calibration.model_validate(GRID)))
     assert list(steps({"validation": PLACES})) == list(validation(Validation.model_validate(PLACES)))

@@ -86,7 +86,6 @@ def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(
         (["plan", "demo", "--config", "nowhere.yaml"], "nowhere.yaml: no such file"),
         (["run", "demo", "--seed", "3"], "--seed belongs to --virtual-time"),
         (["run", "demo", "--virtual-time", "--seed", "-1"], "--seed is 0 or more, not -1"),
-        (["run", "calibration", "--report"], "--report needs a recipe with a thermal_cycle or a warm_up"),
         (["run", "demo", "--out", "/proc/x"], "/proc/x: no session can be written there"),
         (["run", "demo", "--out", __file__], "no session can be written there (Not a directory)"),
         (["demo", "--out", "/proc/x"], "/proc/x: no session can be written there"),

@@ -59,6 +59,20 @@ experiments:
   - warm_up: {table_position: {linear: 0, rotary: 0}, cool_down_max_s: 60, frames: 3, interval_s: 60}
 """
 
+OWN_STEPS = """
+name: own-steps
+steps:
+  - close_flap
+  - move_to: {linear: 0, rotary: 0}
+  - start_chamber: 24
+  - soak: 120
+  - repeat:
+      times: 2
+      steps:
+        - ramp: {to_degC: 30, rate_K_per_min: 3, every_K: 3, steps: [open_flap, capture, close_flap]}
+        - ramp: {to_degC: 24, rate_K_per_min: 3, every_K: 6}
+"""
+
 
 @pytest.fixture
 def _aravis() -> None:
@@ -111,9 +125,11 @@ def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, conf
     assert ended.returncode == NOT_REPORTED
     directory = Path(ended.stdout.strip())
     assert verify(directory).is_sound
-    assert not (directory / REPORT_NAME).exists()
     last = ended.stderr.splitlines()[-1]
-    assert last.startswith(f"error: {directory} is recorded, but not reported: a fit needs frames at 3 chamber")
+    assert last.startswith(f"error: {directory} is recorded, but no model: a fit needs frames at 3 chamber")
+    assert last.endswith(f"; {directory / REPORT_NAME} shows the drift alone")
+    assert "Drift over temperature" in (directory / REPORT_NAME).read_text(encoding="utf-8")
+    assert not (directory / MODEL_NAME).exists()
 
 
 @pytest.mark.usefixtures("_aravis")
@@ -126,6 +142,21 @@ def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, confi
     assert lines == [f"report   {Path(session) / REPORT_NAME}"]
     assert not (Path(session) / MODEL_NAME).exists()
     assert ">Warm-up<" in (Path(session) / REPORT_NAME).read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("_aravis")
+@pytest.mark.parametrize("role", ["other", "fit"])
+def test_frames_of_ones_own_steps_have_a_report_of_what_there_is(role: str, out: Path, config_text: Callable[..., str]):
+    recipe = out.parent / "recipe.yaml"
+    recipe.write_text(OWN_STEPS.replace("capture", f"{{capture: {{role: {role}}}}}"))
+    ended = run_reported(str(recipe), config_text(), out, 600)
+    assert ended.returncode == 0, ended.stderr
+    session, *lines = ended.stdout.splitlines()
+    assert lines == [f"report   {Path(session) / REPORT_NAME}"]
+    assert Session.open(Path(session)).frame_count == 4
+    page = (Path(session) / REPORT_NAME).read_text(encoding="utf-8")
+    assert f"4 (4 {role})" in page
+    assert "Drift over time" in page
 
 
 @pytest.mark.nightly

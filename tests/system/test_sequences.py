@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import OTHER, observe
+from compensation.observations import observe
 from experiments.steps import Role
 from foundation.items import Event, StepMark, StepState
 from foundation.progress import progress
@@ -135,4 +135,4 @@ def check_no_drift_is_fitted_to_them(session: Session) -> None:
     assert observed.of(*cycle).sum() == 0
     elsewhere = (Role.CALIBRATION, Role.POSE, Role.REPEATABILITY)
     assert (observed.of(Role.WARM_UP).sum(), observed.of(*elsewhere).sum()) == (12, 12)
-    assert observed.of(OTHER).sum() == 0
+    assert observed.of(Role.OTHER).sum() == 0

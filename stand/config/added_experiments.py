@@ -1,0 +1,106 @@
+"""Experiments of other packages: the entry points of the group `thermostand.experiments`.
+
+Each is a function of one parameter, which is annotated with a pydantic model, that yields steps, as those of
+`experiments` are. Its name is the entry's key in a recipe. It must be pure: the same parameters give the same steps.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+from importlib.metadata import EntryPoint, entry_points
+from itertools import islice
+from typing import cast, get_type_hints
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from experiments.sequence import MOST_STEPS
+from experiments.steps import Step, kind_of
+
+GROUP = "thermostand.experiments"
+_AT_LEAST = {"frames": 1, "interval_s": 1e-6, "exposure_s": 1e-6}
+
+
+def added_names() -> list[str]:
+    """Of the experiments that other packages add."""
+    return sorted({point.name for point in entry_points(group=GROUP)})
+
+
+def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
+    """The steps of the experiment `name` of another package; ValueError, or ValidationError with the parameter's place,
+    when it is not there, refuses its parameters, or makes what is no plan."""
+    point = _only(name)
+    make, model = _loaded(point)
+    try:
+        checked = model.model_validate({} if parameters is None else parameters)
+    except ValidationError as error:
+        raise _within(name, error) from error
+    try:
+        steps = tuple(islice(cast("Iterable[object]", make(checked)), MOST_STEPS + 1))
+    except Exception as error:  # somebody else's code may raise anything
+        raise ValueError(f"{name}: {_package(point)} makes no steps of these ({_told(error)})") from error
+    faults = (f"step {number} {fault}" for number, step in enumerate(steps) if (fault := _fault(step)))
+    if fault := next(faults, ""):
+        raise ValueError(f"{name}: {_package(point)} makes what cannot be done: {fault}; correct the package")
+    return cast("tuple[Step, ...]", steps)
+
+
+def _only(name: str) -> EntryPoint:
+    found = {point.value: point for point in entry_points(group=GROUP, name=name)}
+    if len(found) != 1:
+        packages = " and ".join(sorted(_package(point) for point in found.values()))
+        raise ValueError(f"{name}: {packages} have an experiment of that name; keep one of them installed")
+    return next(iter(found.values()))
+
+
+def _loaded(point: EntryPoint) -> tuple[Callable[[BaseModel], object], type[BaseModel]]:
+    """The function, and the model that its parameter is annotated with."""
+    try:
+        make = point.load()
+        (parameter,) = inspect.signature(make).parameters
+        model = get_type_hints(make)[parameter]
+    except Exception as error:  # whatever importing a stranger's module raises
+        text = f"{point.name}: {_package(point)} cannot be loaded ({_told(error)}); install it anew, or leave this out"
+        raise ValueError(text) from error
+    if not (inspect.isclass(model) and issubclass(model, BaseModel)):
+        raise ValueError(f"{point.name}: {point.value} takes no pydantic model; annotate its parameter with one")
+    return make, model
+
+
+def _fault(step: object) -> str:
+    """Why this is no step that a stand can do; "" when it is one."""
+    if not isinstance(step, Step):
+        return f"is no step of experiments.steps but {type(step).__name__}"
+    for name in [field.name for field in fields(step)]:
+        value = getattr(step, name)
+        if name in ("axis", "text", "role", "on"):
+            continue
+        least = _AT_LEAST.get(name, 0.0 if name.endswith("_s") else -math.inf)
+        if not isinstance(value, float | int) or not math.isfinite(value) or value < least:
+            return f"({kind_of(step)}) has {name} {value!r}"
+    return ""
+
+
+def _within(name: str, error: ValidationError) -> ValidationError:
+    """The faults of an entry's parameters, with the entry's key in front of their places."""
+    faults = [
+        InitErrorDetails(
+            type=PydanticCustomError("parameter", "{text}", {"text": fault["msg"].removeprefix("Value error, ")}),
+            loc=(name, *fault["loc"]),
+            input=fault["input"],
+        )
+        for fault in error.errors()
+    ]
+    return ValidationError.from_exception_data(name, faults)
+
+
+def _package(point: EntryPoint) -> str:
+    """As in `acme-experiments 1.2`."""
+    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.value
+
+
+def _told(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
