@@ -23,7 +23,7 @@ from drivers.sim.gvcp_device import ControlChannel, Peer
 from drivers.sim.gvsp_sender import CameraFaults, StreamCounts, StreamSender
 from foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 
-Render = Callable[[int, float, float], NDArray[np.uint8]]
+Render = Callable[[int, float, float, int], NDArray[np.uint8]]
 
 WIDTH_px, HEIGHT_px = 2448, 2048
 
@@ -54,12 +54,12 @@ class CameraPlant(Protocol):
 class FakeCamera:
     """The camera with serial number `serial` at UDP `address`:3956.
 
-    `render(time_ns, exposure_s, gain_dB)` gives the image of an exposure whose middle is time_ns: uint8, shape
-    (height, width) of the sensor; it is called in a thread of the camera, without the plant's lock. With `real_time` a
-    frame leaves when its exposure has ended on the clock; without, a triggered frame leaves at once (virtual time
-    stands still meanwhile) and a free-running one after `advance`. Timestamps are ns since power-on, at the start of
-    the exposure. `boot_s` is simulated time from power-on to the first answer; a camera that has power when it is
-    built is ready. `faults` and `counts` are open to all.
+    `render(time_ns, exposure_s, gain_dB, rows)` gives the upper rows of an exposure whose middle is time_ns: uint8,
+    shape (rows, width of the sensor); it is called in a thread of the camera, without the plant's lock. With
+    `real_time` a frame leaves when its exposure has ended on the clock; without, a triggered frame leaves at once
+    (virtual time stands still meanwhile) and a free-running one after `advance`. Timestamps are ns since power-on, at
+    the start of the exposure. `boot_s` is simulated time from power-on to the first answer; a camera that has power
+    when it is built is ready. `faults` and `counts` are open to all.
     """
 
     def __init__(
@@ -262,9 +262,11 @@ class FakeCamera:
     # ------------------------------------------------------------------------------------------------------ images
 
     def _expose(self) -> None:
-        self._render(self._clock.now_ns(), 0.001, 0.0)  # the first image is slow: not within an acquisition
+        if self._real_time:  # the first image is slow: not within an acquisition
+            self._render(self._clock.now_ns(), 0.001, 0.0, self._registers.integer("HeightMax"))
         while (shot := self._next_shot()) is not None:
-            image = self._render(shot.middle_ns, shot.exposure_ns / NS_PER_S, shot.gain_dB)
+            rows = self._registers.integer("OffsetY") + self._registers.integer("Height")
+            image = self._render(shot.middle_ns, shot.exposure_ns / NS_PER_S, shot.gain_dB, rows)
             self._send(shot, image)
 
     def _next_shot(self) -> Shot | None:

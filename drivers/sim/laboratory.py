@@ -208,8 +208,8 @@ class Laboratory:
         self.addresses[name] = wire.address
         return wire, faults
 
-    def _render(self, time_ns: int, exposure_s: float, gain_dB: float) -> NDArray[np.uint8]:
+    def _render(self, time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
         with self.plant.lock:
             self.plant.advance(time_ns if self._followed is None else self._clock.now_ns())
             optics, flap_open = self.plant.optics(time_ns), self.plant.flap_open_at(time_ns)
-        return self._scene.render(optics, time_ns, exposure_s, gain_dB, flap_open)
+        return self._scene.render(optics, time_ns, exposure_s, gain_dB, flap_open, rows)

@@ -52,45 +52,58 @@ class Scene:
     def __init__(self, spec: SceneSpec, seed: int) -> None:
         self._spec = spec
         self._seed = seed
-        self._light = _light(spec)
+        self._light = _light(spec, 0)
 
     def render(
-        self, optics: Optics, time_ns: int, exposure_s: float, gain_dB: float, flap_open: float
+        self,
+        optics: Optics,
+        time_ns: int,
+        exposure_s: float,
+        gain_dB: float,
+        flap_open: float,
+        rows: int = HEIGHT_px,
     ) -> NDArray[np.uint8]:
-        """(2048, 2448) frame; its noise depends on the seed and `time_ns` only."""
-        image = self.noise_free(optics, exposure_s, gain_dB, flap_open)
+        """(rows, 2448) frame, the upper part of the sensor's 2048 rows; its noise depends on the seed and `time_ns`
+        only."""
+        image = self.noise_free(optics, exposure_s, gain_dB, flap_open, rows)
         noise = np.random.Generator(np.random.SFC64(np.random.SeedSequence((self._seed, time_ns))))
         gain = _gain(gain_dB)
         read_variance = np.float32((gain * self._spec.read_noise_DN) ** 2)
         shot_per_DN = np.float32(gain / self._spec.shot_e_per_DN)
         frame = np.empty(image.shape, dtype=np.uint8)
         draw = np.empty((NOISE_ROWS, image.shape[1]), dtype=np.float32)
-        for top in range(0, image.shape[0], NOISE_ROWS):
+        for top in range(0, rows, NOISE_ROWS):
             signal = image[top : top + NOISE_ROWS]
             noise.standard_normal(dtype=np.float32, out=draw)
-            draw *= np.sqrt((signal - np.float32(self._spec.black_DN)) * shot_per_DN + read_variance)
-            draw += signal
-            draw += np.float32(0.5)  # with the cut of astype: rounding
-            np.clip(draw, 0.0, 255.0, out=draw)
-            frame[top : top + NOISE_ROWS] = draw
+            part = draw[: len(signal)]
+            part *= np.sqrt((signal - np.float32(self._spec.black_DN)) * shot_per_DN + read_variance)
+            part += signal
+            part += np.float32(0.5)  # with the cut of astype: rounding
+            np.clip(part, 0.0, 255.0, out=part)
+            frame[top : top + NOISE_ROWS] = part
         return frame
 
-    def noise_free(self, optics: Optics, exposure_s: float, gain_dB: float, flap_open: float) -> NDArray[np.float32]:
-        """The image before noise, rounding and saturation, DN, black level included."""
+    def noise_free(
+        self, optics: Optics, exposure_s: float, gain_dB: float, flap_open: float, rows: int = HEIGHT_px
+    ) -> NDArray[np.float32]:
+        """The upper rows of the image before noise, rounding and saturation, DN, black level included."""
         spec = self._spec
         scale = exposure_s / spec.nominal_exposure_s * _gain(gain_dB)
         if flap_open < FLAP_SHUT:
-            return np.full(self._light.shape, spec.black_DN, dtype=np.float32)
-        image = self._light * _shadow(flap_open, scale * (spec.paper_DN - spec.black_DN))
+            return np.full((rows, WIDTH_px), spec.black_DN, dtype=np.float32)
+        if len(self._light) < rows:
+            self._light = _light(spec, rows)
+        image = self._light[:rows] * _shadow(flap_open, scale * (spec.paper_DN - spec.black_DN))[:rows]
         darkening = np.float32(1.0 - (spec.disc_DN - spec.black_DN) / (spec.paper_DN - spec.black_DN))
-        for left, top, coverage in disc_coverages(optics, spec.blur_px):
+        for left, top, coverage in disc_coverages(optics, spec.blur_px, rows):
             _dim(image, left, top, 1.0 - darkening * coverage)
         image += np.float32(spec.black_DN)
         return image
 
 
-def disc_coverages(optics: Optics, blur_px: float) -> list[tuple[int, int, NDArray[np.float32]]]:
-    """Per marker (left, top, coverage): its blurred disc, 0..1 per pixel, and the pixel of the array's corner.
+def disc_coverages(optics: Optics, blur_px: float, rows: int = HEIGHT_px) -> list[tuple[int, int, NDArray[np.float32]]]:
+    """Per marker that reaches into the upper `rows` (left, top, coverage): its blurred disc, 0..1 per pixel, and the
+    pixel of the array's corner.
 
     Arrays are not cut at the image's border; the sum of a coverage is the disc's area in px^2.
     """
@@ -102,6 +115,8 @@ def disc_coverages(optics: Optics, blur_px: float) -> list[tuple[int, int, NDArr
     across, down = _blur_matrix(int(width), blur_px), _blur_matrix(int(height), blur_px)
     discs: list[tuple[int, int, NDArray[np.float32]]] = []
     for outline, (left, top) in zip(outlines, corners, strict=True):
+        if top >= rows:
+            continue
         cells = (outline - (left, top) + 0.5) * SUBCELLS
         fine = polygon_coverage(cells, int(width) * SUBCELLS, int(height) * SUBCELLS).astype(np.float32)
         coverage = np.empty((int(height), int(width)), dtype=np.float32)
@@ -147,10 +162,10 @@ def _blur_matrix(pixels: int, blur_px: float) -> NDArray[np.float32]:
     return ((below[left_edge + SUBCELLS] - below[left_edge]) / SUBCELLS).astype(np.float32)
 
 
-def _light(spec: SceneSpec) -> NDArray[np.float32]:
-    """Relative light on the image, 1 in the centre: a plane times a radial loss."""
+def _light(spec: SceneSpec, rows: int) -> NDArray[np.float32]:
+    """Relative light on the image's upper rows, 1 in the centre: a plane times a radial loss."""
     x = (np.arange(WIDTH_px) - (WIDTH_px - 1) / 2) / WIDTH_px
-    y = ((np.arange(HEIGHT_px) - (HEIGHT_px - 1) / 2) / HEIGHT_px)[:, None]
+    y = ((np.arange(rows) - (HEIGHT_px - 1) / 2) / HEIGHT_px)[:, None]
     corner_squared = (WIDTH_px**2 + HEIGHT_px**2) / (4.0 * WIDTH_px**2)
     radius_squared = (x**2 + (y * HEIGHT_px / WIDTH_px) ** 2) / corner_squared
     light = (1.0 + spec.light_slope[0] * x + spec.light_slope[1] * y) * (1.0 - spec.vignetting * radius_squared)

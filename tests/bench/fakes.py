@@ -65,8 +65,8 @@ def camera(address: str, serial_number: str, pace_MBps: str) -> tuple[str, list[
     clock = WallClock()
     image = np.random.default_rng(1).integers(0, 256, (HEIGHT_px, WIDTH_px), dtype=np.uint8)
 
-    def render(time_ns: int, exposure_s: float, gain_dB: float) -> NDArray[np.uint8]:
-        return image
+    def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
+        return image[:rows]
 
     plant = Plant(PlantSpec(camera_powered=True), clock.now_ns())
     fake = FakeCamera(plant, clock, render, address, serial_number, pace_MBps=float(pace_MBps))

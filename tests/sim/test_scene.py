@@ -115,6 +115,12 @@ def test_a_frame_depends_on_seed_and_time_only():
     assert (Scene(SceneSpec(), seed=8).render(at(), TIME_ns, 0.1, 0.0, 1.0) != frame).mean() > 0.5
 
 
+@pytest.mark.parametrize("rows", [2, 700, 2047])
+def test_the_upper_rows_alone_are_those_of_the_whole_frame(rows: int):
+    whole = Scene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 0.9)
+    assert (Scene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 0.9, rows) == whole[:rows]).all()
+
+
 def test_an_overexposed_frame_clips_at_255():
     frame = Scene(FLAT, seed=1).render(at(), TIME_ns, 0.2, 0.0, 1.0)
     assert frame[:50].min() == 255

@@ -42,10 +42,10 @@ class StubPlant:
         pass
 
 
-def render(time_ns: int, exposure_s: float, gain_dB: float) -> NDArray[np.uint8]:
+def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT) -> NDArray[np.uint8]:
     """Another pattern for every instant, exposure and gain."""
     seed = (time_ns, round(exposure_s * 1e6), round(gain_dB * 10))
-    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)[:rows]
 
 
 class Client:

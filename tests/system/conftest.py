@@ -15,6 +15,12 @@ from stand.running.order import Order
 from stand.simulator import Simulator, laboratory_of
 from tests.addresses import camera_address, free_port
 
+WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
+_FRAME: dict[str, object] = {
+    "width_px": 612,
+    "height_px": 256,
+}  # a picture costs the simulator as much as a quarter hour
+
 SHORT_RECIPE = """
 name: short
 experiments:
@@ -40,8 +46,13 @@ def require_aravis() -> None:
 
 
 @pytest.fixture
-def config_text(tmp_path: Path) -> Callable[..., str]:
-    """The installed simulated configuration at free addresses; keyword arguments replace whole sections' entries."""
+def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[..., str]:
+    """The installed simulated configuration at free addresses; keyword arguments replace whole sections' entries.
+
+    Frames show the upper left corner of the sensor; whoever needs the target says `camera=WHOLE_SENSOR`. By night all
+    have the whole sensor.
+    """
+    frame = _FRAME if request.node.get_closest_marker("nightly") is None else WHOLE_SENSOR
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
         data = yaml.safe_load(packaged("", "simulated").read_text())
@@ -49,7 +60,7 @@ def config_text(tmp_path: Path) -> Callable[..., str]:
         for name, axis in data["axes"].items():
             axis["address"] = f"serial:{tmp_path / name}"
         data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
-        data["camera"]["address"] = camera_address()
+        data["camera"] |= {"address": camera_address(), **frame}
         data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
         for section, entries in sections.items():
             data.setdefault(section, {}).update(entries)

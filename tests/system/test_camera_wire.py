@@ -59,9 +59,9 @@ class WarmPlant:
                 self.camera_power_on_ns = now_ns
 
 
-def noise(time_ns: int, exposure_s: float, gain_dB: float) -> NDArray[np.uint8]:
+def noise(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT_px) -> NDArray[np.uint8]:
     """An image that belongs to one instant only."""
-    return np.random.default_rng(time_ns).integers(0, 256, (HEIGHT_px, WIDTH_px), dtype=np.uint8)
+    return np.random.default_rng(time_ns).integers(0, 256, (HEIGHT_px, WIDTH_px), dtype=np.uint8)[:rows]
 
 
 @contextmanager
