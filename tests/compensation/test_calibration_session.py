@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +56,7 @@ class Recorded:
     true_px: np.ndarray
 
 
-async def record(directory: Path, role: str) -> None:
+async def record(directory: Path, role: str, places: Sequence[tuple[float, float]] = PLACES) -> None:
     clock, hub = VirtualClock(START_NS), Hub()
     info = SessionInfo(directory.name, "calibration", "TS-0001", "operator", "0.1.0", "virtual")
     devices = {"linear": "axis", "rotary": "axis", "camera": "camera"}
@@ -63,7 +64,7 @@ async def record(directory: Path, role: str) -> None:
     recorder = Recorder(directory, info, {"target.yaml": TARGET_YAML}, devices, hub, clock, settings)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
-    for number, place in enumerate(PLACES):
+    for number, place in enumerate(places):
         await publish_visit(hub, clock, number, place, role)
     for task in tasks:
         task.cancel()
@@ -87,9 +88,10 @@ async def publish_visit(hub: Hub, clock: VirtualClock, number: int, place: tuple
     parameters = {"frames": 2, "role": role, "chamber_degC": 24.0}
     hub.publish(StepMark(clock.now_ns(), capture, 3 * number + 2, "Capture", StepState.STARTED, parameters))
     scene = scene_at(place[0] + REPORTED_mm, place[1])
+    clean = render(scene)
     for frame in range(2):
         await clock.sleep_until(clock.now_ns() + NS_PER_S)
-        image = photograph(scene, render(scene), 10 * number + frame)
+        image = photograph(scene, clean, 10 * number + frame)
         if number == DARK and frame == 1:
             image = np.full_like(image, 3)
         hub.publish(Frame("camera.image", image, clock.now_ns(), 0.1, 0.0, 40.0, 2 * number + frame, 0, 0, capture))
@@ -206,7 +208,7 @@ def test_bad_input_is_refused_with_a_sentence_and_leaves_nothing(recorded: Recor
 
 
 def test_a_session_without_calibration_frames_is_refused(recorded: Recorded, tmp_path: Path):
-    asyncio.run(record(tmp_path / "poses", "pose"))
+    asyncio.run(record(tmp_path / "poses", "pose", PLACES[:1]))
     session = Session.open(tmp_path / "poses")
     with pytest.raises(SessionError, match="has no capture with the role calibration"):
         observe_positions(session, session_target(session))

@@ -16,10 +16,8 @@ from stand.simulator import Simulator, laboratory_of
 from tests.addresses import camera_address, free_port
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
-_FRAME: dict[str, object] = {
-    "width_px": 612,
-    "height_px": 256,
-}  # a picture costs the simulator as much as a quarter hour
+# Rendered and sent whole a frame costs as much as ten minutes of a night.
+_CORNER: dict[str, object] = {"width_px": 612, "height_px": 256}
 
 SHORT_RECIPE = """
 name: short
@@ -52,7 +50,7 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
     Frames show the upper left corner of the sensor; whoever needs the target says `camera=WHOLE_SENSOR`. By night all
     have the whole sensor.
     """
-    frame = _FRAME if request.node.get_closest_marker("nightly") is None else WHOLE_SENSOR
+    frame = _CORNER if request.node.get_closest_marker("nightly") is None else WHOLE_SENSOR
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
         data = yaml.safe_load(packaged("", "simulated").read_text())

@@ -13,7 +13,7 @@ from foundation.items import Event
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from tests.system.conftest import require_aravis
+from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 RECIPE = """
 name: short
@@ -36,7 +36,10 @@ def _aravis() -> None:
 
 async def test_roi_keeps_the_markers_and_a_whole_frame_of_each_capture(tmp_path: Path, order: Callable[..., Order]):
     directory = await run_virtual(
-        order(RECIPE, recording={"frame_encoding": "roi"}), tmp_path / "out", None, lambda hub: None
+        order(RECIPE, camera=WHOLE_SENSOR, recording={"frame_encoding": "roi"}),
+        tmp_path / "out",
+        None,
+        lambda hub: None,
     )
     session = Session.open(directory)
     windows = [frame.windows for frame in session.frames()]
@@ -49,7 +52,7 @@ async def test_roi_keeps_the_markers_and_a_whole_frame_of_each_capture(tmp_path:
 
 
 async def test_a_run_first_salvages_what_a_killed_one_has_left(tmp_path: Path, order: Callable[..., Order]):
-    ordered, events = order(RECIPE), []
+    ordered, events = order(RECIPE, camera=WHOLE_SENSOR), []
     whole = await run_virtual(ordered, tmp_path / "first", None, lambda hub: None)
     left = tmp_path / "out" / "killed"
     shutil.copytree(whole, left)

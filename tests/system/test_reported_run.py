@@ -17,7 +17,7 @@ from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.running.order import load_order
 from stand.session_report import MODEL_NAME, REPORT_NAME
-from tests.system.conftest import require_aravis
+from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 EVERY_SEQUENCE = """
 name: every-sequence
@@ -113,7 +113,7 @@ def check_reported(ended: subprocess.CompletedProcess[str]) -> Path:
 def test_one_command_runs_every_sequence_to_a_report(out: Path, config_text: Callable[..., str]):
     recipe = out.parent / "recipe.yaml"
     recipe.write_text(EVERY_SEQUENCE)
-    directory = check_reported(run_reported(str(recipe), config_text(), out, 900))
+    directory = check_reported(run_reported(str(recipe), config_text(camera=WHOLE_SENSOR), out, 900))
     assert Session.open(directory).frame_count == 3 + 4 + 2 + 5 + 2 * 3
 
 
@@ -121,7 +121,7 @@ def test_one_command_runs_every_sequence_to_a_report(out: Path, config_text: Cal
 def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, config_text: Callable[..., str]):
     recipe = out.parent / "recipe.yaml"
     recipe.write_text(TOO_FEW_TEMPERATURES)
-    ended = run_reported(str(recipe), config_text(), out, 600)
+    ended = run_reported(str(recipe), config_text(camera=WHOLE_SENSOR), out, 600)
     assert ended.returncode == NOT_REPORTED
     directory = Path(ended.stdout.strip())
     assert verify(directory).is_sound
@@ -136,7 +136,7 @@ def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, conf
 def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, config_text: Callable[..., str]):
     recipe = out.parent / "recipe.yaml"
     recipe.write_text(WARM_UP_ALONE)
-    ended = run_reported(str(recipe), config_text(), out, 600)
+    ended = run_reported(str(recipe), config_text(camera=WHOLE_SENSOR), out, 600)
     assert ended.returncode == 0, ended.stderr
     session, *lines = ended.stdout.splitlines()
     assert lines == [f"report   {Path(session) / REPORT_NAME}"]

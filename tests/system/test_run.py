@@ -23,7 +23,7 @@ from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
 from stand.simulator import ControlSocket
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import SHORT_RECIPE, WHOLE_SENSOR, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 
@@ -66,7 +66,7 @@ def at_step(kind: str, action: Callable[[], object]) -> Callable[[Hub], None]:
 
 
 async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order()
+    ordered = order(camera=WHOLE_SENSOR)
     first = await run_virtual(ordered, tmp_path / "first", 7, ignore)
     second = await run_virtual(ordered, tmp_path / "second", 7, ignore)
     assert digests(first) == digests(second)
@@ -279,7 +279,7 @@ async def test_frames_the_disk_refuses_are_counted_and_hold_the_run_until_it_tak
         until=lambda item: isinstance(item, Event) and item.kind == "guard.not_recorded"
     )
     with pytest.raises(SessionError, match="complete, but 2 frames were lost"):
-        await run_virtual(order(), tmp_path / "out", None, watch)
+        await run_virtual(order(camera=WHOLE_SENSOR), tmp_path / "out", None, watch)
     session = Session.open(next((tmp_path / "out").iterdir()))
     assert session.frame_count == 3
     kinds = [event.kind for event in session.events()]
@@ -297,7 +297,7 @@ async def test_a_virtual_run_whose_disk_never_takes_frames_ends_with_a_sentence(
 ):
     watch = refusing_from_the_first_capture(until=lambda item: False)
     with pytest.raises(StandError, match=r"held for 1 h of virtual time .*, and nobody let it go on"):
-        await run_virtual(order(guard={"pause_limit_h": 0.5}), tmp_path / "out", None, watch)
+        await run_virtual(order(camera=WHOLE_SENSOR, guard={"pause_limit_h": 0.5}), tmp_path / "out", None, watch)
     session = Session.open(next((tmp_path / "out").iterdir()))
     assert session.frame_count == 0
     assert next(event.text for event in session.events() if event.kind == "run.end").startswith("failed: held for 1 h")

@@ -12,7 +12,7 @@ from foundation.progress import progress
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from tests.system.conftest import require_aravis
+from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 RECIPE = """
 name: sequences
@@ -50,7 +50,9 @@ def _aravis() -> None:
 async def test_the_sequences_run_over_the_wire_and_leave_what_the_paper_needs(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    session = Session.open(await run_virtual(order(RECIPE), tmp_path / "sessions", 3, lambda _: None))
+    session = Session.open(
+        await run_virtual(order(RECIPE, camera=WHOLE_SENSOR), tmp_path / "sessions", 3, lambda _: None)
+    )
     check_frames(session)
     check_events(session.events())
     check_warm_up(session)

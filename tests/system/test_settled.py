@@ -14,7 +14,7 @@ from recording.reading.session import Session
 from stand.running.entries import Dwell, read_lines
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from tests.system.conftest import require_aravis
+from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 RECIPE = """
 name: settled
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.usefixtures("_aravis")
 
 
 async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: Path, order: Callable[..., Order]):
-    session = Session.open(await run_virtual(order(RECIPE), tmp_path, 3, lambda _: None))
+    session = Session.open(await run_virtual(order(RECIPE, camera=WHOLE_SENSOR), tmp_path, 3, lambda _: None))
     told = [event.text for event in session.events() if event.kind == "settled"]
     assert len(told) == 2
     assert all("K/min" in text and "mpx/min" in text for text in told)
