@@ -20,6 +20,15 @@ SESSION_CRC = "session_crc32"
 # that of `run.end`, how long its plan is in that of `run.start` and `run.resume`; a copy says of what extent it is and
 # which holes it has. Sessions of format 1 say nothing of all that and are read as before.
 FORMAT = 2
+_FORMAT_DIGITS = 4
+
+
+def later_format(session: Mapping[str, str]) -> str:
+    """What is wrong with the format that the record `session` states, in words; "" for one that this version knows."""
+    text = session.get("format", "1")
+    if text.isdecimal() and len(text) <= _FORMAT_DIGITS and int(text) <= FORMAT:
+        return ""
+    return f"is of format {text[:20]!r}; this version of thermostand reads up to {FORMAT}"
 
 
 def segment_metadata(series: str, number: int, session: Mapping[str, str]) -> dict[str, str]:

@@ -20,7 +20,7 @@ from recording.format.damage import DAMAGE, reading
 from recording.format.holes import holes_in, segments_text
 from recording.format.inventory import SegmentFile, State, inventory
 from recording.format.items import event_of, step_of
-from recording.format.layout import FINISHED, FRAMES, TELEMETRY
+from recording.format.layout import FINISHED, FRAMES, TELEMETRY, later_format
 from recording.format.records import Head, read_head, telemetry_messages
 from recording.format.summary import Summary, read_summary
 from recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
@@ -79,7 +79,9 @@ class Glance:
         """Whether the files are sound, by what a glance can tell; `stand session verify` reads all of them."""
         if self.troubles:
             return Files.DAMAGED
-        return Files.INCOMPLETE if self.missing else Files.SOUND
+        if self.missing:
+            return Files.INCOMPLETE
+        return Files.UNKNOWN if later_format(self.metadata) else Files.SOUND
 
     @property
     def lacks(self) -> str:
@@ -89,7 +91,7 @@ class Glance:
     @property
     def state_text(self) -> str:
         """The same with the first reason: `incomplete: telemetry/0003.mcap is missing`."""
-        reasons = self.troubles or self.missing
+        reasons = self.troubles or self.missing or tuple(filter(None, [later_format(self.metadata)]))
         more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
         return f"{self.state}: {reasons[0]}{more}" if reasons else str(self.state)
 

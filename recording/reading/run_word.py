@@ -24,11 +24,12 @@ class Run(StrEnum):
 
 class Files(StrEnum):
     """sound: everything that was acknowledged is there and as it was written. incomplete: something of it is missing.
-    damaged: something is not as it was written."""
+    damaged: something is not as it was written. unknown: by a later version, whose format this one does not know."""
 
     SOUND = "sound"
     INCOMPLETE = "incomplete"
     DAMAGED = "damaged"
+    UNKNOWN = "unknown"
 
 
 _STOPPED_BY_OPERATOR = "interrupted"  # what the journals of format 1 call it

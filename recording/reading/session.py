@@ -40,7 +40,7 @@ from recording.format.items import (
     stands_for_item,
     step_of,
 )
-from recording.format.layout import DAMAGED, DEVICES, FINISHED, FORMAT, FRAMES, TELEMETRY, UNFINISHED
+from recording.format.layout import DAMAGED, DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED, later_format
 from recording.format.records import (
     FramePlace,
     Message,
@@ -63,7 +63,7 @@ from recording.reading.run_word import Run, run_word
 
 T = TypeVar("T")
 _HOLES_TOLD_BY = (messages.CAMERA_META, messages.EVENT, messages.STEP)
-_FORMAT_DIGITS, _NUMBER_DIGITS = 4, 18
+_NUMBER_DIGITS = 18
 
 
 class Session:
@@ -79,7 +79,8 @@ class Session:
         head = read_head(telemetry[0])
         self.metadata = head.session
         self._attachments = head.attachments
-        _check_format(path, self.metadata)
+        if text := later_format(self.metadata):
+            raise SessionError(f"{path}: {text}")
         self._salvaged: dict[Path, bool] = {}  # of the segments known to belong here: whether a salvage has made them
         for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others
             with suppress(_Unreadable):  # it is told when it is read
@@ -364,13 +365,6 @@ class Session:
 
 class _Unreadable(FileDamaged):
     """The head of a segment cannot be read."""
-
-
-def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
-    """SessionError for a session of a later version of thermostand."""
-    text = metadata.get("format", "1")
-    if not text.isdecimal() or len(text) > _FORMAT_DIGITS or int(text) > FORMAT:
-        raise SessionError(f"{path}: is of format {text[:20]!r}; this version of thermostand reads up to {FORMAT}")
 
 
 def _number(segment: Path) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from recording.format.layout import (
     SEGMENT_METADATA,
     SESSION_METADATA,
     TELEMETRY,
+    later_format,
 )
 from recording.format.records import Message
 from recording.format.utc_offsets import UtcOffsets, offsets_of
@@ -39,6 +40,7 @@ from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_
 from recording.reading.kept import is_recovered
 from recording.reading.run_word import Files, Run, run_word
 from recording.repair.segment_check import Damage, SegmentCheck, check_segment
+from recording.writing.settings import SessionInfo
 
 
 class Severity(StrEnum):
@@ -77,7 +79,7 @@ class Verification:
     def files(self) -> Files:
         """The gravest of what was found."""
         words = {finding.files for finding in self.findings}
-        return next((word for word in (Files.DAMAGED, Files.INCOMPLETE) if word in words), Files.SOUND)
+        return next((word for word in (Files.DAMAGED, Files.INCOMPLETE, Files.UNKNOWN) if word in words), Files.SOUND)
 
     @property
     def is_sound(self) -> bool:
@@ -127,6 +129,17 @@ def _link(file: SegmentFile, check: SegmentCheck) -> Link:
     return Link(file.series, file.number, check.messages, check.first_ns, check.last_ns, is_salvaged)
 
 
+def _format(session: Mapping[str, str]) -> Iterator[Finding]:
+    """What a later version of thermostand may have recorded is not known here."""
+    if text := later_format(session):
+        yield Finding(Severity.ERROR, "", f"{text}: what is new in that was not checked", Files.UNKNOWN)
+    elif unknown := sorted(session.keys() - {field.name for field in fields(SessionInfo)}):
+        names = ", ".join(name[:40] for name in unknown[:6])
+        yield _note(
+            f"the record of the session has fields that this version does not know: {names}; they were not checked"
+        )
+
+
 def _extent(extent: Extent | None, utc: UtcOffsets) -> Iterator[Finding]:
     if extent is not None:
         yield _note(extent.text(utc))
@@ -154,6 +167,7 @@ def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Ver
     coverage = read.coverage(journal)
     extent = extent_of(read.session())
     findings = (
+        *_format(read.session()),
         *_extent(extent, utc),
         *_not_finished(files, read.checks),
         *_missing(coverage, utc),

@@ -22,6 +22,7 @@ from recording.reading.session import Session
 from recording.reading.using import open_whole
 from recording.repair.salvage import salvage_session
 from recording.repair.verify import verify
+from tests.stand.hostile_sessions import everywhere
 
 from .damage import METADATA, write_segment
 from .recorded import START_NS, images, record, telemetry
@@ -301,6 +302,22 @@ def test_a_session_of_a_later_format_is_refused_with_a_sentence(tmp_path):
     write_segment(tmp_path / TELEMETRY, TELEMETRY, range(2), finish=True, metadata={**METADATA, "format": "3"})
     with pytest.raises(SessionError, match="is of format '3'; this version of thermostand reads up to 2"):
         Session.open(tmp_path)
+
+
+def test_of_a_later_format_it_is_unknown_whether_everything_is_there(session):
+    everywhere(session, format="3")
+    found, seen = verify(session), glance(session)
+    assert found.files is seen.state is Files.UNKNOWN
+    assert not found.is_sound
+    assert "is of format '3'; this version of thermostand reads up to 2" in seen.state_text
+    assert "what is new in that was not checked" in str(found.findings[0])
+
+
+def test_a_field_that_this_version_does_not_know_is_named(session):
+    everywhere(session, weather="fog")
+    found = verify(session)
+    assert found.files is glance(session).state is Files.SOUND
+    assert any("fields that this version does not know: weather" in finding.text for finding in found.findings)
 
 
 def test_holes_in_a_record_are_read_again_and_nonsense_is_none():

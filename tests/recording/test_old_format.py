@@ -4,7 +4,10 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+from click.testing import Result
+from typer.testing import CliRunner
 
+from compensation.cli import app as compensate
 from recording.exporting.replay import replay_and_record
 from recording.exporting.trim import trim
 from recording.reading.glance import glance
@@ -12,6 +15,7 @@ from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 from recording.repair.verify import verify
+from stand.commands.commands import app as stand
 
 SESSION = Path(__file__).parent / "data" / "20260101T180000Z-format-1"
 
@@ -48,3 +52,35 @@ def test_its_run_has_a_word_without_its_journal_too(tmp_path):
     directory = shutil.copytree(SESSION, tmp_path / "s")
     (directory / "journal.jsonl").unlink()
     assert (verify(directory).run, verify(directory).files) == (Run.COMPLETE, Files.INCOMPLETE)
+
+
+def asked(app, *words) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_every_command_that_looks_at_a_session_works_on_it(tmp_path):
+    info = asked(stand, "session", "info", SESSION)
+    assert info.exit_code == 0, info.output
+    assert "3" in next(line for line in info.output.splitlines() if line.startswith("frames"))
+    listed = asked(stand, "session", "list", SESSION.parent)
+    assert listed.exit_code == 0
+    assert "complete" in listed.output
+    verified = asked(stand, "session", "verify", SESSION)
+    assert verified.exit_code == 0, verified.output
+    assert "sound" in verified.output
+    exported = asked(stand, "session", "export", SESSION, "--out", tmp_path / "tables")
+    assert exported.exit_code == 0, exported.output
+    assert len(list((tmp_path / "tables").rglob("*.png"))) == 3
+
+
+def test_its_frames_are_a_table_and_are_looked_at_for_markers(tmp_path):
+    table = Session.open(SESSION).frames_table()
+    assert len(table) == 3
+    assert np.isfinite(table.camera_degC).all()
+    assert np.isfinite(table.air_degC).all()
+    assert all(table.role)
+    assert set(table.positions) == {"linear", "rotary"}
+    for command in ("detect", "fit", "report"):  # its frames show too little of the target
+        found = asked(compensate, command, SESSION, "-o", tmp_path / command)
+        assert found.exit_code == 1
+        assert "of 54 markers" in found.output.splitlines()[-1]

@@ -24,7 +24,7 @@ from recording.format.images import CAMERA_IMAGE
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.wire import CHUNK, LENGTH, RECORD
 
-SOUND, INCOMPLETE, DAMAGED, NONE = "sound", "incomplete", "damaged", ""
+SOUND, INCOMPLETE, DAMAGED, UNKNOWN, NONE = "sound", "incomplete", "damaged", "unknown", ""
 GB = 1 << 30
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -284,7 +284,9 @@ ROWS: dict[str, Row] = {
     "two segments exchanged": Row(swapped, DAMAGED),
     "the series exchanged": Row(exchanged, DAMAGED),
     "a segment of another session": Row(lambda s: rewritten(frames(s, 2), session_id="night-2"), DAMAGED),
-    "a segment of a version that is not known": Row(lambda s: everywhere(s, format_version="999"), SOUND),
+    "a later format": Row(lambda s: everywhere(s, format="999"), UNKNOWN),
+    "a format that is no number": Row(lambda s: everywhere(s, format="two"), UNKNOWN),
+    "a field that is not known": Row(lambda s: everywhere(s, format_version="999"), SOUND),
     "a segment far outside": Row(lambda s: shutil.copy(telemetry(s, 1), s / TELEMETRY / "99999999999.mcap"), DAMAGED),
     "an empty segment far outside": Row(lambda s: (s / TELEMETRY / "99999999999.mcap").touch(), DAMAGED),
     "a number of 200 digits": Row(lambda s: (s / FRAMES / f"{'9' * 200}.mcap").touch(), DAMAGED),
