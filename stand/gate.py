@@ -71,12 +71,14 @@ class Gate:
 
 
 class Phase(StrEnum):
-    """Where a run is."""
+    """Where a run is. aborting: it is being made safe, then it is cancelled. ending: it makes safe and takes everything
+    down by itself, and must not be cancelled."""
 
     IDLE = "idle"
     RUNNING = "running"
     HELD = "held"
     ABORTING = "aborting"
+    ENDING = "ending"
     ENDED = "ended"
 
 
@@ -87,15 +89,18 @@ class Turn(StrEnum):
     HOLD = "hold"
     RELEASE = "release"
     STOP = "stop"
+    TAKE_DOWN = "take_down"
     END = "end"
 
 
 # What is not in a row changes nothing: a run that is being aborted cannot be held, one that has ended stays so.
+_LAST: dict[Turn, Phase] = {Turn.STOP: Phase.ABORTING, Turn.TAKE_DOWN: Phase.ENDING, Turn.END: Phase.ENDED}
 _NEXT: dict[Phase, dict[Turn, Phase]] = {
-    Phase.IDLE: {Turn.START: Phase.RUNNING, Turn.STOP: Phase.ABORTING, Turn.END: Phase.ENDED},
-    Phase.RUNNING: {Turn.HOLD: Phase.HELD, Turn.STOP: Phase.ABORTING, Turn.END: Phase.ENDED},
-    Phase.HELD: {Turn.RELEASE: Phase.RUNNING, Turn.STOP: Phase.ABORTING, Turn.END: Phase.ENDED},
-    Phase.ABORTING: {Turn.END: Phase.ENDED},
+    Phase.IDLE: {Turn.START: Phase.RUNNING, **_LAST},
+    Phase.RUNNING: {Turn.HOLD: Phase.HELD, **_LAST},
+    Phase.HELD: {Turn.RELEASE: Phase.RUNNING, **_LAST},
+    Phase.ABORTING: {Turn.TAKE_DOWN: Phase.ENDING, Turn.END: Phase.ENDED},
+    Phase.ENDING: {Turn.END: Phase.ENDED},
     Phase.ENDED: {},
 }
 

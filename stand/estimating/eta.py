@@ -7,9 +7,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from statistics import median_low
 from types import MappingProxyType
+from typing import Any, cast
 
+from experiments.steps import estimate_s, frames_of, kind_of, number_steps, step_of
 from foundation.clock import NS_PER_S
 from foundation.items import Event, StepMark, StepState
+from recording.reading.contents import PLAN_CHANGED
 from stand.estimating.estimate import PricedStep
 
 _REMEMBERED = 9  # the last measurements of a kind of work count
@@ -52,14 +55,23 @@ class Eta:
         if mark.state is StepState.STARTED:
             self._begin(self._steps[mark.index], mark.time_ns)
             return
-        running, self._running = self._running, None
-        if running is not None and mark.state is StepState.DONE:
+        running = self._running
+        if running is None or running.planned.index != mark.index:
+            return
+        self._running = None
+        if mark.state is StepState.DONE:
             seen_s = self._seen_s[running.work]
             seen_s.append(self._progress_s(mark.time_ns) - running.stated_s)
             self._overhead_s[running.work] = median_low(seen_s)
 
+    @property
+    def count(self) -> int:
+        """How many steps the plan has now."""
+        return len(self._steps)
+
     def event(self, event: Event) -> None:
-        """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further."""
+        """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further.
+        `plan_changed`: an operator has changed what is still to be done."""
         if event.kind == "held":
             self._held_since_ns = event.time_ns if self._held_since_ns is None else self._held_since_ns
             self._reasons.add(event.data.get("reason"))
@@ -68,6 +80,8 @@ class Eta:
             if self._held_since_ns is not None and not self._reasons:
                 self._held_ns += event.time_ns - self._held_since_ns
                 self._held_since_ns = None
+        elif event.kind == PLAN_CHANGED:
+            self._change(event.data)
 
     def left_s(self, now_ns: int) -> float:
         """From `now_ns` until the plan is done, s; a pause that is under way is taken to end now."""
@@ -77,17 +91,51 @@ class Eta:
             left_s += max(0.0, expected_s - self._progress_s(now_ns))
         return max(0.0, left_s)
 
+    def _change(self, data: Mapping[str, object]) -> None:
+        """What replaces steps is priced by what it states."""
+        by, first = data.get("by"), data.get("from_index")
+        if isinstance(by, list) and isinstance(first, int):
+            for index in range(first, len(self._steps)):
+                self._forget(index)
+            steps = (step_of(each["kind"], each["parameters"]) for each in cast("list[dict[str, Any]]", by))
+            del self._steps[first:]
+            for planned in number_steps(steps, first):
+                stated_s, work = estimate_s(planned.step, 0.0), kind_of(planned.step)
+                self._overhead_s.setdefault(work, 0.0)
+                self._seen_s.setdefault(work, deque([0.0], _REMEMBERED))
+                self._steps.append(PricedStep(planned, stated_s, frames_of(planned.step), 0.0, work, stated_s))
+                self._wait_for(planned.index)
+            return
+        found = (step.planned.index for step in self._steps if step.planned.step_id == data.get("step_id"))
+        by_s = data.get("by_s")
+        for index in found:
+            step, is_waiting = self._steps[index], self._forget(index)
+            if isinstance(by_s, int | float):
+                self._steps[index] = replace(step, stated_s=step.stated_s + by_s, duration_s=step.duration_s + by_s)
+                if is_waiting:
+                    self._wait_for(index)
+            if self._running is step:
+                self._running = self._steps[index] if isinstance(by_s, int | float) else None
+
+    def _wait_for(self, index: int) -> None:
+        self._waiting[index] = step = self._steps[index]
+        self._stated_s += step.stated_s
+        self._count[step.work] += 1
+
+    def _forget(self, index: int) -> bool:
+        """Whether the step was waited for."""
+        waiting = self._waiting.pop(index, None)
+        if waiting is not None:
+            self._stated_s -= waiting.stated_s
+            self._count[waiting.work] -= 1
+        return waiting is not None
+
     def _begin(self, step: PricedStep, time_ns: int) -> None:
         for index in range(step.planned.index + 1, self._first):  # of a warm-up that begins anew
-            self._waiting[index] = again = self._steps[index]
-            self._stated_s += again.stated_s
-            self._count[again.work] += 1
+            self._wait_for(index)
         self._first = min(self._first, step.planned.index)
         for index in range(self._first, step.planned.index + 1):
-            waiting = self._waiting.pop(index, None)
-            if waiting is not None:
-                self._stated_s -= waiting.stated_s
-                self._count[waiting.work] -= 1
+            self._forget(index)
         self._first = max(self._first, step.planned.index + 1)
         self._running, self._begun_ns, self._held_ns = step, time_ns, 0
         if self._held_since_ns is not None:

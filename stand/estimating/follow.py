@@ -36,7 +36,6 @@ class Follow:
     ) -> None:
         self.eta = Eta(steps, done, earned_s)
         self._total_s = max(sum(step.duration_s for step in steps), 1e-9)
-        self._count = len(steps)
         self._report, self._warn = report, warn
         self._step = ""
         self._begin_ns: int | None = None
@@ -57,7 +56,7 @@ class Follow:
             return
         if isinstance(item, StepMark):
             self.eta.mark(item)
-            self._step = f"{item.index + 1}/{self._count} {item.kind} {parameters_text(item.parameters)}".rstrip()
+            self._step = f"{item.index + 1}/{self.eta.count} {item.kind} {parameters_text(item.parameters)}".rstrip()
             self._begin_ns = item.time_ns if self._begin_ns is None else self._begin_ns
             self._next_ns = item.time_ns
         if self._begin_ns is not None and item.time_ns >= self._next_ns:

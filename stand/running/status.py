@@ -24,6 +24,7 @@ _STATES: dict[Phase, State] = {
     Phase.RUNNING: "running",
     Phase.HELD: "held",
     Phase.ABORTING: "stopping",
+    Phase.ENDING: "stopping",
     Phase.ENDED: "stopping",
 }
 
@@ -43,7 +44,6 @@ class StatusBoard:
         clock: Clock,
     ) -> None:
         self._recipe = recipe
-        self._count = len(steps)
         self._eta = Eta(steps, state.done, state.earned_s)
         self._gate = gate
         self._stop = stop
@@ -86,7 +86,7 @@ class StatusBoard:
         return RunStatus(
             recipe=self._recipe,
             step=self._step,
-            steps=self._count,
+            steps=self._eta.count,
             doing=self._doing,
             state=self._state,
             reasons=tuple(sorted(self._gate.reasons)),

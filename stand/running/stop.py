@@ -33,7 +33,6 @@ class Stop:
         self.phase = Phase.IDLE
         self._stand: Stand | None = None
         self._aborting: asyncio.Task[None] | None = None
-        self._taking_down = False
         self._signals = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             self._signals.append(signal.SIGHUP)
@@ -54,7 +53,7 @@ class Stop:
         self.fault = self.fault or fault
         if self._stand is not None:
             self._stand.latch(fault)
-        if self.phase in (Phase.ABORTING, Phase.ENDED) or self._taking_down:
+        if self.phase in (Phase.ABORTING, Phase.ENDING, Phase.ENDED):
             if self._stand is not None and fault.rule == OPERATOR:
                 self._stand.safety.give_up()
             return
@@ -67,11 +66,11 @@ class Stop:
 
     def taking_down(self) -> None:
         """From here on the run makes safe and cleans up by itself and must not be cancelled."""
-        self._taking_down = True
+        self._turn(Turn.TAKE_DOWN)
 
     async def settled(self) -> None:
         """From here on nothing is cancelled: the clock and the wires may go."""
-        self._taking_down = True
+        self._turn(Turn.TAKE_DOWN)
         if self._aborting is not None:
             await asyncio.wait([self._aborting])
 
@@ -83,8 +82,8 @@ class Stop:
         try:
             await stand.safety.tried()
         finally:
-            if not self._taking_down:
-                self._taking_down = True
+            if self.phase is Phase.ABORTING:
+                self._turn(Turn.TAKE_DOWN)
                 self._run.cancel()
 
     def _follow(self, gate: Gate) -> None:

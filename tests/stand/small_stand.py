@@ -35,7 +35,8 @@ COMMIT_EVERY_S = 1.0  # and what was published before that, it has in any case
 
 
 class SmallStand:
-    """As stand.stand.Stand towards the executor. broken: the next action fails; camera_back_ns: until then it is
+    """As stand.stand.Stand towards the executor. broken: the next action fails; unconfirmed: the
+    next try to make it safe does, as one does that takes more than its real time; camera_back_ns: until then it is
     lost; supplied: whether the camera is. It is its own chamber, imaging, camera supply and table."""
 
     def __init__(self, clock, hub, wrong):
@@ -50,7 +51,7 @@ class SmallStand:
         self.fault = None
         self.name = "stand"
         self.supplied, self.supplied_ns = True, None
-        self.safe = self.heating = self.flap_open = self.broken = False
+        self.safe = self.heating = self.flap_open = self.broken = self.unconfirmed = False
         self.camera_back_ns = 0
         self.image = None  # what a look shows
         self.started_at_degC = None  # what the chamber was at when it was last set going, None after a new set-point
@@ -154,6 +155,9 @@ class SmallStand:
 
     async def make_safe(self):
         self.heating = self.flap_open = False
+        if self.unconfirmed:
+            self.unconfirmed = False
+            raise TimeoutError
         await self._clock.sleep_until(self._clock.now_ns() + NS_PER_S)
         self.heating = self.flap_open = False
         self.safe = True
@@ -253,8 +257,9 @@ class Life:
         reading = Reading("regulator.pv", pv_degC, "degC", self.clock.now_ns())
         self.hub.publish(Batch("regulator", self.clock.now_ns(), (reading,)))
 
-    def interlock(self):
-        """As the guard does: hold, then make safe; the run waits."""
+    def interlock(self, unconfirmed=False):
+        """As the guard does: hold, then make safe; the run waits. The first try may not confirm."""
+        self.stand.unconfirmed = unconfirmed
         self.call(lambda: (self.stand.gate.hold(INTERLOCK), self.stand.safety.demand()))
         self.do(self.stand.safety.tried())
 
@@ -288,6 +293,8 @@ class Life:
 
     def _on_gate(self, reason, held):
         self.disturbances += held and reason == INTERLOCK
+        if reason == INTERLOCK and not held:
+            self.stand.safety.forgive()  # or a late try would undo what the run does from now on
         if held and len(self.stand.gate.reasons) == 1:
             self._closed_ns = self.clock.now_ns()
             self._open_ns += self._closed_ns - self._open_since_ns

@@ -37,6 +37,7 @@ from stand.estimating.eta import Eta
 from stand.estimating.follow import Follow
 from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
 from stand.estimating.thermal_model import ChamberModel, Response
+from stand.running.entries import Change, Edited, Extended, Skipped, data_of
 from tests.recording.recorded import record
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S
@@ -282,6 +283,34 @@ def test_steps_that_are_begun_again_are_waited_for_again(config: StandConfig):
     eta.mark(third)
     eta.mark(fourth)
     assert eta.left_s(0) == pytest.approx(660)
+
+
+def changed(change: Change) -> Event:
+    return Event(BEGIN_NS, "warning", "plan_changed", "", data_of(change))
+
+
+def test_what_an_operator_changes_of_the_plan_changes_the_time_left(config: StandConfig):
+    plan = planned(Soak(600.0), Soak(300.0), Soak(60.0))
+    eta = Eta(price(plan, config))
+    eta.mark(marks(plan, [600.0, 300.0, 60.0])[0])
+    now_ns = BEGIN_NS + 100 * NS_PER_S
+    assert (eta.left_s(now_ns), eta.count) == (860.0, 3)
+    eta.event(changed(Extended(0, plan[0].step_id, 50.0)))
+    eta.event(changed(Extended(0, plan[1].step_id, 7.0)))
+    assert eta.left_s(now_ns) == 917.0
+    eta.event(changed(Skipped(0, plan[2].step_id)))
+    eta.mark(StepMark(now_ns, plan[2].step_id, 2, "Soak", StepState.SKIPPED))
+    assert eta.left_s(now_ns) == 857.0
+    by: list[dict[str, object]] = [
+        {"kind": "Soak", "parameters": {"duration_s": each_s}} for each_s in (20.0, 30.0, 40.0)
+    ]
+    eta.event(changed(Edited(0, 1, by)))
+    assert (eta.left_s(now_ns), eta.count) == (640.0, 4)
+    eta.mark(StepMark(now_ns, plan[0].step_id, 0, "Soak", StepState.SKIPPED))
+    eta.event(changed(Skipped(0, plan[0].step_id)))
+    assert eta.left_s(now_ns) == 90.0
+    eta.mark(StepMark(now_ns, "b", 1, "Soak", StepState.STARTED))
+    assert eta.left_s(now_ns + 5 * NS_PER_S) == 85.0
 
 
 def test_steps_before_the_running_one_are_not_waited_for(config: StandConfig):

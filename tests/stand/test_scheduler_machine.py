@@ -184,15 +184,19 @@ class RunMachine(RuleBasedStateMachine):
         self.life.stand.camera_back_ns = self.life.clock.now_ns() + seconds_ns(duration_s)
 
     @precondition(lambda self: not self.life.run.done() and self.life.stand.fault is None)
-    @rule()
-    def interlock(self):
+    @rule(unconfirmed=st.booleans())
+    def interlock(self, unconfirmed):
         self.holding.add(INTERLOCK)
-        self.life.interlock()
+        self.life.interlock(unconfirmed)
 
     @precondition(lambda self: not self.life.run.done() and self.life.stand.fault is None)
-    @rule(duration_s=st.sampled_from([0.0, 5.0, 90.0]), pv_degC=st.sampled_from([24.0, 26.0, 30.0]))
-    def interlock_for_a_while(self, duration_s, pv_degC):
-        self.interlock()
+    @rule(
+        duration_s=st.sampled_from([0.0, 5.0, 90.0]),
+        pv_degC=st.sampled_from([24.0, 26.0, 30.0]),
+        unconfirmed=st.booleans(),
+    )
+    def interlock_for_a_while(self, duration_s, pv_degC, unconfirmed):
+        self.interlock(unconfirmed)
         self.life.passes(duration_s)
         self.operator_clears(pv_degC)
 

@@ -21,6 +21,7 @@ from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSetti
 from stand.running.entries import Begun, Dwell, Ended
 from stand.running.journal import Journal
 from stand.running.logbook import Logbook
+from stand.running.state import RunState
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", telemetry_commit_s=0.05, stop_frames_below_bytes=0, alert_below_fraction=0.0)
@@ -50,7 +51,7 @@ async def main(directory):
     recorder = Recorder(directory, INFO, {}, {}, hub, clock, SETTINGS, disk=disk)
     await recorder.begin(tuple)
     recording = asyncio.create_task(recorder.run())
-    log, journal = Logbook(hub, clock), Journal.create(directory)
+    log, journal = Logbook(hub, clock, RunState(())), Journal.create(directory)
     await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
     recorder.beside(journal)
     publishing = asyncio.create_task(publish(hub, clock, journal))
