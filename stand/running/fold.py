@@ -83,7 +83,8 @@ def after(state: RunState, entry: Entry) -> RunState:
             return replace(state, disturbances=state.disturbances + 1, is_cold=True)
         case Restored(_, disturbances):
             is_cold = state.is_cold and disturbances < state.disturbances
-            return replace(state, restored=max(state.restored, disturbances), is_cold=is_cold)
+            restored = min(max(state.restored, disturbances), state.disturbances)
+            return replace(state, restored=restored, is_cold=is_cold)
         case Skipped() | Extended() | Edited():
             return state if refusal(state, entry) else _changed(state, entry)
         case Tripped(_, _, text):

@@ -1,0 +1,141 @@
+"""The state of a run is folded from its entries: any of them, in any order, and the same from the journal's lines."""
+
+import dataclasses
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stand.running.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
+from stand.running.entries import (
+    Again,
+    Begun,
+    Cleared,
+    Cooled,
+    Due,
+    Dwell,
+    Edited,
+    Ended,
+    Extended,
+    Gap,
+    Held,
+    Readying,
+    Restored,
+    Skipped,
+    Step,
+    Taken,
+    Tripped,
+    Written,
+    encode_line,
+    read_lines,
+)
+from stand.running.fold import after, fold
+from stand.running.state import RunState
+from tests.stand.test_run_table import ID, PLAN, S
+
+ids = st.sampled_from([*ID, "unknown"])
+soak = {"kind": "Soak", "parameters": {"duration_s": 5.0}}
+open_flap = {"kind": "OpenFlap", "parameters": {}}
+KINDS = {
+    Step: st.tuples(ids, st.sampled_from(["started", "done"])),
+    Dwell: st.tuples(ids, st.floats(0, 200)),
+    Held: st.tuples(st.sampled_from(["operator", "interlock", "disk_low"]), st.booleans()),
+    Again: st.tuples(st.lists(ids, max_size=3)),
+    Skipped: st.tuples(ids),
+    Extended: st.tuples(ids, st.floats(-5, 50)),
+    Edited: st.tuples(st.integers(-1, 15), st.lists(st.sampled_from([soak, open_flap]), max_size=3)),
+    Tripped: st.tuples(st.just("rule"), st.just("text")),
+    Cleared: st.tuples(),
+    Ended: st.tuples(st.sampled_from(["stopped", "complete"]), st.just("text")),
+    Taken: st.tuples(ids),
+    Due: st.tuples(st.none() | st.integers(0, 100 * S), st.booleans()),
+    Readying: st.tuples(st.booleans()),
+    Restored: st.tuples(st.integers(0, 5)),
+    Cooled: st.tuples(),
+}
+VOID = (Due, Readying, Restored, Cooled)  # not written, and void after a gap
+
+
+@st.composite
+def runs(draw):
+    """Entries at instants that only grow."""
+    entries, now_ns = [], 0
+    for kind in draw(st.lists(st.sampled_from([*KINDS, Gap]), max_size=30)):
+        from_ns, now_ns = now_ns, now_ns + draw(st.integers(0, 40 * S))
+        entries.append(Gap(from_ns, now_ns) if kind is Gap else kind(now_ns, *draw(KINDS[kind])))
+    return entries
+
+
+def lasting(state: RunState) -> dict[str, object]:
+    """What a gap leaves; for how long it was out, and how often disturbed, is not known to the last digit."""
+    fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    for name in ("out_ns", "out_since_ns", "seen_ns", "was_held", "disturbances", "restored", "is_cold"):
+        del fields[name]
+    return fields
+
+
+@given(runs())
+def test_any_entries_make_a_state_that_holds_together(entries):
+    state = fold(PLAN, entries)
+    ids = [planned.step_id for planned in state.plan]
+    assert [planned.index for planned in state.plan] == list(range(len(ids)))
+    assert all(step_id in state.done for step_id in ids[: state.index])
+    assert state.index == len(ids) or ids[state.index] not in state.done
+    assert state.skipped <= state.done
+    assert 0 <= state.restored <= state.disturbances
+    assert all(state.owed_ns(planned) >= 0 for planned in state.plan)
+    assert state.outage_ns(2000 * S) >= 0
+    next_action(state, Surroundings(2000 * S))
+
+
+@given(runs(), st.integers(0, 30))
+def test_entry_by_entry_is_the_same_as_all_at_once(entries, cut):
+    state = fold(PLAN, entries[:cut])
+    for entry in entries[cut:]:
+        state = after(state, entry)
+    assert state == fold(PLAN, entries)
+
+
+@given(runs())
+def test_after_a_gap_nothing_is_done_before_the_stand_is_as_it_was(entries):
+    state = after(fold(PLAN, entries), Gap(1900 * S, 2000 * S))
+    assert (state.is_disturbed, state.under_way, state.reasons, state.due_ns) == (True, "", frozenset(), None)
+    assert not isinstance(next_action(state, Surroundings(2000 * S)), Aim | Earn | Perform | TakeFrame)
+
+
+@given(runs())
+def test_what_is_not_written_is_proved_by_the_recording_or_void_after_a_gap(entries):
+    gap = Gap(1900 * S, 2000 * S)
+    kept = [entry for entry in entries if not isinstance(entry, VOID)]
+    assert lasting(fold(PLAN, [*entries, gap])) == lasting(fold(PLAN, [*kept, gap]))
+
+
+@given(runs())
+def test_the_lines_of_a_journal_make_the_same_state(entries):
+    written = [Begun(0, "night-1", "0f", {}), *(entry for entry in entries if isinstance(entry, Written))]
+    lines = b"".join(map(encode_line, written))
+    assert fold(PLAN, read_lines(lines)[0]) == fold(PLAN, written)
+
+
+OLD = b"""\
+572ccb08 {"entry": "Begun", "time_ns": 1767290410650000000, "run": "20260101T180000Z-warm", "plan": "ad3190b2c63808e9", "texts": \
+{"config.yaml": "aa1f5212ae546e79", "recipe.yaml": "41b3154da3e88692", "target.yaml": "00dc7edb33b066d7"}, \
+"seed": 1}
+908cafae {"entry": "Step", "time_ns": 1767290410650000000, "step_id": "300c383f4748", "state": "started"}
+94f02eb6 {"entry": "Step", "time_ns": 1767290410800000000, "step_id": "300c383f4748", "state": "done"}
+b7a497cf {"entry": "Dwell", "time_ns": 1767290498900000000, "step_id": "a3f5ce16725c", "earned_s": 60.0}
+21549590 {"entry": "Held", "time_ns": 1767290507600000000, "reason": "interlock", "held": true}
+d1ca24ec {"entry": "Cleared", "time_ns": 1767290560650000000}
+1701a400 {"entry": "Again", "time_ns": 1767290560650000000, "step_ids": ["5ad769f71479", "153e3deaed10", \
+"511dd54d2a88", "abda167cb1de", "78b30c06fba1", "5600e5a40ea3", "ea038b26529d", "fb2903a59a45"]}
+291ded75 {"entry": "Gap", "from_ns": 1767290508850000000, "time_ns": 1767290619500000000}
+4bf0d7d8 {"entry": "Ended", "time_ns": 1767291659150000000, "status": "complete", "text": "complete"}
+"""
+
+
+def test_a_journal_of_the_version_before_changes_of_plans_is_read():
+    entries, size_bytes = read_lines(OLD)
+    assert size_bytes == len(OLD)
+    kinds = ["Begun", "Step", "Step", "Dwell", "Held", "Cleared", "Again", "Gap", "Ended"]
+    assert [type(entry).__name__ for entry in entries] == kinds
+    state = fold(PLAN, entries)
+    assert (state.done, state.earned_s, state.ended.status) == ({"300c383f4748"}, {"a3f5ce16725c": 60.0}, "complete")
