@@ -118,7 +118,8 @@ def test_the_lines_of_a_journal_make_the_same_state(entries):
 
 OLD = b"""\
 572ccb08 {"entry": "Begun", "time_ns": 1767290410650000000, "run": "20260101T180000Z-warm", "plan": \
-"ad3190b2c63808e9", "texts": {"config.yaml": "aa1f5212ae546e79", "recipe.yaml": "41b3154da3e88692", "target.yaml": "00dc7edb33b066d7"}, \
+"ad3190b2c63808e9", "texts": {"config.yaml": "aa1f5212ae546e79", \
+"recipe.yaml": "41b3154da3e88692", "target.yaml": "00dc7edb33b066d7"}, \
 "seed": 1}
 908cafae {"entry": "Step", "time_ns": 1767290410650000000, "step_id": "300c383f4748", "state": "started"}
 94f02eb6 {"entry": "Step", "time_ns": 1767290410800000000, "step_id": "300c383f4748", "state": "done"}
