@@ -1,7 +1,7 @@
 """The paper's calibration (section 6.3): the target at 34 table positions, all at the reference temperature.
 
 Positions are a grid of linear and rotary ones without those left out. The chamber is closed but for the captures, and
-the camera comes to equilibrium first. The home checks at both ends tell whether the table lost steps in between.
+the camera comes to equilibrium first. The home checks at both ends show whether the table lost steps in between.
 """
 
 from __future__ import annotations

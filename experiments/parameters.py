@@ -38,7 +38,7 @@ class StillTable(CaptureParameters):
 class Settled(BaseModel):
     """When a camera counts as settled; see steps.SoakUntilSettled.
 
-    The drift decides: it is seen to some 0.1 mpx/min, while cameras tell their temperature in digits of 0.1 to 0.5 K.
+    The drift decides: it is seen to some 0.1 mpx/min, while cameras give their temperature in digits of 0.1 to 0.5 K.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

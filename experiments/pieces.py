@@ -40,7 +40,7 @@ def placed(table_position: Mapping[str, float]) -> Iterator[Step]:
 
 
 def moved(position: TablePosition) -> Iterator[Step]:
-    """Both axes approached anew, also one that is there already: its motor may have been without current meanwhile."""
+    """Both axes approached again, also one that is there already: its motor may have been without current meanwhile."""
     yield from placed(dict(zip(_AXES, (position.linear_mm, position.rotary_deg), strict=True)))
 
 

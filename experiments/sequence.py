@@ -1,4 +1,4 @@
-"""Whether a sequence of steps makes sense, whoever has written it: what each step needs of those before it."""
+"""Whether a sequence of steps makes sense: what each step needs of those before it."""
 
 from __future__ import annotations
 

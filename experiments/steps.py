@@ -136,7 +136,7 @@ class CoolDown:
 
 @dataclass(frozen=True, slots=True)
 class CheckHome:
-    """Home the axis named `axis` again, record how far its scale had gone astray, and go back to where it stood."""
+    """Home the axis named `axis` again, record how far its scale was off, and go back to where it stood."""
 
     axis: str
 

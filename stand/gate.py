@@ -8,13 +8,13 @@ from enum import StrEnum
 
 Listener = Callable[[str, bool], None]
 
-# Who may hold a run; whoever sets a reason clears it, and nobody else's.
+# What may hold a run; each reason is cleared by what has set it.
 OPERATOR = "operator"  # a pause; the chamber keeps its set-point
 INTERLOCK = "interlock"  # the guard has made the chamber safe; only an operator clears it
 CAMERA_LOST = "camera_lost"  # until it answers again
 DISK_LOW = "disk_low"  # until frames can be recorded again
 NOT_RECORDED = "not_recorded"  # until the disk takes telemetry again
-STOPPING = "stopping"  # the run is being ended; nobody clears it
+STOPPING = "stopping"  # the run is being ended; never cleared
 
 
 class Gate:

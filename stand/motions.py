@@ -19,7 +19,7 @@ class Motions:
 
     @contextmanager
     def under_way(self, name: str, text: str) -> Generator[None]:
-        """It moves while inside; where one motion is part of another, the inner one is told."""
+        """It moves while inside; where one motion is part of another, the inner one is shown."""
         before = self._under_way.get(name)
         self._under_way[name] = text
         try:

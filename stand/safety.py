@@ -1,6 +1,6 @@
 """The one owner of making safe: every actuator, until it has confirmed.
 
-Whoever finds a reason (a rule, the operator, a run that ends) demands it; that takes nobody's time. Permissions are
+A rule, the operator or a run that ends demands it, without waiting for it. Permissions are
 gone at once. Each actuator has a task of its own, so that one that does not answer keeps none of the others.
 """
 
@@ -111,7 +111,7 @@ class Safety:
     """Brings every actuator it has taken to its safe state. `revoke` takes back every permission, at once.
 
     It goes on until each has confirmed what was demanded last; `close` ends that. An actuator is taken when it has been
-    opened: whoever has not opened a device does not command it either.
+    opened: a device that another run has open is not commanded.
     """
 
     def __init__(self, revoke: Callable[[], None], hub: Hub, clock: Clock) -> None:
@@ -170,7 +170,7 @@ class Safety:
             await self._changed.wait()
 
     async def confirmed(self, limit_s: float) -> bool:
-        """Whether everything is confirmed within that time, on the stand's clock, and before somebody gives up; an
+        """Whether everything is confirmed within that time, on the stand's clock, and before an operator gives up; an
         event each minute says what is not."""
         end_ns = self._clock.now_ns() + seconds_ns(limit_s)
         await self.tried()
@@ -186,7 +186,7 @@ class Safety:
         await asyncio.gather(*(maker.close() for maker in self._makers))
 
     async def _changes_before(self, due_ns: int) -> bool:
-        """Wait for the confirmation, or for somebody to give up, until then."""
+        """Wait for the confirmation, or for an operator to give up, until then."""
         sleeping = asyncio.ensure_future(self._clock.sleep_until(due_ns))
         try:
             while not (sleeping.done() or self.is_confirmed or self._given_up):

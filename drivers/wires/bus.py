@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from drivers.wires.modbus_client import BusSettings, Fault, ModbusClient, WireFault
+from drivers.wires.modbus_client import BusSettings, FaultKind, ModbusClient, WireFault
 from drivers.wires.registers import Space
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
@@ -29,11 +29,11 @@ PROBE_PERIODS_S = (1.0, 2.0, 4.0, 8.0, 10.0)  # of a dead unit, the last for goo
 REOPEN_PERIOD_S = 1.0
 QUARANTINE_MARGIN_S = 0.05
 
-ERRORS: dict[Fault, type[DeviceError]] = {
-    Fault.LINE_DOWN: Unreachable,
-    Fault.SILENCE: Unreachable,
-    Fault.GARBLED: GarbledReply,
-    Fault.REFUSED: Refused,
+ERRORS: dict[FaultKind, type[DeviceError]] = {
+    FaultKind.LINE_DOWN: Unreachable,
+    FaultKind.SILENCE: Unreachable,
+    FaultKind.GARBLED: GarbledReply,
+    FaultKind.REFUSED: Refused,
 }
 
 
@@ -51,16 +51,16 @@ class BusCounters:
     stray: int = 0
     skipped: int = 0
 
-    def count(self, fault: Fault) -> None:
+    def count(self, fault: FaultKind) -> None:
         """One more transaction failed this way."""
         match fault:
-            case Fault.LINE_DOWN:
+            case FaultKind.LINE_DOWN:
                 self.lines_down += 1
-            case Fault.SILENCE:
+            case FaultKind.SILENCE:
                 self.silences += 1
-            case Fault.GARBLED:
+            case FaultKind.GARBLED:
                 self.garbled += 1
-            case Fault.REFUSED:
+            case FaultKind.REFUSED:
                 self.refused += 1
 
 
@@ -168,14 +168,14 @@ class Bus:
         self.counters.count(fault.fault)
         now_ns = self.clock.now_ns()
         match fault.fault:
-            case Fault.LINE_DOWN:
+            case FaultKind.LINE_DOWN:
                 # The first loss is retried at once (a gateway hangs up when idle), a lasting one once a second.
                 self._reopen_ns = now_ns + seconds_ns(REOPEN_PERIOD_S) if self._line_fault else now_ns
                 self._line_fault = str(fault)
-            case Fault.SILENCE | Fault.GARBLED:
-                silent = fault.fault is Fault.SILENCE
+            case FaultKind.SILENCE | FaultKind.GARBLED:
+                silent = fault.fault is FaultKind.SILENCE
                 self._health[unit] = self._health.get(unit, _Health()).failed(silent, now_ns)
-            case Fault.REFUSED:
+            case FaultKind.REFUSED:
                 self._health[unit] = _Health()
         return ERRORS[fault.fault](device, f"unit {unit} on {self.name}: {fault}")
 
@@ -185,7 +185,7 @@ class Bus:
         try:
             result = function(*args)
         except WireFault as fault:
-            if fault.fault is not Fault.LINE_DOWN:  # a line opened anew has nothing late on it
+            if fault.fault is not FaultKind.LINE_DOWN:  # a line opened anew has nothing late on it
                 self._suspect = True
                 self._free_s = time.monotonic() + self._quarantine_s
             raise

@@ -67,7 +67,7 @@ class BusSettings(Document):
     gap_s: float = Field(default=0.005, ge=0, le=1)
 
 
-class Fault(StrEnum):
+class FaultKind(StrEnum):
     """How a transaction failed."""
 
     LINE_DOWN = "line down"  # the port or connection itself: no unit is to blame
@@ -79,7 +79,7 @@ class Fault(StrEnum):
 class WireFault(Exception):
     """One transaction failed; `fault` says how, the text why."""
 
-    def __init__(self, fault: Fault, text: str) -> None:
+    def __init__(self, fault: FaultKind, text: str) -> None:
         super().__init__(text)
         self.fault = fault
 
@@ -163,7 +163,7 @@ class ModbusClient:
             client.connect()
         except (OSError, termios.error) as error:
             client.close()
-            raise WireFault(Fault.LINE_DOWN, f"cannot open {self._settings.address}: {error}") from error
+            raise WireFault(FaultKind.LINE_DOWN, f"cannot open {self._settings.address}: {error}") from error
         self._client = client
 
     def _make(self) -> _SerialClient | _TcpClient:
@@ -211,7 +211,7 @@ class ModbusClient:
         """`count` registers or bits (0 or 1) from `address` on."""
         reply = self._exchange(READS[space](dev_id=unit, address=address, count=count))
         if self.serial and self._heard.startswith(self._sent):
-            raise WireFault(Fault.GARBLED, "the request came back (local echo of the adapter?)")
+            raise WireFault(FaultKind.GARBLED, "the request came back (local echo of the adapter?)")
         if space in ("holding", "input"):
             return _exactly(list(reply.registers), count, count)
         return _exactly([int(bit) for bit in reply.bits], -(-count // 8) * 8, count)
@@ -229,7 +229,7 @@ class ModbusClient:
         reply = self._exchange(WriteMultipleRegistersRequest(dev_id=unit, address=address, registers=values))
         if (reply.address, reply.count) != (address, len(values)):
             raise WireFault(
-                Fault.GARBLED,
+                FaultKind.GARBLED,
                 f"wrote {len(values)} words at {address:#06x}, the reply has {reply.count} at {reply.address:#06x}",
             )
 
@@ -237,11 +237,12 @@ class ModbusClient:
         """Send a single write, whose reply repeats address and value, and so is as long as the request."""
         reply = self._exchange(request)
         if len(self._heard) != len(self._sent):
-            raise WireFault(Fault.GARBLED, "more came back than a reply (local echo of the adapter?)")
+            raise WireFault(FaultKind.GARBLED, "more came back than a reply (local echo of the adapter?)")
         sent, echoed = ((pdu.address, pdu.registers[0]) for pdu in (request, reply))
         if sent != echoed:
             raise WireFault(
-                Fault.GARBLED, "wrote {1:#06x} at {0:#06x}, the reply has {3:#06x} at {2:#06x}".format(*sent, *echoed)
+                FaultKind.GARBLED,
+                "wrote {1:#06x} at {0:#06x}, the reply has {3:#06x} at {2:#06x}".format(*sent, *echoed),
             )
 
     def _exchange(self, request: ModbusPDU) -> ModbusPDU:
@@ -249,29 +250,29 @@ class ModbusClient:
         self.connect()
         reply = self._execute(request)
         if reply.function_code & 0x7F != request.function_code:
-            raise WireFault(Fault.GARBLED, f"asked function {request.function_code}, got {reply.function_code}")
+            raise WireFault(FaultKind.GARBLED, f"asked function {request.function_code}, got {reply.function_code}")
         if code := reply.exception_code:
-            fault = Fault.SILENCE if code in UNANSWERED_EXCEPTIONS else Fault.REFUSED
+            fault = FaultKind.SILENCE if code in UNANSWERED_EXCEPTIONS else FaultKind.REFUSED
             raise WireFault(fault, f"exception {code} ({EXCEPTIONS.get(code, 'not in the standard')})")
         return reply
 
     def _execute(self, request: ModbusPDU) -> ModbusPDU:
         client = self._client
         if client is None:
-            raise WireFault(Fault.LINE_DOWN, f"{self._settings.address} is closed")
+            raise WireFault(FaultKind.LINE_DOWN, f"{self._settings.address} is closed")
         self._heard = b""
         try:
             return client.execute(False, request)
         except ConnectionException as error:
             self.close()
-            raise WireFault(Fault.LINE_DOWN, f"{self._settings.address} is gone: {error.string}") from error
+            raise WireFault(FaultKind.LINE_DOWN, f"{self._settings.address} is gone: {error.string}") from error
         except ModbusException as error:
             if self._heard:
-                raise WireFault(Fault.GARBLED, f"no valid reply in {self._heard.hex(' ')}") from error
-            raise WireFault(Fault.SILENCE, f"no reply within {self._settings.timeout_s:g} s") from error
+                raise WireFault(FaultKind.GARBLED, f"no valid reply in {self._heard.hex(' ')}") from error
+            raise WireFault(FaultKind.SILENCE, f"no reply within {self._settings.timeout_s:g} s") from error
         except (OSError, termios.error) as error:
             self.close()
-            raise WireFault(Fault.LINE_DOWN, f"{self._settings.address} is gone: {error}") from error
+            raise WireFault(FaultKind.LINE_DOWN, f"{self._settings.address} is gone: {error}") from error
 
     def _trace(self, sending: bool, data: bytes) -> bytes:
         """pymodbus hands every packet here: what went out, and what has come and is not yet a frame."""
@@ -285,5 +286,5 @@ class ModbusClient:
 def _exactly(values: list[int], expected: int, count: int) -> list[int]:
     """The first `count` of `values`, of which there must be `expected`: another length answers another request."""
     if len(values) != expected:
-        raise WireFault(Fault.GARBLED, f"asked for {count} values, got {len(values)}")
+        raise WireFault(FaultKind.GARBLED, f"asked for {count} values, got {len(values)}")
     return values[:count]

@@ -1,4 +1,4 @@
-"""When the refrigeration compressor runs: the regulator's cooling output is a wish, the compressor's health decides.
+"""When the refrigeration compressor runs: the regulator's cooling output is a demand, the compressor's limits decide.
 
 The regulator's cooling period (at most 99 s) is far shorter than a compressor's minimum off time, so its output is
 read as a demand. Once started, the compressor keeps running and the heater trims the temperature, as in commercial
@@ -6,7 +6,7 @@ climate chambers: that holds the air steady, where cycling at full stroke would 
 regulator heats hard against it.
 
 What it did last is kept in a small file, so that a daemon that restarts, or crashes again and again, spares it as one
-that goes on: `restored` and `keep`. The file counts in the host's boot time and names the boot, so that a system clock
+that keeps running: `restored` and `keep`. The file counts in the host's boot time and names the boot: a system clock
 that is stepped between two daemons neither shortens nor lengthens the rest. In virtual time, which has no boot, it
 counts in instants of the stand's clock.
 """
@@ -78,8 +78,8 @@ class _Kept(BaseModel):
 
 def restored(path: Path | None, now_ns: int, boot: Boot | None) -> CompressorState:
     """What `path` keeps, for a compressor that is off now. When it was switched off is unknown, and so taken for just
-    now, when the file is missing or damaged, is of another boot, ends with a running compressor, or tells of the
-    future. Starts of another boot are forgotten."""
+    now, when the file is missing or damaged, is of another boot, ends with a running compressor, or has times in
+    the future. Starts of another boot are forgotten."""
     unknown = CompressorState(running=False, since_ns=now_ns)
     if path is None:
         return unknown

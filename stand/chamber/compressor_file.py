@@ -1,4 +1,4 @@
-"""What the compressor did last, on the disk for the next daemon; nobody waits for it."""
+"""What the compressor did last, on the disk for the next daemon; written in the background."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Heat and cold are permitted for some seconds at a time, and relays are compared with what they were told.
+"""Heat and cold are permitted for some seconds at a time, and relays are compared with what they were commanded.
 
 The relays of heater and compressor are only ever switched on by the board's own timer: a daemon that dies neither
 heats nor cools. Each is read before it is armed again; one that is off before its time has been dropped by something
@@ -47,7 +47,7 @@ class Permission(StrEnum):
 
 class Permits:
     """The relays of heater and compressor. `allowed` says whether the guard looks and finds all well: else nothing is
-    armed. `keep` is told of each change of the compressor, and must not wait."""
+    armed. `keep` is called at each change of the compressor, and must not wait."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Permits:
     ) -> None:
         self.name = relays.name
         self.permission = Permission.REVOKED
-        self.intrusions = 0  # how often somebody else has switched heat or cold on since the permission was withdrawn
+        self.intrusions = 0  # how often heat or cold were switched on by others since the permission was withdrawn
         self.allowed: Callable[[], bool] = lambda: True
         self._relays = relays
         self._limits = limits
@@ -85,7 +85,7 @@ class Permits:
         self.permission = Permission.REVOKED
 
     def forgive(self) -> None:
-        """An operator has seen to whoever switched what was not permitted."""
+        """An operator has found out what switched heat or cold on."""
         self.intrusions = 0
 
     async def make_safe(self) -> None:
@@ -95,7 +95,7 @@ class Permits:
         self._are_off()
 
     async def withdraw_left_on(self) -> None:
-        """Before anything else: what another daemon, or somebody by hand, left on is switched off and told. A
+        """Before anything else: what another daemon or a hand left on is switched off, event `left_on`. A
         compressor that ran until now begins its rest now."""
         left_on = {name for name, on in (await self._coils()).items() if on} & {HEATER, COMPRESSOR}
         await self._relays.make_safe()
@@ -121,7 +121,7 @@ class Permits:
             return coils
 
     async def supervise(self) -> dict[str, bool]:
-        """While the permission is withdrawn: whatever reads on nevertheless is switched off, and told. Returns what the
+        """While the permission is withdrawn: whatever reads on is switched off, event `switched_off`. Returns what the
         coils read before that."""
         async with self._comparing:
             was_withdrawn = self.permission is Permission.WITHDRAWN
@@ -185,7 +185,7 @@ class Permits:
         switched = wanted.running != self._compressor.running
         if wanted.running:
             if switched:
-                self._set(wanted)  # before it runs: a start that nobody sees confirmed is a start
+                self._set(wanted)  # before it runs: a start that is not confirmed counts, too
             await self._hold_on(COMPRESSOR)
         elif switched:
             await self._relays.switch(COMPRESSOR, on=False)
@@ -196,7 +196,7 @@ class Permits:
             self._hub.publish(Event(self._clock.now_ns(), "info", "compressor", text, {"running": wanted.running}))
 
     async def _intruded(self, channel: str) -> None:
-        """Somebody else has switched it on."""
+        """It was switched on, and not by this daemon."""
         self.intrusions += 1
         now_ns = self._clock.now_ns()
         await self._relays.switch(channel, on=False)

@@ -40,7 +40,7 @@ def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
         raise _within(name, error) from error
     try:
         steps = tuple(islice(cast("Iterable[object]", make(checked)), MOST_STEPS + 1))
-    except Exception as error:  # somebody else's code may raise anything
+    except Exception as error:  # another package's code may raise anything
         raise ValueError(f"{name}: {_package(point)} makes no steps of these ({_told(error)})") from error
     faults = (f"step {number} {fault}" for number, step in enumerate(steps) if (fault := _fault(step)))
     if fault := next(faults, ""):
@@ -63,7 +63,7 @@ def _loaded(point: EntryPoint) -> tuple[Callable[[BaseModel], object], type[Base
         (parameter,) = inspect.signature(make).parameters
         model = get_type_hints(make)[parameter]
     except Exception as error:  # whatever importing a stranger's module raises
-        text = f"{point.name}: {_package(point)} cannot be loaded ({_told(error)}); install it anew, or leave this out"
+        text = f"{point.name}: {_package(point)} cannot be loaded ({_told(error)}); reinstall it, or leave this out"
         raise ValueError(text) from error
     if not (inspect.isclass(model) and issubclass(model, BaseModel)):
         raise ValueError(f"{point.name}: {point.value} takes no pydantic model; annotate its parameter with one")

@@ -1,7 +1,7 @@
 """What a body in the chamber feels of the air: a look that believes neither of the two probes.
 
 A body of lag L follows the air T by dB/dt = (T - B) / L, so that T = B + L dB/dt: whatever the probes say, a body that
-warms tells how warm the air around it is. Both are taken over the same window, the body's rate by least squares.
+warms shows how warm the air around it is. Both are taken over the same window, the body's rate by least squares.
 L is known roughly only; the error that makes grows with how far the body is from the air, and so does what is allowed.
 """
 
@@ -18,7 +18,7 @@ from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
-_GAP_S = 60.0  # between two readings; after a longer one the window begins anew
+_GAP_S = 60.0  # between two readings; after a longer one the window begins again
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Felt:
 
 
 def felt(looks: Sequence[Look], window_s: float, lag_s: float) -> Felt | None:
-    """What a window tells of the air around a body of that lag; None before it is full. One wild value of the body
+    """What a window says of the air around a body of that lag; None before it is full. One wild value of the body
     changes nothing: medians of three."""
     if len(looks) < 5 or looks[-1].time_ns - looks[0].time_ns < 0.9 * seconds_ns(window_s):
         return None
@@ -63,7 +63,7 @@ def felt(looks: Sequence[Look], window_s: float, lag_s: float) -> Felt | None:
 
 
 def looked(looks: tuple[Look, ...], readings: Readings, body: str, probe: str, window_s: float) -> tuple[Look, ...]:
-    """The window with what is new, if that is a measurement; anew after a gap."""
+    """The window with what is new, if that is a measurement; a new one after a gap."""
     reading, probe_degC = readings.latest(body), value_of(readings, probe)
     if reading is None or math.isnan(reading.value) or math.isnan(probe_degC):
         return looks

@@ -53,7 +53,7 @@ def first_heat(limits: FirstHeatConfig, air: str, regulator: str, permit: str) -
         if now_ns - state.since_ns < seconds_ns(limits.within_s):
             return state, None
         if state.sum_percent / state.count < limits.output_percent:
-            return None, None  # too little heat to tell
+            return None, None  # too little heat to judge
         rises = " and ".join(
             f"{name} by {risen_K:.1f} K" for name, risen_K in zip((pv, air), state.risen_K, strict=True)
         )

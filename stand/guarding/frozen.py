@@ -31,7 +31,7 @@ class Still:
 def frozen(channel: str, module: tuple[str, ...], step_K: float, after_s: float, regulator: str) -> Rule:
     """`channel` has been exactly constant for `after_s` while the regulator's output works.
 
-    That tells something of fine converters only; how fine it is shows in the steps of all thermometers of its `module`,
+    That is evidence for fine converters only; how fine it is shows in the steps of all thermometers of its `module`,
     so that one that was frozen from the begin is found too.
     """
 

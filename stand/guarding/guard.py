@@ -19,8 +19,8 @@ from stand.guarding.notify import Notifier
 from stand.safety import Safety
 
 _LATE_PERIODS = 2
-_STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stopped is read within this after it goes on
-_ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more often needs somebody to look
+_STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stopped is read within this after it continues
+_ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more often needs an operator
 
 
 @dataclass
@@ -28,12 +28,12 @@ class Guard:
     """Every `period_s` the rules.
 
     On a fault `stop(fault)` ends the run, or `hold(fault)` lets it wait; the trip is recorded, the stand is made safe,
-    somebody is told. A hold stays until `clear`, but for one that ends by itself: `release()` is then called when no
+    and `notifier` runs. A hold stays until `clear`, but for one that ends by itself: `release()` is then called when no
     rule objects any more and the stand has confirmed that it is safe, at most three times an hour. Without a `hold`
     every trip aborts. A guard that fails aborts.
 
     A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
-    wait for a GOOD reading of each of `vital`, the channels without which nobody may heat, taken since. What is too old
+    wait for a GOOD reading of each of `vital`, the channels that heat depends on, taken since. What is too old
     only because of it is given time to be renewed (Watch.after_gap_s).
     """
 
@@ -58,7 +58,7 @@ class Guard:
     _telling: set[asyncio.Task[None]] = field(default_factory=set[asyncio.Task[None]])
 
     def look(self) -> bool:
-        """Whether the guard goes on; False when the run is being aborted."""
+        """Whether the run continues; False when the run is being aborted."""
         self._note_time()
         faults = self._faults()
         fault = next((each for each in faults if each.action == "abort" or self.hold is None), None)
@@ -79,7 +79,7 @@ class Guard:
         return all(time_ns is not None and time_ns >= self._fresh_after_ns for time_ns in good_ns)
 
     def clear(self) -> Fault | None:
-        """An operator has looked: the hold, which is returned, is forgotten, and every rule has its grace time anew.
+        """An operator has looked: the hold, which is returned, is forgotten, and every grace time begins again.
         What is wrong still trips again, what has no grace time before anything moves. Letting the run go on is the
         caller's."""
         fault, self.held = self.held, None
@@ -102,7 +102,7 @@ class Guard:
             raise
 
     async def told(self) -> None:
-        """Return when everybody who is being told of a trip has been, or could not be."""
+        """Return when each notify command of a trip has ended, or could not be run."""
         while self._telling:
             await asyncio.wait(self._telling)
 
@@ -134,16 +134,14 @@ class Guard:
         self._endings_ns = [time_ns for time_ns in self._endings_ns if now_ns - time_ns < seconds_ns(3600)]
         data: dict[str, object] = {"rule": fault.rule, "endings_in_last_h": len(self._endings_ns)}
         if self.release is None or len(self._endings_ns) >= _ENDINGS_PER_H:
-            text = (
-                f"{fault.rule} has held the run more than {_ENDINGS_PER_H} times within an hour; `stand clear` goes on"
-            )
+            text = f"{fault.rule} has held the run more than {_ENDINGS_PER_H} times in an hour; `stand clear` continues"
             self.held = Fault(fault.rule, f"{fault.text}; {text}", fault.action)
             self.hub.publish(Event(now_ns, "error", "hold_stays", text, data))
             self._notify(text)
             return
         self._endings_ns.append(now_ns)
         self.held = None
-        text = f"{fault.rule} is over; the run goes on"
+        text = f"{fault.rule} is over; the run continues"
         self.hub.publish(Event(now_ns, "warning", "hold_ended", text, data))
         self.release()
 
@@ -179,7 +177,7 @@ class Guard:
         return faults
 
     def _make_safe(self, fault: Fault) -> None:
-        """Demanded before anybody is told: who listens may fail."""
+        """Demanded before anything is published: a listener may fail."""
         self.safety.demand()
         if fault.cuts_camera and self.cut_camera is not None:
             self.cut_camera()

@@ -22,7 +22,7 @@ class Watch:
     """A rule, how long it must object without a break before it counts (s), and what is then done.
 
     after_gap_s: for so long after a look that came late its objection does not count, because it judges by how old
-    something is that nobody could renew meanwhile. Permits wait for fresh readings all that time.
+    something is that could not be renewed meanwhile. Permits wait for fresh readings all that time.
     """
 
     rule: Rule
@@ -109,8 +109,8 @@ def disagreement(channel: str, other: str, max_K: float) -> Rule:
 def reported_fault(channel: str) -> Rule:
     """A device says that something is wrong: a flag, whose reading's reason says what.
 
-    The regulator's names the set-point that somebody changed, and manual mode; its driver compares the set-point with
-    the one it sent under the lock of both, so that a change of ours never looks like one of theirs.
+    The regulator's names a set-point changed by hand, and manual mode; its driver compares the set-point with the one
+    it sent under the lock of both, so that a change of ours never looks like one of theirs.
     """
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
@@ -123,7 +123,7 @@ def reported_fault(channel: str) -> Rule:
 
 
 def stopped_while_permitted(running: str, permit: str) -> Rule:
-    """The stand permits heat, yet the regulator does not control: somebody has pressed its keys."""
+    """The stand permits heat, yet the regulator does not control: its keys were pressed."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         if value_of(readings, running) == 0 and value_of(readings, permit) == 1:
@@ -200,8 +200,8 @@ def frames_stopped(reason: Callable[[], str]) -> Rule:
 
 
 def intrusion(times: Callable[[], int]) -> Rule:
-    """Heat, cold or the regulator were switched on, twice since the permission was withdrawn, by somebody else. Once
-    is put right and told; who does it again does not stop by himself."""
+    """Heat, cold or the regulator were switched on, twice since the permission was withdrawn, by others. The first
+    time is put right with an event; a second one does not end by itself."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         if times() < 2:
@@ -232,7 +232,7 @@ class Recording(Protocol):
 
 
 def not_recorded(recording: Recording, durable_within_s: float) -> Rule:
-    """Readings, frames or events are not on the disk in time: nobody will know what the heat was for."""
+    """Readings, frames or events are not on the disk in time: heat without a record is of no use."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         since_ns = recording.waiting_since_ns
@@ -255,7 +255,7 @@ def folder_lost(recording: Recording) -> Rule:
 
 
 def recording_ended(recording: Recording) -> Rule:
-    """Nothing will be recorded any more in this run: somebody has killed the process that writes the session."""
+    """Nothing will be recorded any more in this run: the process that writes the session was killed."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         ended = recording.writer_ended

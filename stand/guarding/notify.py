@@ -1,4 +1,4 @@
-"""Tells somebody outside of the stand, by a command of the configuration."""
+"""Notifies people outside the stand, by a command of the configuration."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _SPARE_S = 4.0  # real seconds beyond what the command may take, for a machine t
 
 class Notifier:
     """Runs `command` with the sentence as its last argument, without a shell, in a session of its own, for at most
-    `limit_s` real seconds. An empty command tells nobody.
+    `limit_s` real seconds. An empty command notifies nobody.
 
-    A small process runs it, so that somebody is told whatever state the daemon and its disk are in. It is there from
+    A small process runs it, so that people are notified whatever state the daemon and its disk are in. It is there from
     `start` on, else from the first sentence on; one that has died, or does not answer, is replaced with the next.
     """
 
@@ -42,7 +42,7 @@ class Notifier:
         if not self._command or shutil.which(self._command[0]) is not None:
             return ""
         return (
-            f"guard.notify: {self._command[0]} is no program that can be run here, nobody would be told of a trip; "
+            f"guard.notify: {self._command[0]} is no program that can be run here, nobody would be notified of a trip; "
             "install it, give its whole path, or take the line out"
         )
 
@@ -69,7 +69,7 @@ class Notifier:
                 return f"the process that runs {self._command[0]} did not answer within {limit_s:g} s"
 
     def close(self) -> None:
-        """End the process; a command under way goes on to its end. May be called twice."""
+        """End the process; a command under way runs to its end. May be called twice."""
         self._drop()
         if self._lane is not None:
             self._lane.close()

@@ -135,7 +135,7 @@ def warming_while_off(
 
 
 @dataclass(frozen=True, slots=True)
-class Cooling:
+class CompressorRun:
     """The compressor has run without heat since `since_ns`, when the air was at `air_degC`."""
 
     since_ns: int
@@ -148,20 +148,20 @@ def cooling_in_vain(
     """The compressor runs, the regulator's heating output is 0, and yet the air, which nothing around it warms, does
     not fall: a welded relay that heats as much as is cooled, or a compressor that does not cool. The two look alike.
 
-    Below its surroundings the chamber may need all its cold to stay where it is, and nothing can be told.
+    Below its surroundings the chamber may need all its cold to stay where it is, and no judgement is possible.
     """
     mv_heat = f"{regulator}.mv_heat"
 
     def is_alone(readings: Readings, air_degC: float) -> bool:
         return all(value_of(readings, channel) < air_degC - limits.margin_K for channel in surroundings)
 
-    def step(last: Cooling | None, readings: Readings, now_ns: int) -> tuple[Cooling | None, Fault | None]:
+    def step(last: CompressorRun | None, readings: Readings, now_ns: int) -> tuple[CompressorRun | None, Fault | None]:
         air_degC = value_of(readings, air)
         cools = value_of(readings, compressor) == 1 and value_of(readings, mv_heat) <= 0
         if not (cools and is_alone(readings, air_degC)):
             return None, None
         if last is None or air_degC <= last.air_degC - limits.fall_K:
-            return Cooling(now_ns, air_degC), None
+            return CompressorRun(now_ns, air_degC), None
         if now_ns - last.since_ns < seconds_ns(limits.window_s):
             return last, None
         text = (
@@ -199,7 +199,7 @@ def stuck_while_other_moves(channel: str, other: str, moved_K: float, after_s: f
     """`channel` has been exactly constant for at least `after_s`, in which `other`, in the same air, went `moved_K`.
 
     The regulator shows 0.1 K and holds that for an hour, while its output goes from one end to the other to do so:
-    neither a constant value nor an output that moves tells a stuck probe, a second sensor does.
+    neither a constant value nor an output that moves proves a stuck probe, a second sensor does.
     """
 
     def step(last: Constant | None, readings: Readings, now_ns: int) -> tuple[Constant | None, Fault | None]:

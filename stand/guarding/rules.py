@@ -49,7 +49,7 @@ PV, AIR, GRANITE, LABORATORY = (
 RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
 FLAP, CAMERA = "flap.position", "camera.temperature"
 _CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
-VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these nobody may heat
+VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these there is no heat
 
 
 class Announcements:
@@ -76,7 +76,7 @@ class Announcements:
 
 def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
     """Every rule with the configured limits. Abort where the stand's temperature is not known or not controlled: that
-    ends a night. Hold where an operator can put it right and the night is worth going on with."""
+    ends a night. Hold where an operator can put it right and the night is worth continuing."""
     return (
         *_temperatures(config),
         *_heat(config),
@@ -113,7 +113,7 @@ def _heat(config: StandConfig) -> tuple[Watch, ...]:
 
 
 def _sensors(config: StandConfig) -> tuple[Watch, ...]:
-    """Of two sensors that disagree nobody knows which is wrong. A thermometer without noise is suspicious, no more."""
+    """Which of two sensors that disagree is wrong is not known. A thermometer without noise is suspicious, no more."""
     limits = config.guard.sensors
     return (
         Watch(disagreement(PV, AIR, limits.warn_K), limits.warn_after_s, "warn"),
@@ -129,7 +129,7 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
 def _independent(config: StandConfig) -> tuple[Watch, ...]:
     """Looks that hold when both probes are wrong alike: heat that was given, and what else stands in that air. Abort,
     for how warm it is nobody knows; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
-    found before anything is warm. The camera's own temperature is not required: one that is stale is told."""
+    found before anything is warm. The camera's own temperature is not required: one that is stale is a warning."""
     limits, chamber = config.guard, config.chamber
     granite, camera, frost = limits.granite_feels, limits.camera_feels, limits.frozen
     module = tuple(f"thermometers.{name}" for name in config.thermometers.channels)
@@ -149,7 +149,7 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
 
 
 def camera_stale(config: StandConfig) -> Rule:
-    """A frozen temperature of the camera: told, and recorded as STALE."""
+    """A frozen temperature of the camera: a warning, and recorded as STALE."""
     frost = config.guard.frozen
     return stale_by_air(CAMERA, AIR, frost.air_moves_K, frost.camera_after_s)
 
@@ -174,8 +174,8 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
 
 
 def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
-    """Heat only while it is recorded. A disk that hangs or refuses may work again by itself; a folder that somebody has
-    moved does not come back by itself. A run whose writer was killed has ended: `stand resume` goes on with it."""
+    """Heat only while it is recorded. A disk that hangs or refuses may work again by itself; a folder that was moved
+    does not come back by itself. A run whose writer was killed has ended: `stand resume` continues it."""
     return (
         Watch(recording_ended(recording)),
         Watch(folder_lost(recording), action="hold"),

@@ -1,4 +1,4 @@
-"""How cold a camera without power is by now: nobody can ask it, but its last word and a time constant tell."""
+"""Estimates an unpowered camera's temperature from its last reading and a time constant."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ _LOOK_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Cooling:
+class CameraTemperature:
     """The camera's temperature, degC, at an instant (ns)."""
 
     camera_degC: float
     time_ns: int
 
-    def after(self, time_ns: int, air_degC: float, time_constant_s: float) -> Cooling:
+    def after(self, time_ns: int, air_degC: float, time_constant_s: float) -> CameraTemperature:
         """At `time_ns`, when the air has been at `air_degC` meanwhile: the excess over it has decayed exponentially."""
         decayed = math.exp(-(time_ns - self.time_ns) / NS_PER_S / time_constant_s)
-        return Cooling(air_degC + (self.camera_degC - air_degC) * decayed, time_ns)
+        return CameraTemperature(air_degC + (self.camera_degC - air_degC) * decayed, time_ns)
 
 
-def last_word(reading: Reading | None) -> Cooling | None:
+def last_temperature(reading: Reading | None) -> CameraTemperature | None:
     """The last temperature of a camera that is about to be switched off; None when it gave none."""
     if reading is None or reading.quality is not Quality.GOOD:
         return None
-    return Cooling(reading.value, reading.time_ns)
+    return CameraTemperature(reading.value, reading.time_ns)
 
 
 async def cool_down(
-    cooling: Cooling | None, band_K: float, time_constant_s: float, max_s: float, hub: Hub, clock: Clock
+    cooling: CameraTemperature | None, band_K: float, time_constant_s: float, max_s: float, hub: Hub, clock: Clock
 ) -> None:
     """Wait until the camera is within `band_K` of the air near it, or `max_s` is over.
 
-    `cooling` is the camera's last word before it was switched off; without one all of `max_s` is waited for. The events
+    `cooling` is the camera's temperature when it was switched off; without one all of `max_s` is waited for. The events
     "cooled_down" and "cool_down_unsure" (a warning) say how it ended.
     """
     begin_ns = clock.now_ns()
     deadline_ns = begin_ns + seconds_ns(max_s)
     if cooling is None:
         await clock.sleep_until(deadline_ns)
-        text = f"the camera told no temperature before it was switched off; waited {max_s:g} s"
+        text = f"the camera gave no temperature before it was switched off; waited {max_s:g} s"
         hub.publish(Event(clock.now_ns(), "warning", "cool_down_unsure", text))
         return
     while True:
@@ -63,4 +63,4 @@ async def cool_down(
         return
     if math.isinf(excess_K):
         waited = "the air near the camera is not measured"
-    hub.publish(Event(now_ns, "warning", "cool_down_unsure", f"{waited}; going on without being within {band_K:g} K"))
+    hub.publish(Event(now_ns, "warning", "cool_down_unsure", f"{waited}; continuing outside {band_K:g} K"))

@@ -17,7 +17,7 @@ RETRY_S, LONGEST_RETRY_S = 1.0, 10.0
 
 class CameraOpening:
     """Opens the camera; one after the other. `is_wanted`: its supply is on, and it was open before. `restarted` is
-    called with the reason when it has, or may have, started anew by itself since it was last heard."""
+    called with the reason when it has, or may have, restarted by itself since its last answer."""
 
     def __init__(
         self, camera: Camera, hub: Hub, clock: Clock, is_wanted: Callable[[], bool], restarted: Callable[[str], None]
@@ -73,7 +73,7 @@ class CameraOpening:
                     if not self._is_lost():
                         return
                     await self._open()
-            except DeviceError:  # told by whoever reads it
+            except DeviceError:  # its poller publishes that
                 await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(retry_s))
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
             else:

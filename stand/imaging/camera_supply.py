@@ -16,7 +16,7 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.tasks import cancelled
 from stand.gate import CAMERA_LOST, Gate
-from stand.imaging.camera_cooling import Cooling, cool_down, last_word
+from stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
 from stand.imaging.equilibrium import CameraEquilibrium
 from stand.interlock import Interlock
@@ -54,7 +54,7 @@ class CameraSupply:
         self.name = f"{relays.name}.{CAMERA_POWER}"
         self.is_on = False
         self.was_on: bool | None = None
-        self.last: Cooling | None = None
+        self.last: CameraTemperature | None = None
         self._camera = camera
         self._relays = relays
         self._limits = limits
@@ -77,7 +77,7 @@ class CameraSupply:
         """Close the camera, then switch it off."""
         self._interlock.check()
         # A camera that was off already has no newer temperature.
-        self.last = last_word(self._hub.known("camera.temperature")) or self.last
+        self.last = last_temperature(self._hub.known("camera.temperature")) or self.last
         self.is_on = False
         await self._camera.close()
         await self._relays.switch(CAMERA_POWER, on=False)
@@ -114,9 +114,7 @@ class CameraSupply:
         equilibrium; event `camera_supply_off`."""
         if self.is_on and not coils.get(CAMERA_POWER, True):
             self.is_on = False
-            text = (
-                "the camera's supply is off though it was switched on: a brown-out of the relay board, or somebody else"
-            )
+            text = "the camera's supply is off though it was switched on: a brown-out of the relay board, or a hand"
             self._hub.publish(Event(self._clock.now_ns(), "error", "camera_supply_off", text))
             self.equilibrium.lose(text)
 

@@ -1,7 +1,7 @@
 """Whether the camera is in thermal equilibrium with the chamber, as far as its supply is concerned.
 
 A camera that was off, or may have been, is cold: what it was soaked before does not count. It has come to equilibrium
-when its own temperature moves slowly for a while, or, when it tells none, after five time constants of its slowest
+when its own temperature moves slowly for a while, or, when it has none, after five time constants of its slowest
 part.
 """
 
@@ -50,7 +50,7 @@ class CameraEquilibrium:
         """It is lost from now on; event `camera_equilibrium_lost`."""
         self.is_lost = True
         self.begin()
-        text = f"the camera's equilibrium is lost, it is soaked anew: {reason}"
+        text = f"the camera's equilibrium is lost, it is soaked again: {reason}"
         self._hub.publish(Event(self._clock.now_ns(), "warning", LOST, text, {"reason": reason, **(data or {})}))
         for listener in self._listeners:
             listener()

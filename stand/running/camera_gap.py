@@ -20,7 +20,7 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepState
 from foundation.readings import Quality, Reading
 from recording.reading.session import Session
-from stand.imaging.camera_cooling import Cooling
+from stand.imaging.camera_cooling import CameraTemperature
 from stand.imaging.equilibrium import CAMERA, LOST, REACHED
 
 AIR = "thermometers.air"
@@ -126,7 +126,7 @@ class CameraBefore:
     host, "" when it is not known. lost: why it was not in equilibrium at the end, "" when nothing speaks against it.
     offsets_K: camera minus air by set-point (degC)."""
 
-    last: Cooling | None = None
+    last: CameraTemperature | None = None
     boot_id: str = ""
     lost: str = ""
     offsets_K: Mapping[float, float] = field(default_factory=dict[float, float])
@@ -166,10 +166,10 @@ def camera_before(session: Session) -> CameraBefore:
     return CameraBefore(_last_word(session), boot_id, lost, settled_offsets(session))
 
 
-def _last_word(session: Session) -> Cooling | None:
+def _last_word(session: Session) -> CameraTemperature | None:
     """The camera's last temperature; None when it never gave one."""
     times_ns, values_degC = session.readings(CAMERA)
     for time_ns, camera_degC in zip(reversed(times_ns.tolist()), reversed(values_degC.tolist()), strict=True):
         if not math.isnan(camera_degC):
-            return Cooling(camera_degC, time_ns)
+            return CameraTemperature(camera_degC, time_ns)
     return None

@@ -37,7 +37,7 @@ from stand.running.resume import Interruption, begun, plan_hash
 from stand.running.settling_watch import SettlingWatch
 from stand.running.state import RunState
 from stand.running.status import StatusBoard
-from stand.running.stop import OPERATOR, Stop
+from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.serving.control import handlers, serve
 
 # The recorder's events that hold a run, and those that let it go on.
@@ -270,7 +270,7 @@ def _ending(fault: Fault | None, error: BaseException) -> Ended:
         cause = cause_of(error)
         reason = "cancelled" if isinstance(cause, asyncio.CancelledError) else failure_text(cause)
         return Ended(0, "failed", f"failed: {reason}")
-    return Ended(0, "stopped" if fault.rule == OPERATOR else "tripped", f"aborted: {fault.text}")
+    return Ended(0, "stopped" if fault.rule == STOPPED_BY_OPERATOR else "tripped", f"aborted: {fault.text}")
 
 
 def _hold_while_not_recorded(gate: Gate) -> Callable[[Item], None]:

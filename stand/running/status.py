@@ -15,7 +15,7 @@ from stand.estimating.follow import parameters_text
 from stand.fault import Fault
 from stand.gate import Gate, Phase
 from stand.running.state import RunState
-from stand.running.stop import OPERATOR, Stop
+from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.serving.control import RunStatus
 
 State = Literal["running", "held", "stopping"]
@@ -110,7 +110,7 @@ class StatusBoard:
     def _fault(self) -> Fault | None:
         """What has tripped; an operator who stops the run is no fault."""
         fault = self._stop.fault or self._held()
-        return None if fault is None or fault.rule == OPERATOR else fault
+        return None if fault is None or fault.rule == STOPPED_BY_OPERATOR else fault
 
     def _follow_state(self) -> None:
         state = _STATES[self._stop.phase]

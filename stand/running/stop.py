@@ -10,8 +10,8 @@ from stand.fault import Fault
 from stand.gate import Gate, Phase, Turn, next_phase
 from stand.stand import Stand
 
-OPERATOR = "operator"  # the rule of a fault that is no fault
-_BY_OPERATOR = Fault(OPERATOR, "stopped by the operator")
+STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
+_BY_OPERATOR = Fault(STOPPED_BY_OPERATOR, "stopped by the operator")
 
 
 class Interrupted(StandError):
@@ -54,7 +54,7 @@ class Stop:
         if self._stand is not None:
             self._stand.latch(fault)
         if self.phase in (Phase.ABORTING, Phase.ENDING, Phase.ENDED):
-            if self._stand is not None and fault.rule == OPERATOR:
+            if self._stand is not None and fault.rule == STOPPED_BY_OPERATOR:
                 self._stand.safety.give_up()
             return
         self._turn(Turn.STOP)
@@ -112,4 +112,4 @@ class Stop:
             text = f"{text}; {error}"
         if isinstance(error, asyncio.CancelledError):
             self._run.uncancel()
-        raise (Interrupted(text) if self.fault.rule == OPERATOR else StandTripped(text)) from error
+        raise (Interrupted(text) if self.fault.rule == STOPPED_BY_OPERATOR else StandTripped(text)) from error

@@ -1,4 +1,4 @@
-"""What keeps the table where the plan put it: home checks, and an approach anew before frames that need it.
+"""What keeps the table where the plan put it: home checks, and a new approach before frames that need it.
 
 A stage without encoder loses steps in silence; only homing again shows it. The 8MT160 profile switches its motor off
 60 s after a move, and the rotor may then relax by up to a full step (2.5 um) while the chamber soaks for an hour.
@@ -26,7 +26,7 @@ async def approach(axis: Axis, position: float) -> None:
 
 
 async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HOME_RESIDUAL_LIMIT_STEPS) -> float:
-    """Home again; the residual in mm or deg: how far the scale had gone astray since the axis was last homed.
+    """Home again; the residual in mm or deg: how far the scale was off since the axis was last homed.
 
     Event "home_residual", or the warning "home_residual_large" beyond `limit_steps` full steps: captures since the last
     good home are then suspect. An axis that has lost its scale is homed without a residual (NaN, event "homed").
@@ -52,10 +52,10 @@ async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HO
 
 
 async def ready(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: Hub, clock: Clock) -> None:
-    """Before a capture: approach anew, from below, each axis whose position cannot be relied upon.
+    """Before a capture: approach again, from below, each axis whose position cannot be relied upon.
 
     `commanded`: where the plan put each axis it moved (mm or deg); the others are left alone. An axis is in doubt when
-    its motor is without current, its scale is lost, or it stands a step or more elsewhere (somebody stopped it); event
+    its motor is without current, its scale is lost, or it stands a step or more elsewhere (stopped by hand); event
     "re-approached" with the reason. DeviceFault in an alarm.
     """
     for name, position in commanded.items():

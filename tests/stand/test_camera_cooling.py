@@ -13,7 +13,7 @@ from foundation.clock import VirtualClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.readings import Quality, Reading, bad_reading
-from stand.imaging.camera_cooling import Cooling, cool_down, last_word
+from stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
 
 BAND_K, TIME_CONSTANT_S = WarmUp().band_K, WarmUp().time_constant_s
 
@@ -43,9 +43,9 @@ class Room:
         air = Reading("thermometers.air", self.plant.air_degC, "degC", self.clock.now_ns())
         self.hub.publish(Batch("thermometers", self.clock.now_ns(), (air,)))
 
-    def switched_off(self) -> Cooling:
+    def switched_off(self) -> CameraTemperature:
         self.plant.camera_powered = False
-        return Cooling(self.plant.sensor_degC, self.clock.now_ns())
+        return CameraTemperature(self.plant.sensor_degC, self.clock.now_ns())
 
     @property
     def waited_s(self) -> float:
@@ -78,7 +78,7 @@ async def test_when_the_wait_is_over_every_part_of_the_camera_is_within_the_band
 
 
 async def test_a_cold_camera_is_not_waited_for(room: Room) -> None:
-    cooling = Cooling(room.plant.air_degC + 0.4, room.clock.now_ns())
+    cooling = CameraTemperature(room.plant.air_degC + 0.4, room.clock.now_ns())
     await cool_down(cooling, BAND_K, TIME_CONSTANT_S, 7200.0, room.hub, room.clock)
     assert room.waited_s == 0.0
 
@@ -87,7 +87,7 @@ async def test_the_wait_ends_at_its_limit_and_says_that_the_camera_is_still_warm
     await cool_down(room.switched_off(), BAND_K, TIME_CONSTANT_S, 600.0, room.hub, room.clock)
     assert room.waited_s == pytest.approx(600.0)
     assert [(event.level, event.kind) for event in room.events] == [("warning", "cool_down_unsure")]
-    assert "without being within 0.5 K" in room.events[0].text
+    assert "continuing outside 0.5 K" in room.events[0].text
 
 
 async def test_a_camera_that_told_no_temperature_is_given_all_the_time(room: Room) -> None:
@@ -106,15 +106,15 @@ async def test_air_that_nobody_measures_does_not_make_a_camera_cold(room: Room) 
     assert "the air near the camera is not measured" in events[0].text
 
 
-def test_only_a_good_temperature_is_a_cameras_last_word() -> None:
+def test_only_a_good_temperature_is_a_cameras_last_one() -> None:
     good = Reading("camera.temperature", 44.0, "degC", 7)
-    assert last_word(good) == Cooling(44.0, 7)
-    assert last_word(Reading("camera.temperature", 44.0, "degC", 7, Quality.STALE, "old")) is None
-    assert last_word(bad_reading("camera.temperature", "degC", 7, "lost")) is None
-    assert last_word(None) is None
+    assert last_temperature(good) == CameraTemperature(44.0, 7)
+    assert last_temperature(Reading("camera.temperature", 44.0, "degC", 7, Quality.STALE, "old")) is None
+    assert last_temperature(bad_reading("camera.temperature", "degC", 7, "lost")) is None
+    assert last_temperature(None) is None
 
 
 def test_the_excess_decays_towards_the_air_by_its_time_constant() -> None:
-    cooled = Cooling(44.0, 0).after(seconds_ns(1200), 24.0, 1200.0)
+    cooled = CameraTemperature(44.0, 0).after(seconds_ns(1200), 24.0, 1200.0)
     assert cooled.camera_degC == pytest.approx(24.0 + 20.0 * 0.36788, abs=1e-4)
-    assert Cooling(44.0, 0).after(0, 24.0, 1200.0).camera_degC == 44.0
+    assert CameraTemperature(44.0, 0).after(0, 24.0, 1200.0).camera_degC == 44.0

@@ -11,7 +11,7 @@ from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
-from stand.imaging.camera_cooling import Cooling
+from stand.imaging.camera_cooling import CameraTemperature
 from stand.imaging.equilibrium import CameraEquilibrium
 from stand.running.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
 
@@ -92,7 +92,7 @@ async def test_a_camera_that_goes_on_moving_is_told_and_waited_for():
     ],
 )
 def test_in_doubt_a_camera_was_off(was_supplied, boot_id, camera_degC, lost, text):
-    before = CameraBefore(Cooling(40.0, 0), "a", lost)
+    before = CameraBefore(CameraTemperature(40.0, 0), "a", lost)
     reading = Reading("camera.temperature", camera_degC, "degC", NS_PER_S)
     found = doubt(before, boot_id, was_supplied, reading)
     assert found.startswith(text)
