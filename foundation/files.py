@@ -1,16 +1,34 @@
-"""Files that appear when they are complete: a reader, or an interrupted run, never sees half of one."""
+"""Files and folders that appear when they are complete: a reader, or an interrupted run, never sees half of one."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 import tempfile
 from collections.abc import Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
 from foundation.errors import SessionError
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """`data` as the file `path`, whole and on the disk when this returns, whoever else writes one of the same name at
+    the same time; its folder is made. Raises OSError, and then whatever was there before still is."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _beside(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            _placed(file.fileno(), temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+    sync_folder(path.parent)
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -21,10 +39,11 @@ def write_whole(path: Path, text: str) -> None:
 
 def write_whole_bytes(path: Path, data: bytes) -> None:
     """As `write_whole`, for what is no text."""
-    with _placed(path) as temporary, temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    _check_place(path)
+    try:
+        replace_file(path, data)
+    except OSError as error:
+        raise _refused(path, error) from error
 
 
 @contextmanager
@@ -34,22 +53,14 @@ def whole_file(path: Path) -> Generator[TextIO]:
     Until then, and for good when the block raises, an older file stays as it was and nothing else is left behind.
     SessionError when the place refuses.
     """
-    with _placed(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
-
-
-@contextmanager
-def _placed(path: Path) -> Generator[Path]:
-    """A temporary file beside `path` that replaces it when the block ends well."""
     _check_place(path)
     temporary = _temporary(path)
     try:
-        yield temporary
-        temporary.chmod(0o644)
-        _check_place(path)
-        temporary.replace(path)
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            yield file
+            file.flush()
+            _check_place(path)
+            _placed(file.fileno(), temporary, path)
     except OSError as error:
         raise _refused(path, error) from error
     finally:
@@ -98,12 +109,69 @@ def _check_place(path: Path) -> None:
 
 def _temporary(path: Path) -> Path:
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        return _beside(path)
     except OSError as error:
         raise _refused(path, error) from error
+
+
+def _beside(path: Path) -> Path:
+    """A new file in the same folder, under a name nobody else has."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
     return Path(name)
 
 
+def _placed(fd: int, temporary: Path, path: Path) -> None:
+    """What was written is on the disk, and then under its name."""
+    os.fchmod(fd, 0o644)
+    os.fsync(fd)
+    temporary.replace(path)
+
+
 def _refused(path: Path, error: OSError) -> SessionError:
     return SessionError(f"{path}: cannot be written ({error.strerror})")
+
+
+@contextmanager
+def new_folder(out: Path) -> Generator[Path]:
+    """A folder beside `out` (`NAME.part`) to write into. When the block ends well it is on the disk and becomes `out`;
+    when it does not, it is removed. SessionError when `out` exists or the disk refuses."""
+    part = out.parent / f"{out.name}.part"
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if out.exists():
+            raise SessionError(f"{out}: exists already; choose another name or move it away")
+        if part.exists():
+            raise SessionError(f"{part}: is in the way, left by a command that was killed; remove it")
+        part.mkdir()
+    except OSError as error:
+        raise SessionError(f"{out}: cannot be made ({error})") from error
+    try:
+        yield part
+        _sync_all(part)
+        part.rename(out)
+        sync_folder(out.parent)
+    except OSError as error:
+        raise SessionError(f"{out}: cannot be written ({error})") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)  # there is none any more when all went well
+
+
+def _sync_all(folder: Path) -> None:
+    """Everything in `folder` on the disk, then the folder itself."""
+    for path in folder.iterdir():
+        if path.is_dir():
+            _sync_all(path)
+            continue
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+    sync_folder(folder)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the folder's names durable."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

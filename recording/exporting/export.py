@@ -28,7 +28,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from google.protobuf.message import DecodeError
 
 from foundation.errors import SessionError
-from foundation.folder import new_folder
+from foundation.files import new_folder
 from foundation.items import Batch
 from foundation.readings import Reading
 from recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text

@@ -17,7 +17,7 @@ from typing import Any
 
 from foundation.clock import Clock, VirtualClock, WallClock
 from foundation.errors import SessionError
-from foundation.folder import new_folder
+from foundation.files import new_folder
 from foundation.hub import Hub
 from foundation.items import Item
 from foundation.lane import Lane

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType
 
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import SessionError
-from foundation.folder import new_folder
+from foundation.files import new_folder
 from foundation.items import Event, StepMark, StepState
 from recording.exporting.topics import recorded_topics
 from recording.format import messages

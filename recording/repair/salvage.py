@@ -24,7 +24,7 @@ from mcap.records import Channel
 from mcap.writer import CompressionType, Writer
 
 from foundation.errors import SessionError
-from foundation.sink import sync_folder
+from foundation.files import sync_folder
 from recording.format.layout import (
     DAMAGED,
     FINISHED,
@@ -42,8 +42,8 @@ from recording.reading.walk import StoredMessage, Survey, stored_messages, surve
 from recording.repair.opening import Opening, opening_of, segments_of
 from recording.repair.segment_check import check_segment
 from recording.repair.share_done import ReportShare, ShareDone, no_report
-from recording.writing.block import CHUNK_BYTES
 from recording.writing.locks import lock
+from recording.writing.sink import CHUNK_BYTES
 
 BEING_RECORDED = "is being recorded"
 COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}

@@ -12,7 +12,7 @@ from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.writing.segment import SeriesForm, Topic
 from recording.writing.settings import RecordingSettings
-from recording.writing.telemetry import TelemetryEncoder
+from recording.writing.writers import TelemetryEncoder
 
 TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it goes on when frames or others fill the disk
 

@@ -7,7 +7,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from foundation.sink import sync_folder
+from foundation.files import sync_folder
 
 
 class FolderLost(OSError):

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 from foundation.instants import utc_text
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.writing.home import FolderLost
-from recording.writing.space import Notice
+from recording.writing.notices import Notice
 
 Refound = Callable[[], Awaitable[bool]]
 

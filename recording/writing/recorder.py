@@ -33,13 +33,11 @@ from recording.format.restarts import restarted_step
 from recording.writing.disk import Disk
 from recording.writing.forms import SessionForm
 from recording.writing.homes import Beside, Homes, Kept
-from recording.writing.losses import DroppedReadings, Losses
+from recording.writing.notices import DroppedReadings, Losses, Notice
 from recording.writing.settings import USUAL, RecordingSettings, SessionInfo
-from recording.writing.space import Notice
 from recording.writing.store import RemoteStore, Store
-from recording.writing.telemetry import TelemetryEncoder
 from recording.writing.waiting import Waiting
-from recording.writing.writers import Fate, ImageWriter, TelemetryWriter
+from recording.writing.writers import Fate, ImageWriter, TelemetryEncoder, TelemetryWriter
 
 NO_IMAGE = np.empty((0, 0), np.uint8)
 FINISH_WITHIN_S = 2.0  # real seconds that a disk may take for the end of a run that is stopped

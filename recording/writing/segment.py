@@ -21,16 +21,26 @@ from pathlib import Path
 from typing import NamedTuple
 
 from google.protobuf.message import Message
+from mcap.records import Attachment, Channel, DataEnd, McapRecord, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
 from mcap.well_known import MessageEncoding
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from foundation.sink import CommitSink, sync_folder
+from foundation.files import sync_folder
 from recording.format.damage import DAMAGE
-from recording.format.layout import DEVICES, FINISHED, SEGMENT_METADATA, SESSION_METADATA, UNFINISHED, segment_metadata
-from recording.writing.block import Block, chunk_writer
-from recording.writing.compaction import merge_chunks
-from recording.writing.space import disk_space
+from recording.format.layout import (
+    DEVICES,
+    FINISHED,
+    SEGMENT_METADATA,
+    SESSION_METADATA,
+    TEMPORARY,
+    UNFINISHED,
+    segment_metadata,
+)
+from recording.writing.notices import disk_space
+from recording.writing.sink import Block, CommitSink, chunk_writer
 
 MANY_CHUNKS = 32  # opening a chunk takes a reader as long as a dozen messages
 FILE_SYSTEM_BYTES = 1_000_000  # never reserved: the file system needs blocks of its own to hold a reserve
@@ -184,3 +194,61 @@ def _affordable_bytes(folder: Path, form: SeriesForm) -> int:
         return 0
     spare_bytes = disk_space(folder).free_bytes - max(form.keep_free_bytes, FILE_SYSTEM_BYTES)
     return min(form.reserve_bytes, max(0, spare_bytes))
+
+
+def merge_chunks(source: Path, target: Path, compression: CompressionType) -> None:
+    """Copy the complete segment `source` to `target`, durably, with large chunks: a reader pays for every chunk.
+
+    Telemetry is committed each second, so ten minutes are 600 chunks of a few messages each. The copy has the same
+    header, attachments, metadata, schemas, channels and messages in the same order, and the same input gives the same
+    bytes. It is made under a temporary name, which counts for nothing when it is found later; one chunk is in memory at
+    a time.
+
+    On an error the temporary file is removed and `source` is as it was; OSError from the disk, others when the source
+    does not read as it was written.
+    """
+    temporary = target.with_name(target.name.removesuffix(FINISHED) + TEMPORARY)
+    sink = CommitSink(temporary)
+    try:
+        _copy(source, sink, compression)
+        sink.settle()
+        os.replace(temporary, target)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+    finally:
+        sink.close()
+    sync_folder(target.parent)
+
+
+def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> None:
+    block = Block()
+    writer = chunk_writer(block, compression)
+    writer.start()
+    with source.open("rb") as file:
+        for record in StreamReader(file, validate_crcs=True, record_size_limit=source.stat().st_size).records:
+            if isinstance(record, DataEnd):  # behind it is the index
+                break
+            _add(writer, record)
+            if parts := block.take():
+                sink.append(parts)
+    writer.finish()
+    sink.append(block.take())
+
+
+def _add(writer: Writer, record: McapRecord) -> None:
+    """One record of the source; schemas and channels get the numbers they had, because their order is the same."""
+    match record:
+        case McapMessage():
+            writer.add_message(record.channel_id, record.log_time, record.data, record.publish_time, record.sequence)
+        case Channel():
+            writer.register_channel(record.topic, record.message_encoding, record.schema_id, record.metadata)
+        case Schema():
+            writer.register_schema(record.name, record.encoding, record.data)
+        case Metadata():
+            writer.add_metadata(record.name, record.metadata)
+        case Attachment():
+            writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+        case _:  # the header is the Writer's own, and so are the message indexes
+            pass

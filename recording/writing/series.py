@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
-from foundation.sink import CommitSink
 from recording.format.chain import foreign_numbers
 from recording.format.layout import TEMPORARY
 from recording.writing.home import Home
 from recording.writing.segment import Record, Segment, SeriesForm
+from recording.writing.sink import CommitSink
 
 
 class Series:

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from foundation.files import sync_folder
 from foundation.helper import Line
-from foundation.sink import sync_folder
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
 from recording.writing.forms import SessionForm
+from recording.writing.notices import Notice, SpaceWatch
 from recording.writing.segment import Record
 from recording.writing.series import Series
-from recording.writing.space import Notice, SpaceWatch
 
 _NAME = "store"
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from foundation.clock import Boot, seconds_ns
-from foundation.sink import sync_folder
+from foundation.files import sync_folder
 from stand.config.stand_config import CompressorConfig
 
 # Calls of `keep`, and of which of them the file at a path is.

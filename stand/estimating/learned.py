@@ -16,8 +16,8 @@ from experiments.steps import Role, Step
 from foundation.clock import NS_PER_S
 from foundation.documents import Document, yaml_data
 from foundation.errors import SessionError
+from foundation.files import replace_file
 from foundation.items import StepMark, StepState
-from foundation.whole_file import write_whole
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig
 from stand.estimating.durations import Situation, expect
@@ -156,6 +156,6 @@ def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float | None]]:
 
 def _replace(path: Path, text: str) -> None:
     try:
-        write_whole(path, text.encode())
+        replace_file(path, text.encode())
     except OSError as error:
         raise SessionError(f"{path}: cannot be written ({error.strerror})") from error

@@ -10,7 +10,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field, ValidationError
 
 from foundation.documents import Document
 from foundation.errors import SessionError
-from foundation.sink import sync_folder
+from foundation.files import replace_file
 
 QUEUE_NAME = "queue.json"
 LAST_NAME = "queue.json.last"
@@ -180,25 +180,10 @@ def _store(directory: Path, queue: Queue) -> None:
     path = directory / QUEUE_NAME
     try:
         if path.exists():
-            _replace(directory / LAST_NAME, path.read_bytes())
-        _replace(path, queue.model_dump_json(indent=1).encode() + b"\n")
-        sync_folder(directory)
+            replace_file(directory / LAST_NAME, path.read_bytes())
+        replace_file(path, queue.model_dump_json(indent=1).encode() + b"\n")
     except OSError as error:
         raise SessionError(f"{path}: cannot be written ({error.strerror}); the queue is as it was") from error
-
-
-def _replace(path: Path, data: bytes) -> None:
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError:
-        with suppress(OSError):
-            part.unlink()
-        raise
 
 
 @contextmanager

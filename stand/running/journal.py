@@ -17,10 +17,9 @@ from pathlib import Path
 
 from foundation.clock import Clock
 from foundation.errors import SessionError
+from foundation.files import replace_file, sync_folder
 from foundation.helper import Line
 from foundation.lane import Lane
-from foundation.sink import sync_folder
-from foundation.whole_file import write_whole
 from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, lines_of
 from recording.writing.disk import JOURNAL_LINE, Disk
 from recording.writing.home import FolderLost
@@ -218,7 +217,7 @@ def _kept(path: Path, data: bytes, last_damaged: int) -> Path:
     names = (f"{path.name}{_DAMAGED}" if number == 1 else f"{path.name}.{number}{_DAMAGED}" for number in count(1))
     copy = next(copy for copy in map(path.with_name, names) if not copy.exists() or is_it(copy))
     if not copy.exists():
-        write_whole(copy, data)
+        replace_file(copy, data)
     return copy
 
 

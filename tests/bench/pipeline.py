@@ -32,7 +32,7 @@ from recording.format.png import encode_png
 from recording.reading.session import Session
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.telemetry import TelemetryEncoder
+from recording.writing.writers import TelemetryEncoder
 from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, photograph, render

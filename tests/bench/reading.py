@@ -30,7 +30,7 @@ from recording.format.layout import FRAMES, TELEMETRY
 from recording.reading.session import Session
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.telemetry import TelemetryEncoder
+from recording.writing.writers import TelemetryEncoder
 from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
 
 ROUNDS = 50

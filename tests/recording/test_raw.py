@@ -3,8 +3,7 @@ import pytest
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from foundation.readings import Frame
-from recording.format.images import decode_image
-from recording.format.raw import encode_raw
+from recording.format.images import decode_image, encode_raw
 
 TIME_NS = 1_767_290_400_123_456_789
 

@@ -23,7 +23,7 @@ from recording.reading.session import Session
 from recording.writing.recorder import Recorder
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.telemetry import TelemetryEncoder
+from recording.writing.writers import TelemetryEncoder
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
 

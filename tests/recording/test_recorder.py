@@ -18,7 +18,7 @@ from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading, bad_reading
 from recording.format.images import encode_image
 from recording.reading.session import Session
-from recording.writing.losses import Losses, ranges
+from recording.writing.notices import Losses, ranges
 from recording.writing.recorder import Recorder, RecordingSettings, Saved, SessionInfo
 from tests.recording.disks import limit_files
 

@@ -12,12 +12,12 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from foundation.errors import SessionError
-from foundation.sink import CommitSink
 from recording.format.layout import FRAMES, TELEMETRY, segment_metadata
 from recording.format.records import read_head
 from recording.reading.session import Session
 from recording.repair.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
 from recording.repair.verify import Severity, verify
+from recording.writing.sink import CommitSink
 from tests.recording.damage import (
     ATTACHMENTS,
     DAMAGES,

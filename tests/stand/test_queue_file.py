@@ -269,7 +269,7 @@ def test_a_damaged_file_is_named_left_alone_and_can_be_put_right(tmp_path: Path,
 
 def test_a_disk_that_refuses_leaves_the_queue_as_it_was(tmp_path: Path):
     add(tmp_path)
-    (tmp_path / f".{LAST_NAME}.part").mkdir()  # in the way of the new file, as a full disk would be
+    (tmp_path / LAST_NAME).mkdir()  # in the way of the new file, as a full disk would be
     with pytest.raises(SessionError, match=r"cannot be written \(Is a directory\); the queue is as it was"):
         add(tmp_path)
     assert states(tmp_path) == [(1, "waiting")]

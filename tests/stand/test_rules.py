@@ -9,7 +9,7 @@ from foundation.clock import seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Reading, bad_reading
-from recording.writing.space import Notice, SpaceWatch
+from recording.writing.notices import Notice, SpaceWatch
 from stand.config.stand_config import load_config, packaged
 from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches

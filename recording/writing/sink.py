@@ -1,4 +1,4 @@
-"""A file that grows by whole blocks, each on the disk before it counts."""
+"""The bytes of a segment on their way to the disk: what a Writer makes, and a file that grows by whole blocks of it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,49 @@ import os
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import IO, cast
 
+from mcap.writer import CompressionType, Writer
+
+CHUNK_BYTES = 1024 * 1024
 _KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE, linux/falloc.h
 _NO_RESERVE = (errno.EOPNOTSUPP, errno.ENOSYS)  # a file system that cannot reserve is written to without
 _PARTS_AT_ONCE = 1024  # IOV_MAX
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.fallocate64.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
+
+
+class Block:
+    """The stream of an MCAP Writer: what it has written since somebody last took it, whole chunks with nothing copied.
+    `tell` is the place in the file."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._written_bytes = 0
+
+    def write(self, data: bytes) -> int:
+        """Keep `data`, which is not to be changed any more."""
+        self._parts.append(data)
+        self._written_bytes += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """How many bytes were ever written."""
+        return self._written_bytes
+
+    def flush(self) -> None:
+        """Nothing waits anywhere."""
+
+    def take(self) -> list[bytes]:
+        """The parts since the last time, one behind the other."""
+        parts, self._parts = self._parts, []
+        return parts
+
+
+def chunk_writer(block: Block, compression: CompressionType) -> Writer:
+    """A Writer into `block`; a chunk ends at its flush, or when it has CHUNK_BYTES."""
+    return Writer(cast(IO[bytes], block), chunk_size=CHUNK_BYTES, compression=compression)
 
 
 class CommitSink:
@@ -93,12 +129,3 @@ def _write(fd: int, parts: Sequence[bytes], offset: int) -> int:
         if written:
             rest[0] = rest[0][written:]
     return offset
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the folder's names durable."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
