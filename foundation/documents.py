@@ -15,6 +15,15 @@ from foundation.errors import ConfigError
 
 _LONGEST_VALUE = 200  # characters of a faulty value that a message shows
 _MOST_FAULTS = 20  # that a message names
+# What pydantic says in terms of Python, in those of YAML.
+OUR_WORDS = {
+    "extra_forbidden": "unknown key; correct its name, or take it out",
+    "missing": "is missing; give it",
+    "too_short": "is empty or too short; give more entries",
+    "tuple_type": "give a list: each entry behind a dash, or all in [ ]",
+    "dict_type": "give keys and values, as in `key: value`",
+    "model_type": "give keys and values, as in `key: value`",
+}
 _LONGEST_TEXT, _MOST_VALUES = 250_000, 100_000  # of a document: a hundred times of what ours have
 
 
@@ -116,9 +125,9 @@ def _sentence(where: str, details: ErrorDetails) -> str:
         return f"{where}: {text}"
     value = details["input"]
     shown = "" if isinstance(value, dict | list) or value is None else f" (got {_shown(value)})"
-    if details["type"] == "extra_forbidden":
-        text = "unknown key"
-        shown = ""
+    if (ours := OUR_WORDS.get(details["type"])) is not None:
+        text = ours
+        shown = "" if details["type"] == "extra_forbidden" else shown
     return f"{where}: {path}: {text}{shown}"
 
 

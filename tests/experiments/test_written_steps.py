@@ -142,7 +142,7 @@ def test_a_capture_may_give_the_set_point_it_is_labelled_with():
         ("steps: [{start_chamber: 24}, cool_down]", "steps.1.cool_down: the camera is on here; give power_camera: off"),
         ("steps: [{start_chamber: 24}, open_flap, {soak: 600}]", "steps.2.soak: the flap is open here, and the labor"),
         ("steps: [{soak_until_settled: {max_s: 100}}]", "steps.0.soak_until_settled: max_s 100.0 is the longest"),
-        ("experiments: [{steps: [{move_to: linear}]}]", "experiments.0.steps.0.move_to: Input should be a valid dict"),
+        ("experiments: [{steps: [{move_to: linear}]}]", "experiments.0.steps.0.move_to: give keys and values, as in"),
         (
             "steps: [{repeat: {times: 9999, steps: [{repeat: {times: 9999, steps: [open_flap]}}]}}]",
             "steps.0.repeat.steps.0.repeat.steps.0.open_flap: the plan has more than 100000 steps or 20000 captures",

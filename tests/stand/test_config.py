@@ -78,7 +78,7 @@ def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
         ("guard.heating.gain_K", 0, "guard.heating.gain_K: Input should be greater than 0"),
         ("guard.sensors.warn_K", 7, "guard.sensors: warn_K 7.0 is above trip_K 6.0"),
         ("guard.keys_s", 9, "guard.keys_s must be at least twice the poll of regulator and relays (5.0 s)"),
-        ("guard.notify", "mail", "guard.notify: Input should be a valid tuple"),
+        ("guard.notify", "mail", "guard.notify: give a list: each entry behind a dash"),
         ("guard.notify", ["mail", ""], "guard.notify.1: String should have at least 1 character"),
         ("guard.notify_limit_s", 61, "guard.notify_limit_s: Input should be less than or equal to 60"),
         ("compressor.state_file", "a\nb", "compressor.state_file: expected a path of printable characters"),

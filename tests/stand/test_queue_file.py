@@ -145,7 +145,7 @@ def test_what_is_queued_is_what_the_files_were_when_they_were_added(tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("name: bad\nexperiments: [{warm_upp: {}}]\n", "unknown key"),
+        ("name: bad\nexperiments: [{warm_upp: {}}]\n", "there is no experiment 'warm_upp'; did you mean warm_up?"),
         ("name: bad\nexperiments: [{thermal_cycle: {set_points_degC: [65]}}]\n", r"outside limits\.chamber_degC"),
     ],
 )
@@ -166,7 +166,7 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path):
 def test_what_this_version_refuses_is_named_with_its_run(tmp_path: Path):
     add(tmp_path)
     entry = queue.queued(tmp_path).entries[0].model_copy(update={"recipe_text": "name: x\n"})
-    with pytest.raises(ConfigError, match=r"run 1 of the queue: warm-up: experiments"):
+    with pytest.raises(ConfigError, match=r"run 1 of the queue: warm-up: nothing to do; give experiments:"):
         queue.order_of(entry)
 
 

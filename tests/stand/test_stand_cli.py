@@ -111,7 +111,7 @@ def test_a_target_that_is_none_is_refused_before_anything_moves(tmp_path: Path):
     config.write_text(yaml.safe_dump({**data, "target": str(target)}))
     result = runner.invoke(app, ["run", "demo", "--config", str(config), "--out", str(tmp_path / "out")])
     assert result.exit_code == 2
-    assert result.output.startswith(f"error: {target}: columns: Field required")
+    assert result.output.startswith(f"error: {target}: columns: is missing; give it")
     assert len(result.output.strip().splitlines()) == 1
 
 
