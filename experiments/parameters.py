@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self, cast
+from typing import Annotated, Literal, Self, cast
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -67,7 +67,15 @@ def _settled(value: object) -> object:
     raise ValueError(f"until takes `settled`, or `settled:` with thresholds, not {value!r}")
 
 
-Until = Annotated[Settled | None, BeforeValidator(_settled)]
+class _UntilSettled(BaseModel):
+    """As a recipe writes thresholds."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    settled: Settled
+
+
+Until = Annotated[Settled | None, BeforeValidator(_settled, json_schema_input_type=_UntilSettled | Literal["settled"])]
 
 
 def check_until(until: Settled | None, dwell_s: float, name: str = "dwell_s") -> None:

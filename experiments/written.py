@@ -146,6 +146,11 @@ def _as_list(value: object) -> object:
     return [value] if isinstance(value, str) else value
 
 
+_AxisNames = Annotated[
+    tuple[str, ...], Field(min_length=1), BeforeValidator(_as_list, json_schema_input_type=str | tuple[str, ...])
+]
+
+
 class StepEntry(_Part):
     """One step, repeat or ramp."""
 
@@ -159,7 +164,7 @@ class StepEntry(_Part):
     close_flap: Nothing | None = None
     capture: CaptureEntry | None = None
     move_to: Annotated[dict[str, float], Field(min_length=1)] | None = None
-    check_home: Annotated[tuple[str, ...], BeforeValidator(_as_list), Field(min_length=1)] | None = None
+    check_home: _AxisNames | None = None
     power_camera: bool | None = None
     cool_down: CoolDownEntry | None = None
     prompt: Annotated[str, StringConstraints(min_length=1, max_length=500)] | None = None
@@ -181,7 +186,7 @@ class StepEntry(_Part):
 _WITH_A_VALUE = frozenset(
     {"start_chamber", "set_temperature", "soak", "move_to", "check_home", "power_camera", "prompt"}
 )
-StepEntries = tuple[Annotated[StepEntry, BeforeValidator(_as_entry)], ...]
+StepEntries = tuple[Annotated[StepEntry, BeforeValidator(_as_entry, json_schema_input_type=str | StepEntry)], ...]
 Repeat.model_rebuild()
 Ramp.model_rebuild()
 StepEntry.model_rebuild()

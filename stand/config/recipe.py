@@ -6,7 +6,7 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Self, cast
 
-from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from experiments.calibration import Calibration, calibration
@@ -24,6 +24,8 @@ _MOST_VISITS = 10_000  # captures; more than any camera lives through, and a pla
 
 class Experiment(Document):
     """One entry of the recipe: exactly one of the keys, or the name of an experiment that another package adds."""
+
+    model_config = ConfigDict(json_schema_extra={"additionalProperties": True})  # names of other packages' experiments
 
     warm_up: WarmUp | None = None
     thermal_cycle: ThermalCycle | None = None

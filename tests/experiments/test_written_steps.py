@@ -174,3 +174,12 @@ PLANS = {
 def test_an_installed_recipe_keeps_its_plan(name: str):
     ids = ",".join(step.step_id for step in load_recipe(packaged("recipes", name)).plan())
     assert hashlib.sha256(ids.encode()).hexdigest()[:16] == PLANS[name]
+
+
+def test_the_schema_knows_what_may_be_written_in_short():
+    schema = Recipe.model_json_schema()
+    parts = schema["$defs"]
+    assert {"type": "string"} in schema["properties"]["steps"]["items"]["anyOf"]  # `- open_flap`
+    assert {"type": "string"} in parts["StepEntry"]["properties"]["check_home"]["anyOf"]
+    assert {"const": "settled", "type": "string"} in parts["ThermalCycle"]["properties"]["until"]["anyOf"]
+    assert parts["Experiment"]["additionalProperties"]  # experiments of other packages
