@@ -112,14 +112,15 @@ async def test_the_time_left_of_dwells_that_end_when_settled_is_true_once_a_run_
     tmp_path: Path, order: Callable[..., Order]
 ):
     recipe = SHORT_RECIPE.replace("[30, 20, 24]", "[28, 24]").replace("held_out_degC: [20]", "held_out_degC: []")
-    settled = "dwell_s: 3600\n      until: {settled: {drift_px_per_min: 0.004}}"
+    # Looks are 2 min apart. A camera that is all but as slow as is asked for settles at this look or at the next, by
+    # chance; at 0.0034 px/min all seeds do at the same one: those before and at it see 3.8 and at most 3.1 mpx/min.
+    settled = "dwell_s: 3600\n      until: {settled: {drift_px_per_min: 0.0034}}"
     ordered = order(recipe.replace("dwell_s: 600", settled))
     await followed(ordered, tmp_path, 3)
     learn(tmp_path, ordered.config)
     session, left = await followed(ordered, tmp_path, 4)
     assert len(left) > 100
-    # Whether a camera has settled shows at a look only, and from seed to seed two looks earlier or later: 122 s here.
-    assert is_true(left, session, 150.0)
+    assert is_true(left, session, 60.0)
 
 
 @pytest.mark.nightly
