@@ -16,6 +16,7 @@ from foundation.errors import ConfigError, Unreachable
 from stand.config.stand_config import StandConfig
 
 _STOP_LIMIT_S = 5.0
+_CAMERA_BOOT_S = 3.0  # a stand that waits for less has a camera that takes less
 _FREE_TCP, _FREE_SERIAL = "tcp:127.0.0.1:0", "serial:"
 
 
@@ -59,6 +60,7 @@ def laboratory_of(
             "address": None if is_anywhere else config.camera.address,
             "serial_number": config.camera.serial_number,
         },
+        "camera_boot_s": min(_CAMERA_BOOT_S, config.camera.boot_s),
     }
 
 

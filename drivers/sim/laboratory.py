@@ -75,6 +75,7 @@ class LaboratorySpec(Document):
     axes: dict[Literal["linear", "rotary"], AxisSpec]
     flap: EndpointSpec
     camera: EndpointSpec
+    camera_boot_s: float = Field(default=3.0, ge=0)
 
 
 class Laboratory:
@@ -175,6 +176,7 @@ class Laboratory:
             spec.camera.serial_number or "",
             real_time=not spec.virtual,
             pace_MBps=_PACE_MBps[spec.virtual],
+            boot_s=spec.camera_boot_s,
         )
 
     def _camera_at_a_free_address(self) -> FakeCamera:

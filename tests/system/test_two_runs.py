@@ -79,7 +79,7 @@ async def test_a_second_run_touches_nothing_until_the_first_has_ended(
     stand: Callable[..., "subprocess.Popen[str]"],
     ending: str,
 ):
-    ordered = order(LONG, camera={"boot_s": 0.5, "poll_s": 0.5}, regulator={"poll_s": 0.5})
+    ordered = order(LONG, camera={"boot_s": 0.2, "poll_s": 0.5}, regulator={"poll_s": 0.5})
     await asyncio.to_thread(simulator, ordered.config, False)
     out, other = tmp_path / "out", tmp_path / "other"
     run = ("run", tmp_path / "recipe.yaml", "--config", tmp_path / "config.yaml", "--out")

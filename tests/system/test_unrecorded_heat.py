@@ -42,7 +42,7 @@ FAST = {
     "thermometers": {"poll_s": 0.25},
     "relays": {"poll_s": 0.5, "self_test_s": 0.6},
     "flap": {"poll_s": 0.5},
-    "camera": {"poll_s": 0.5, "boot_s": 1.0},
+    "camera": {"poll_s": 0.5, "boot_s": 0.2},
     "guard": {"period_s": 0.25, "heater_hold_s": 3.0, "heater_renew_s": 0.5},
     # Longer than a commit takes on the busy disk of a shared machine: the fourth hold within an hour waits for `clear`.
     "recording": {"telemetry_commit_s": 0.2, "durable_within_s": 3.0},
