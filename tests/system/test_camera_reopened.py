@@ -31,7 +31,8 @@ def temperatures_good(directory: Path) -> list[bool]:
 async def test_a_camera_that_was_cut_off_in_a_soak_is_opened_again_and_keeps_its_soak(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
-    ordered = order(SOAK, **FAST)
+    # A camera that was switched on a second ago could not be told from one that has started anew meanwhile.
+    ordered = order(SOAK, **{**FAST, "camera": {"poll_s": 0.5, "boot_s": 2.5}})
     await asyncio.to_thread(simulator, ordered.config, False)
     async with heating(ordered, tmp_path / "out") as (_, watcher):
         await fault(ordered, "camera.silent", True)
