@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -85,8 +84,9 @@ def journal_facts(directory: Path) -> JournalFacts | None:
         lines = lines_of(path.read_bytes())
     except OSError as error:
         return JournalFacts(damage=f"cannot be read ({error.strerror})")
-    entries = [entry for text in lines.sound if (entry := _fields(text)) is not None]
-    last: Mapping[str, object] = entries[-1] if entries else {}
+    last = next((entry for text in reversed(lines.sound) if (entry := _fields(text)) is not None), dict[str, object]())
+    told = (text for text in lines.sound if b'"done"' in text or b'"Gap"' in text)  # the others take seconds to decode
+    entries = [entry for text in told if (entry := _fields(text)) is not None]
     is_end = last.get("entry") == "Ended"
     done = (entry.get("step_id") for entry in entries if entry.get("entry") == "Step" and entry.get("state") == "done")
     last_ns = _instant(last.get("time_ns"))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from foundation.errors import SessionError
+from recording.format.inventory import State, inventory
 from recording.reading.ends import frames_of_plan
 from recording.reading.run_word import Run
 from recording.reading.session import Session
@@ -15,8 +16,9 @@ Say = Callable[[str], None]
 
 
 def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
-    """The session in `path`; SessionError when something of it is missing, unless `incomplete` takes the sentence that
-    says what. Frames that were never acknowledged, or that the recorder itself said it lost, are not missing."""
+    """The session in `path`; SessionError when something of it is missing or was never finished, unless `incomplete`
+    takes the sentence that says what. Frames that were never acknowledged, or that the recorder itself said it lost,
+    are not missing."""
     session = Session.open(path)
     check_whole(session, incomplete)
     return session
@@ -24,6 +26,7 @@ def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
 
 def check_whole(session: Session, incomplete: Say | None = None) -> None:
     """As above, for a session that is open."""
+    _check_finished(session.path, incomplete)
     missing = [hole for hole in session.holes if not hole.excused]
     if not missing:
         return
@@ -34,3 +37,14 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
     if incomplete is None:
         raise SessionError(f"{sentence}; with --incomplete what is there is used")
     incomplete(f"{sentence}; only what is there is used")
+
+
+def _check_finished(path: Path, incomplete: Say | None) -> None:
+    """Segments that a killed recorder has left are not read: a salvage finishes them."""
+    left = [file.name for file in inventory(path) if file.state is State.UNFINISHED]
+    if not left:
+        return
+    sentence = f"{path}: {left[0]} {'is' if len(left) == 1 else f'and {len(left) - 1} more are'} not finished and"
+    if incomplete is None:
+        raise SessionError(f"{sentence} would be left out; `stand session salvage {path}` first")
+    incomplete(f"{sentence} left out; `stand session salvage {path}` recovers what is in it")

@@ -6,7 +6,7 @@ import asyncio
 import json
 import re
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
@@ -74,7 +74,7 @@ def list_sessions(
     Example: stand session list /data/sessions
     """
     with one_line_errors():
-        seen = sorted(map(glance, _sessions_in(directory)), key=lambda session: (session.begin_ns or 0, session.path))
+        seen = sorted(_glances(_sessions_in(directory)), key=lambda session: (session.begin_ns or 0, session.path))
         if as_json:
             typer.echo(json.dumps([glance_json(session) for session in seen], indent=2))
         elif not seen:
@@ -84,6 +84,15 @@ def list_sessions(
         else:
             for line in table_lines(map(list_row, seen)):
                 typer.echo(line)
+
+
+def _glances(paths: Sequence[Path]) -> list[Glance]:
+    seen: list[Glance] = []
+    with late_progress("look at sessions", len(paths)) as report:
+        for path in paths:
+            report(len(seen), one_line(path.name))
+            seen.append(glance(path))
+    return seen
 
 
 def _sessions_in(directory: Path) -> list[Path]:
@@ -133,16 +142,12 @@ def _session_in(directory: Path) -> Path:
 
 @contextmanager
 def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
-    """The session in `directory` for a command that takes all of it. SessionError when segments of it would be left
-    out because they are not finished, or when something of it is missing and not `incomplete`; what is being recorded
-    is left out with a warning. Damage that the command meets becomes a sentence that says what helps."""
+    """The session in `directory` for a command that takes all of it. SessionError when something of it is missing or
+    not finished, and not `incomplete`; what is being recorded is left out with a warning. Damage that the command meets
+    becomes a sentence that says what helps."""
     files = inventory(_session_in(directory))
     help_text = f"`stand session salvage {directory}`"
-    left = [file.name for file in files if file.state is State.UNFINISHED]
     growing = [file.name for file in files if file.state is State.RECORDING]
-    if left:
-        are = "is" if len(left) == 1 else f"and {len(left) - 1} more are"
-        raise SessionError(f"{directory}: {left[0]} {are} not finished and would be left out; {help_text} first")
     if growing:
         _warn(f"{directory}: is being recorded; without what is not finished yet: {', '.join(growing)}")
     try:

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from compensation.cli import app
 from compensation.drift.model_file import save_model
 from recording.reading.session import Session
+from recording.repair.salvage import salvage_session
 
 from .conftest import SEQUENCE, Recorded
 from .test_apply import paper
@@ -76,3 +77,29 @@ def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded,
         assert not out.exists()
     status, said = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")
     assert (status, said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap")) == (0, True)
+
+
+@pytest.fixture
+def unfinished(recorded: Recorded, tmp_path: Path) -> Path:
+    """A killed recorder has left the second segment of the frames."""
+    path = Path(shutil.copytree(recorded.path, tmp_path / "night"))
+    last = path / "frames" / "0001.mcap"
+    last.rename(last.with_name("0001.mcap.part"))
+    return path
+
+
+def test_what_a_killed_recorder_left_is_not_left_out_in_silence(unfinished: Path, tmp_path: Path):
+    out = tmp_path / "markers.csv"
+    status, said = ask("detect", unfinished, "-o", out)
+    assert status == 1
+    assert said == (
+        f"error: {unfinished}: frames/0001.mcap.part is not finished and would be left out; "
+        f"`stand session salvage {unfinished}` first"
+    )
+    assert not out.exists()
+    status, said = ask("detect", unfinished, "-o", out, "--incomplete")
+    assert status == 0
+    assert f"warning: {unfinished}: frames/0001.mcap.part is not finished and left out" in said
+    salvage_session(unfinished)
+    status, said = ask("detect", unfinished, "-o", out)
+    assert (status, "warning" in said) == (0, False)

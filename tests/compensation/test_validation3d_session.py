@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -216,6 +217,21 @@ def test_a_silent_thermometer_is_named_where_it_is_needed(folder: Path, tmp_path
     assert refused.exit_code == 1
     assert "the thermometer artifact was silent" in refused.stderr.splitlines()[-1]
     assert run(folder, tmp_path / "silent", out).exit_code == 0
+
+
+def test_a_session_with_something_missing_is_validated_only_when_that_is_asked_for(folder: Path, tmp_path: Path):
+    session = Path(shutil.copytree(folder / "session", tmp_path / "session"))
+    (session / "frames" / "0001.mcap.part").write_bytes(b"what a killed recorder left")
+    out = tmp_path / "validation.html"
+    refused = run(folder, session, out)
+    assert refused.exit_code == 1
+    assert "frames/0001.mcap.part is not finished and would be left out" in refused.stderr
+    assert not out.exists()
+    used = run(folder, session, out, "--incomplete")
+    assert used.exit_code == 0, used.output
+    assert f"warning: {session}: frames/0001.mcap.part is not finished and left out" in used.stderr
+    assert run(folder, folder / "session", tmp_path / "whole.html").exit_code == 0
+    assert json.loads((tmp_path / "validation.json").read_text()) == json.loads((tmp_path / "whole.json").read_text())
 
 
 def test_pose_frames_teach_the_drift_nothing(folder: Path):
