@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from pathlib import Path
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from typing import Self, cast
 
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationError, model_validator
@@ -16,9 +15,15 @@ from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
 from experiments.written import Place, PlanError, StepEntries, Written, set_point_after, unknown, written_steps
-from foundation.documents import Document, load_document
+from foundation.documents import Document
 from stand.config.added_experiments import added_names, added_steps
 
+_MADE_BY: Mapping[str, Callable[..., Iterable[Step]]] = {
+    "warm_up": warm_up,
+    "thermal_cycle": thermal_cycle,
+    "calibration": calibration,
+    "validation": validation,
+}
 _MOST_VISITS = 10_000  # captures; more than any camera lives through, and a plan is still listed within a second
 
 
@@ -59,31 +64,24 @@ class Experiment(Document):
     @property
     def visits(self) -> int:
         """How many captures the entry asks for, the reference frames of a cycle and written steps apart."""
-        return sum(parameters.visits for parameters in self._given if not isinstance(parameters, tuple))
+        return sum(getattr(parameters, "visits", 0) for parameters in self._given.values())
 
     def sequence(self, place: Place = (), at_degC: float | None = None) -> Generator[Written, None, None]:
         """The steps of this entry, which stands at `place`; at_degC: the set-point before them."""
-        match self._given:
-            case (WarmUp() as parameters,):
-                steps = warm_up(parameters)
-            case (ThermalCycle() as parameters,):
-                steps = thermal_cycle(parameters)
-            case (Calibration() as parameters,):
-                steps = calibration(parameters)
-            case (Validation() as parameters,):
-                steps = validation(parameters)
-            case (tuple() as entries,):
-                yield from written_steps(entries, (*place, "steps"), at_degC)
-                return
-            case _:
-                steps = iter(self._added[1])
-        name = self._added[0] or next(iter(self.model_fields_set))
+        if self.steps is not None:
+            yield from written_steps(self.steps, (*place, "steps"), at_degC)
+            return
+        name, steps = self._added
+        if not name:
+            name, parameters = next(iter(self._given.items()))
+            steps = _MADE_BY[name](parameters)
         yield from (Written((*place, name), step) for step in steps)
 
     @property
-    def _given(self) -> tuple[WarmUp | ThermalCycle | Calibration | Validation | StepEntries, ...]:
-        entries = (self.warm_up, self.thermal_cycle, self.calibration, self.validation, self.steps)
-        return tuple(entry for entry in entries if entry is not None)
+    def _given(self) -> dict[str, object]:
+        """The keys that have a value."""
+        values = ((name, getattr(self, name)) for name in type(self).model_fields)
+        return {name: value for name, value in values if value is not None}
 
 
 class Recipe(Document):
@@ -122,8 +120,3 @@ class Recipe(Document):
                 yield written
                 at_degC = set_point_after(written.step, at_degC)
         yield from written_steps(self.steps, ("steps",), at_degC)
-
-
-def load_recipe(path: Path) -> Recipe:
-    """The recipe file, checked; ConfigError names file and path."""
-    return load_document(path, Recipe)

@@ -34,8 +34,9 @@ from experiments.steps import (
 )
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
+from foundation.documents import load_document
 from foundation.errors import ConfigError
-from stand.config.recipe import Experiment, Recipe, load_recipe
+from stand.config.recipe import Experiment, Recipe
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price
 
@@ -55,7 +56,7 @@ PLACES = {"temperatures_degC": (24.0, 30.0, 12.0), "positions": POSITIONS}
 
 
 def recipe(name: str) -> Recipe:
-    return load_recipe(packaged("recipes", name))
+    return load_document(packaged("recipes", name), Recipe)
 
 
 def steps_of(name: str) -> list[Step]:
@@ -388,7 +389,7 @@ def test_a_recipe_file_is_refused_with_file_and_path(tmp_path: Path, entry: dict
     path = tmp_path / "wrong.yaml"
     path.write_text(yaml.safe_dump({"name": "wrong", "experiments": [plain(entry)]}))
     with pytest.raises(ConfigError, match=sentence) as refused:
-        load_recipe(path)
+        load_document(path, Recipe)
     assert str(path) in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
 

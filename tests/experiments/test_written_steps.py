@@ -21,9 +21,9 @@ from experiments.steps import (
     Step,
     StopChamber,
 )
-from foundation.documents import parse_document
+from foundation.documents import load_document, parse_document
 from foundation.errors import ConfigError
-from stand.config.recipe import Recipe, load_recipe
+from stand.config.recipe import Recipe
 from stand.config.stand_config import packaged
 
 
@@ -172,7 +172,7 @@ PLANS = {
 
 @pytest.mark.parametrize("name", PLANS)
 def test_an_installed_recipe_keeps_its_plan(name: str):
-    ids = ",".join(step.step_id for step in load_recipe(packaged("recipes", name)).plan())
+    ids = ",".join(step.step_id for step in load_document(packaged("recipes", name), Recipe).plan())
     assert hashlib.sha256(ids.encode()).hexdigest()[:16] == PLANS[name]
 
 

@@ -17,7 +17,8 @@ from experiments.steps import (
     StopChamber,
     estimate_s,
 )
-from stand.config.recipe import load_recipe
+from foundation.documents import load_document
+from stand.config.recipe import Recipe
 from stand.config.stand_config import packaged
 from tests.stand.guarded_chamber import Action, Chamber
 
@@ -47,7 +48,7 @@ class Player:
     def actions(self) -> Iterator[tuple[float, Action]]:
         """How long each lasts, s, and what it does."""
         begun_s, interruptions = 0.0, 0
-        for planned in load_recipe(packaged("recipes", self.recipe)).plan():
+        for planned in load_document(packaged("recipes", self.recipe), Recipe).plan():
             last_s = 0.0
             for last_s, action in self._perform(planned.step):
                 yield last_s, action

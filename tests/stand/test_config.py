@@ -4,10 +4,11 @@ import pytest
 import yaml
 
 from foundation.clock import WallClock
+from foundation.documents import load_document
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from stand.assembly import assemble
-from stand.config.recipe import load_recipe
+from stand.config.recipe import Recipe
 from stand.config.safe_ranges import largest_correction_K
 from stand.config.stand_config import load_config, packaged
 
@@ -34,7 +35,7 @@ def test_installed_configurations_are_valid(name: str):
 
 @pytest.mark.parametrize("path", sorted((CONFIGS / "recipes").glob("*.yaml")), ids=lambda path: path.stem)
 def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
-    recipe = load_recipe(path)
+    recipe = load_document(path, Recipe)
     assert recipe.name == path.stem
     assert list(recipe.plan())
 

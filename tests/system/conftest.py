@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from drivers.wires.aravis_library import library
+from foundation.documents import load_document
 from foundation.errors import StandError
-from stand.config.recipe import load_recipe
+from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import Order
 from stand.simulator import Simulator, laboratory_of
@@ -79,7 +80,7 @@ def order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Orde
         recipe_file.write_text(recipe)
         target = packaged("targets", "paper-9x6").read_text()
         config = load_config(config_file)
-        return Order(config, load_recipe(recipe_file), text, recipe, target, at_configured_addresses=True)
+        return Order(config, load_document(recipe_file, Recipe), text, recipe, target, at_configured_addresses=True)
 
     return build
 

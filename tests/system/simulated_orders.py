@@ -7,7 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from stand.config.recipe import load_recipe
+from foundation.documents import load_document
+from stand.config.recipe import Recipe
 from stand.config.stand_config import load_config, packaged
 from stand.running.order import Order
 
@@ -31,7 +32,7 @@ def simulated_order(directory: Path, recipe: str, poll_s: float | None = None) -
     config_file.write_text(yaml.safe_dump(data))
     recipe_file.write_text(recipe)
     target = packaged("targets", "paper-9x6").read_text()
-    return Order(load_config(config_file), load_recipe(recipe_file), config_file.read_text(), recipe, target)
+    return Order(load_config(config_file), load_document(recipe_file, Recipe), config_file.read_text(), recipe, target)
 
 
 def _free_port() -> int:
