@@ -34,7 +34,7 @@ from stand.running.journal import Journal
 from stand.running.logbook import Logbook
 from stand.running.order import Order
 from stand.running.resume import Interruption, begun, plan_hash
-from stand.running.settling_watch import SettlingWatch
+from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.state import RunState
 from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
@@ -66,6 +66,7 @@ async def run_guarded(work: GuardedRun) -> None:
     """The whole plan, or what is not done of it; the actuators are safe before anything else is taken down."""
     assembly, stop = work.assembly, work.stop
     plan, before = work.order.recipe.plan(), work.before
+    load_for(work.order.recipe.plan())
     log = Logbook(assembly.hub, assembly.clock, fold(plan, ()) if before is None else before.state)
     assembly.stand.attended = work.order.attended
     pollers, guard = assembly.pollers(), _guard(work, log)

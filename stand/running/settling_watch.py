@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 from collections import deque
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.steps import SoakUntilSettled
+from experiments.steps import PlannedStep, SoakUntilSettled
 from foundation.clock import Clock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
@@ -25,6 +26,12 @@ if TYPE_CHECKING:
 CHAMBER, CAMERA = "regulator.pv", "camera.temperature"
 _UNKNOWN_S = 60.0
 _KEPT = 20_000  # readings: more than a day at one every 5 s
+
+
+def load_for(plan: Iterable[PlannedStep]) -> None:
+    """Import what looks need, when the plan has any: in the run that would hold the guard's loop for a second."""
+    if any(isinstance(planned.step, SoakUntilSettled) for planned in plan):
+        importlib.import_module("markers.detection")
 
 
 class SettlingWatch:
@@ -90,7 +97,7 @@ class SettlingWatch:
 
     def _find(self, frame: Frame) -> None:
         """In the lane: the markers, and how far they have moved since the look before."""
-        from markers.detection import DetectionError, detect  # numba and scipy take a second that few runs need
+        from markers.detection import DetectionError, detect  # see load_for
 
         try:
             found = detect(frame.image, self._target, self._before)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+OLD = Path(__file__).parents[1] / "recording" / "data" / "20260101T180000Z-format-1"
 HEAVY = ("numba", "scipy", "cv2", "matplotlib")
 
 WORK = {
@@ -32,6 +34,23 @@ def test_help_loads_no_heavy_library(command: str):
 @pytest.mark.parametrize("module", ["foundation.clock", "recording", "markers", "compensation", "experiments", "stand"])
 def test_a_package_loads_no_heavy_library(module: str):
     assert loaded(f"import {module}") == set()
+
+
+@pytest.mark.parametrize(("recipe", "heavy"), [("demo", set[str]()), ("thermal-cycle-settled", {"numba", "scipy"})])
+def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(recipe: str, heavy: set[str]):
+    code = (
+        "import stand.running.run\n"
+        "from stand.running.order import load_order\n"
+        "from stand.running.settling_watch import load_for\n"
+        f"load_for(load_order({recipe!r}, 'simulated').recipe.plan())"
+    )
+    assert loaded(code) - {"cv2"} == heavy  # frames are encoded with OpenCV
+
+
+def test_reading_a_session_loads_no_heavy_library_until_a_frame_is_decoded():
+    code = f"from recording import Session; s = Session.open({str(OLD)!r}); s.channels(); s.frames_table(); s.holes"
+    assert loaded(code) == set()
+    assert loaded(f"{code}; s.frame(0)") == {"cv2"}
 
 
 def test_a_heavy_library_would_be_found():
