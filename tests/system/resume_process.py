@@ -10,6 +10,8 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from signal import SIGKILL
+from threading import Timer
 
 from foundation.items import StepMark, StepState
 from foundation.readings import Frame
@@ -17,6 +19,11 @@ from stand.running.resume import interruption
 from stand.running.run import resume, run_virtual
 
 DOWNTIME_S = 45.0
+
+
+def say(line):
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 def watch(hub):
@@ -27,8 +34,7 @@ def watch(hub):
             taken.setdefault(item.step_id, []).append(item.time_ns)
         is_done = isinstance(item, StepMark) and item.state is StepState.DONE
         times_ns = taken.get(item.step_id, []) if is_done else []
-        sys.stdout.write(" ".join([type(item).__name__, *map(str, times_ns)]) + "\n")
-        sys.stdout.flush()
+        say(" ".join([type(item).__name__, *map(str, times_ns)]))
 
     hub.subscribe(follow)
 
@@ -36,7 +42,10 @@ def watch(hub):
 def main():
     order, place = pickle.loads(sys.stdin.buffer.read())
     if order is None:
-        asyncio.run(resume(interruption(place), watch, DOWNTIME_S))
+        say("resuming")
+        before = interruption(place)
+        say("resumed")
+        asyncio.run(resume(before, watch, DOWNTIME_S))
     else:
         asyncio.run(run_virtual(order, place, None, watch))
 
@@ -51,16 +60,27 @@ class Daemon:
         self._process.stdin.write(pickle.dumps((order, place)))
         self._process.stdin.close()
         self.acknowledged = []
+        self.is_resumed = False  # the session is salvaged and read
 
     def lives_for(self, items, kind=""):
         """Whether it still lives when it has published so many more, of that kind."""
         for line in self._process.stdout:
             name, *times_ns = line.decode().split()
             self.acknowledged += map(int, times_ns)
-            items -= not kind or kind == name
+            self.is_resumed = self.is_resumed or name == "resumed"
+            items -= kind == name or not (kind or name.startswith("resum"))
             if items <= 0:
                 return True
         return False
+
+    def ends_within(self, real_s):
+        """Whether it has come to its end by itself; else it is killed then."""
+        timer = Timer(real_s, self._process.kill)
+        timer.start()
+        code = self.wait()
+        timer.cancel()
+        assert code in (0, -SIGKILL)
+        return code == 0
 
     def kill(self):
         """Dead when this returns; what it had acknowledged meanwhile counts, too."""

@@ -1,0 +1,50 @@
+"""A night that is killed every 20 s of real time until it ends, also while it is being resumed and salvaged."""
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from stand.running.entries import Gap, read_lines
+from stand.running.journal import JOURNAL_NAME
+from stand.running.order import Order
+from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.resume_process import Daemon
+from tests.system.test_resume import check, check_soaks, revived
+
+LIFE_S = 20.0
+NIGHT = (
+    SHORT_RECIPE.replace("600", "1800")
+    .replace("[30, 20, 24]", "[30, 20, 24, 32, 18, 28, 22, 34, 26, 16, 30, 20, 24]")
+    .replace("frames_per_point: 1", "frames_per_point: 20")
+)
+
+
+@pytest.mark.nightly
+def test_a_night_killed_every_20_s_of_real_time_comes_to_its_end_and_loses_nothing(
+    tmp_path: Path, order: Callable[..., Order], record_property: Callable[[str, object], None]
+):
+    require_aravis()
+    ordered, out, rng = order(NIGHT), tmp_path / "out", random.Random(20)
+    acknowledged, unresumed, lives = list[int](), 0, 1
+    daemon = Daemon(ordered, out)
+    while not daemon.ends_within(LIFE_S):
+        acknowledged += daemon.acknowledged
+        daemon = revived(ordered, out)
+        for _ in range(rng.randrange(4)):  # killed while it salvages, reads the session, or opens the devices
+            if daemon.lives_for(1, "resuming") and not daemon.ends_within(rng.choice([0.02, 0.1, 0.3, 1.0, 3.0])):
+                unresumed += not daemon.is_resumed
+                acknowledged += daemon.acknowledged
+                daemon = revived(ordered, out)
+        lives += 1
+        assert lives < 100, "the night does not get on"
+    assert daemon.wait() == 0
+    (directory,) = out.iterdir()
+    check(directory, ordered, acknowledged + daemon.acknowledged)
+    check_soaks(directory, ordered)
+    gaps = [entry for entry in read_lines((directory / JOURNAL_NAME).read_bytes())[0] if isinstance(entry, Gap)]
+    record_property("lives", f"{lives}, of {lives + unresumed} daemons begun; {len(gaps)} gaps")
+    assert lives > 5
+    assert unresumed > 2
+    assert len(gaps) > 5
