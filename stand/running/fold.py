@@ -8,7 +8,7 @@ Pure: no clock, no disk, no device.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -51,10 +51,25 @@ from stand.running.state import RunState, SetUp
 def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
     """The state of a run of that plan after these entries. ConfigError when the plan was edited to steps that are not
     known here."""
-    state = RunState(tuple(plan))
+    state = RunState(tuple(plan), done=_Growing(), begun=_Growing())
     for entry in entries:
         state = after(state, entry)
-    return state
+    return replace(state, done=frozenset(state.done), begun=frozenset(state.begun))
+
+
+class _Growing(set[str]):
+    """Ids within a fold, where nobody keeps the states between: a plan has up to 100,000 steps."""
+
+
+def _plus(ids: Set[str], step_id: str) -> Set[str]:
+    if isinstance(ids, _Growing):
+        ids.add(step_id)
+        return ids
+    return ids | {step_id}
+
+
+def _minus(ids: Set[str], gone: Set[str]) -> Set[str]:
+    return _Growing(ids - gone) if isinstance(ids, _Growing) else ids - gone
 
 
 def after(state: RunState, entry: Entry) -> RunState:
@@ -141,7 +156,7 @@ def _changed(state: RunState, change: Change) -> RunState:
     state = replace(state, changes=(*state.changes, change))
     match change:
         case Skipped(_, step_id):
-            state = replace(state, skipped=state.skipped | {step_id}, done=state.done | {step_id})
+            state = replace(state, skipped=state.skipped | {step_id}, done=_plus(state.done, step_id))
             if state.under_way == step_id:
                 state = replace(state, under_way="", due_ns=None, is_lost=False)
             return _placed(state)
@@ -167,13 +182,12 @@ def _longer(planned: PlannedStep, step_id: str, by_s: float) -> PlannedStep:
 
 
 def _placed(state: RunState) -> RunState:
-    """The first step to do, and what those before it have set up."""
-    set_up = SetUp()
-    for index, planned in enumerate(state.plan):
-        if planned.step_id not in state.done:
-            return replace(state, index=index, set_up=set_up)
+    """From its place on: the first step to do, and what those before it have set up."""
+    index, set_up = state.index, state.set_up
+    while index < len(state.plan) and (planned := state.plan[index]).step_id in state.done:
         set_up = set_up if planned.step_id in state.skipped else set_up.after(planned)
-    return replace(state, index=len(state.plan), set_up=set_up)
+        index += 1
+    return replace(state, index=index, set_up=set_up)
 
 
 def _begun(state: RunState, entry: Step) -> RunState:
@@ -181,7 +195,7 @@ def _begun(state: RunState, entry: Step) -> RunState:
     is_anew = state.under_way != entry.step_id
     state = replace(
         state,
-        begun=state.begun | {entry.step_id},
+        begun=_plus(state.begun, entry.step_id),
         under_way=entry.step_id,
         due_ns=None if is_anew else state.due_ns,
         is_lost=state.is_lost and not is_anew,
@@ -197,7 +211,7 @@ def _done(state: RunState, entry: Step) -> RunState:
     return _placed(
         replace(
             state,
-            done=state.done | {entry.step_id},
+            done=_plus(state.done, entry.step_id),
             under_way="" if is_under_way else state.under_way,
             earned_ns=_without(state.earned_ns, entry.step_id),
             frames=_without(state.frames, entry.step_id),
@@ -256,7 +270,15 @@ def _again(state: RunState, entry: Again) -> RunState:
     """A capture under way begins anew where it is; for other steps what those before them set up is needed again."""
     ids = frozenset(entry.step_ids)
     frames = MappingProxyType({each: count for each, count in state.frames.items() if each not in ids})
-    kept = replace(state, done=state.done - ids, begun=state.begun - ids, skipped=state.skipped - ids, frames=frames)
+    kept = replace(
+        state,
+        index=0,
+        set_up=SetUp(),
+        done=_minus(state.done, ids),
+        begun=_minus(state.begun, ids),
+        skipped=state.skipped - ids,
+        frames=frames,
+    )
     if ids != frozenset((state.under_way,)):
         kept = replace(kept, under_way="", due_ns=None, is_lost=False, disturbances=state.disturbances + 1)
     return _placed(kept)

@@ -6,6 +6,7 @@ import asyncio
 import importlib.metadata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from foundation.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
@@ -32,7 +33,7 @@ from stand.running.fold import fold
 from stand.running.holds import end_endless_holds, keep_shut_in_holds
 from stand.running.journal import Journal
 from stand.running.logbook import Logbook
-from stand.running.order import Order
+from stand.running.order import Order, check_plan
 from stand.running.resume import Interruption, begun, plan_hash
 from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.state import RunState
@@ -148,12 +149,10 @@ async def _begun(
     work.assembly.hub.subscribe(_hold_while_not_recorded(gate))
     if before is not None:
         _judge_camera(before, work.assembly)
-    assembly, config = work.assembly, work.order.config
+    assembly, allowed = work.assembly, partial(check_plan, config=work.order.config)
     offsets = OffsetWatch(assembly.hub, assembly.clock, None if before is None else _gap(before, assembly.clock))
     flushed = work.recorder.flushed
-    return Executor(
-        assembly.stand, assembly.hub, assembly.clock, log, flushed, settling, offsets, lambda plan: price(plan, config)
-    )
+    return Executor(assembly.stand, assembly.hub, assembly.clock, log, flushed, settling, offsets, allowed)
 
 
 def _gap(before: Interruption, clock: Clock) -> OffsetGap:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from drivers.wires.registers import load_register_map
+from experiments.sequence import checked
+from experiments.steps import PlannedStep
+from experiments.written import PlanError, Written
 from foundation.documents import parse_document, read_document
+from foundation.errors import ConfigError
 from markers.target import Target
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -44,6 +48,17 @@ def load_order(recipe: str, config: str) -> Order:
         load_register_map(packaged("registers", registers))
     price(order.recipe.plan(), stand)
     return order
+
+
+def check_plan(plan: Iterable[PlannedStep], config: StandConfig) -> None:
+    """ConfigError when a step cannot be where it is, or is nothing for this stand."""
+    planned = tuple(plan)
+    try:
+        for _ in checked(Written((each.index,), each.step) for each in planned):
+            pass
+    except PlanError as error:
+        raise ConfigError(f"step {error.place[0]}: {error}") from error
+    price(planned, config)
 
 
 def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:

@@ -5,7 +5,7 @@ It is folded from the run's entries (stand/running/fold.py); what to do next is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -104,9 +104,9 @@ class RunState:
     plan: Plan
     index: int = 0
     set_up: SetUp = field(default_factory=SetUp)
-    done: frozenset[str] = frozenset()
-    begun: frozenset[str] = frozenset()
-    skipped: frozenset[str] = frozenset()
+    done: Set[str] = frozenset()
+    begun: Set[str] = frozenset()
+    skipped: Set[str] = frozenset()
     under_way: str = ""
     earned_ns: Mapping[str, int] = field(default_factory=_nothing)
     frames: Mapping[str, int] = field(default_factory=_nothing)
@@ -150,6 +150,8 @@ class RunState:
 
     def step(self, step_id: str) -> PlannedStep | None:
         """The step of that id in the plan in force."""
+        if self.index < len(self.plan) and self.plan[self.index].step_id == step_id:
+            return self.plan[self.index]
         return next((planned for planned in self.plan if planned.step_id == step_id), None)
 
     def owed_ns(self, soak: PlannedStep) -> int:

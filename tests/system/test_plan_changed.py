@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import Capture, CloseFlap, OpenFlap, Role, Soak, StopChamber
+from experiments.steps import Capture, CloseFlap, OpenFlap, Role, SetTemperature, Soak, StopChamber
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from foundation.items import Item, StepMark, StepState
@@ -57,8 +57,10 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
         (executor,) = executors
         await executor.skip(first.step_id)
         await executor.extend(soak.step_id, 60.0)
-        with pytest.raises(ConfigError, match=r"step 9 .*: 99.0 degC is outside limits.chamber_degC"):
-            await executor.edit(9, [type(plan[8].step)(99.0)])
+        with pytest.raises(ConfigError, match=r"step 9.* 99 degC"):
+            await executor.edit(9, [SetTemperature(99.0)])
+        with pytest.raises(ConfigError, match=r"step 10: the flap is closed here, and fit frames show the target"):
+            await executor.edit(9, [SetTemperature(24.0), rest[1]])
         await executor.edit(other.index + 1, rest)
         (directory,) = out.iterdir()
         await asyncio.to_thread(ask, directory, {"do": "stop"})
