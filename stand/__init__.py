@@ -1,1 +1,1 @@
-"""The daemon: hub, guard, scheduler, recorder, sessions and the command line."""
+"""The daemon: hub, guard, run, recorder, sessions and the command line."""

@@ -56,7 +56,7 @@ def planned(*steps: Step) -> list[PlannedStep]:
 
 
 def marks(plan: Iterable[PlannedStep], durations_s: Iterable[float]) -> list[StepMark]:
-    """What a scheduler publishes when the steps take so long."""
+    """What a run publishes when the steps take so long."""
     found: list[StepMark] = []
     now_ns = BEGIN_NS
     for item, duration_s in zip(plan, durations_s, strict=True):
