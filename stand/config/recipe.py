@@ -48,7 +48,7 @@ class Experiment(Document):
             return handler(data)
         name, known = str(others[0]), [*cls.model_fields, *added_names()]
         if name not in known:
-            raise ValueError(unknown("experiment", name, known))
+            raise ValueError(f"{unknown('experiment', name, known)}; others come with the package that adds them")
         if len(entry) > 1:
             raise ValueError(f"give exactly one of {', '.join(known)}")
         experiment = cls.model_construct()

@@ -4,6 +4,9 @@ import hashlib
 from pathlib import Path
 
 import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from experiments.steps import (
     Capture,
@@ -22,6 +25,7 @@ from experiments.steps import (
     Step,
     StopChamber,
 )
+from experiments.written import StepEntry
 from foundation.documents import load_document, parse_document
 from foundation.errors import ConfigError
 from stand.config.recipe import Recipe
@@ -190,3 +194,22 @@ def test_the_example_of_the_docs_can_be_planned():
     lines = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text().splitlines()
     example = "\n".join(line.removeprefix("    ") for line in lines if line.startswith("    "))
     assert list(parse_document(example, Recipe, "docs/recipes.md").plan())
+
+
+NAMES = st.sampled_from([*StepEntry.model_fields, "steps", "times", "to_degC", "rate_K_per_min", "frames", "role", "x"])
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.dates() | st.text(max_size=5) | NAMES,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(NAMES | st.none() | st.integers(), inner, max_size=3),
+    max_leaves=12,
+)
+
+
+@settings(deadline=None)
+@given(st.dictionaries(st.sampled_from(["experiments", "steps"]), st.lists(VALUES, max_size=4) | VALUES, min_size=1))
+def test_whatever_is_written_is_a_plan_or_one_sentence(written: dict[str, object]):
+    try:
+        recipe = parse_document(yaml.safe_dump({"name": "own", **written}), Recipe, "own.yaml")
+    except ConfigError as error:
+        assert "\n" not in str(error)  # noqa: PT017 - either is fine
+    else:
+        assert list(recipe.plan())
