@@ -5,12 +5,14 @@ A driver's settings are one frozen model beside it: what a stand's file has, wha
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
 from foundation.documents import Document
 
+DeviceName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]  # the first part of its channels
 PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]
 Line = Annotated[str, Field(pattern=r"^\P{Cc}*$", max_length=200)]  # free text without control characters
 
@@ -49,7 +51,7 @@ class EquilibriumSettings(Document):
 
 
 class CameraSettings(Polled):
-    """What the stand asks of a camera, whatever its protocol.
+    """What the stand asks of a camera, whatever its protocol (a file in drivers/devices), and where it is found.
 
     serial_number: refused when another camera answers; none takes any. width_px, height_px: from the sensor's first
     pixel; none the whole sensor. trigger: one frame per software trigger, or frames at frame_rate_hz all the time
@@ -57,6 +59,7 @@ class CameraSettings(Polled):
     no GOOD one then. boot_s: from its supply being switched on until it answers.
     """
 
+    address: str
     serial_number: str | None = Field(default=None, pattern=r"^[ -~]{1,16}$")  # as the bootstrap register holds it
     width_px: int | None = Field(default=None, ge=16, le=65535)
     height_px: int | None = Field(default=None, ge=16, le=65535)
@@ -67,3 +70,13 @@ class CameraSettings(Polled):
     has_temperature: bool = True
     boot_s: float = Field(default=8.0, ge=0, le=600)
     equilibrium: EquilibriumSettings = EquilibriumSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Which camera has answered."""
+
+    vendor: str
+    model: str
+    serial_number: str
+    version: str

@@ -9,13 +9,14 @@ from typing import Protocol, cast
 
 import usb.backend
 
-from drivers.devices.camera import Camera
+from drivers.devices.cameras import make_camera
 from drivers.devices.flap import Flap
 from drivers.devices.protocols import Sensor
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays
 from drivers.devices.stage import Axis
 from drivers.devices.thermometers import Thermometers
+from drivers.settings import EquilibriumSettings, OnBus
 from drivers.wires.bus import Bus
 from drivers.wires.registers import RegisterMap, load_register_map
 from foundation.clock import Clock, VirtualClock
@@ -29,7 +30,7 @@ from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
-from stand.guarding.rules import CAMERA, VITAL, Announcements, camera_measured, camera_stale, recorded, watches
+from stand.guarding.rules import VITAL, Announcements, camera_measured, camera_stale, recorded, watches
 from stand.imaging.camera_supply import SupplyLimits
 from stand.poller import Poller
 from stand.stand import Devices, Stand
@@ -52,16 +53,16 @@ class Assembly:
         config, devices = self.config, self.devices
         timed: list[tuple[Sensor, float]] = [
             (devices.regulator, config.regulator.poll_s),
-            (devices.thermometers, config.thermometers.poll_s),
+            (devices.thermometers, config.thermometer_module.poll_s),
             (devices.relays, config.relays.poll_s),
-            (devices.camera, config.camera.poll_s),
+            *((devices.cameras[name], camera.poll_s) for name, camera in config.cameras.items()),
             (devices.flap, config.flap.poll_s),
             *((devices.axes[name], axis.poll_s) for name, axis in config.axes.items()),
         ]
         pollers = tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
         for poller in pollers:
-            if poller.sensor is devices.camera:
-                poller.mark = marking_stale(CAMERA, camera_stale(config), self.hub)
+            if (name := poller.sensor.name) in devices.cameras:
+                poller.mark = marking_stale(f"{name}.temperature", camera_stale(config, name), self.hub)
         return pollers
 
     def guard(
@@ -110,37 +111,35 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         regulator=Regulator(
             "regulator",
             bus,
-            _register_map(config.regulator.registers, config.regulator.unit),
+            _register_map(config.regulator),
             clock,
         ),
         relays=Relays(
             "relays",
             bus,
-            _register_map(config.relays.registers, config.relays.unit),
+            _register_map(config.relays),
             {str(name): number for name, number in config.relays.channels.items()},
         ),
-        thermometers=_thermometers(config, bus, clock),
-        axes={str(name): Axis(name, axis, clock) for name, axis in config.axes.items()},
+        thermometers=Thermometers(
+            "thermometers", bus, _register_map(config.thermometer_module), config.thermometers, clock
+        ),
+        axes={name: Axis(name, axis, clock) for name, axis in config.axes.items()},
         flap=_flap(config, clock),
-        camera=Camera("camera", config.camera, clock),
+        cameras={name: make_camera(name, camera, clock) for name, camera in config.cameras.items()},
     )
     state_file = config.compressor.state_file
     if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces
         state_file = config.recording.directory / "compressor.json"
     permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, config.compressor)
     chamber = ChamberLimits(config.limits.chamber_degC, permits, config.guard.heater_renew_s, state_file)
-    supply = SupplyLimits(config.camera.boot_s, config.guard.heater_hold_s, config.camera.equilibrium)
+    boots_s = [camera.boot_s for camera in config.cameras.values()]
+    equilibrium = config.camera.equilibrium if config.camera is not None else EquilibriumSettings()
+    supply = SupplyLimits(max(boots_s, default=0.0), config.guard.heater_hold_s, equilibrium)
     return Assembly(config, hub, clock, bus, devices, Stand(devices, chamber, supply, hub, clock), notifier)
 
 
-def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers:
-    channels = {str(name): entry for name, entry in config.thermometers.channels.items()}
-    register_map = _register_map(config.thermometers.registers, config.thermometers.unit)
-    return Thermometers("thermometers", bus, register_map, channels, clock)
-
-
-def _register_map(name: str, unit: int) -> RegisterMap:
-    return load_register_map(packaged("registers", name)).at_unit(unit)
+def _register_map(unit: OnBus) -> RegisterMap:
+    return load_register_map(packaged("registers", unit.registers)).at_unit(unit.unit)
 
 
 class _BackendModule(Protocol):

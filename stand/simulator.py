@@ -49,18 +49,18 @@ def laboratory_of(
         "regulator_unit": config.regulator.unit,
         "relays_unit": config.relays.unit,
         "relay_channels": dict(config.relays.channels),
-        "thermometers_unit": config.thermometers.unit,
-        "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.channels.items()},
+        "thermometers_unit": config.thermometer_module.unit,
+        "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.items()},
         "axes": {
             name: {"address": address_of(axis.address), "profile": axis.profile, "serial_number": axis.serial_number}
             for name, axis in config.axes.items()
         },
         "flap": {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
-        "camera": {
-            "address": None if is_anywhere else config.camera.address,
-            "serial_number": config.camera.serial_number,
+        "cameras": {
+            name: {"address": None if is_anywhere else camera.address, "serial_number": camera.serial_number}
+            for name, camera in config.cameras.items()
         },
-        "camera_boot_s": min(_CAMERA_BOOT_S, config.camera.boot_s),
+        "camera_boot_s": min(_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())),
     }
 
 
@@ -68,12 +68,13 @@ def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
     """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses)."""
     simulation = config.simulation
     axes = {name: axis.model_copy(update={"address": addresses[name]}) for name, axis in config.axes.items()}
+    cameras = {name: each.model_copy(update={"address": addresses[name]}) for name, each in config.cameras.items()}
     return config.model_copy(
         update={
             "bus": config.bus.model_copy(update={"address": addresses["bus"]}),
             "axes": axes,
             "flap": config.flap.model_copy(update={"backend_address": addresses["flap"]}),
-            "camera": config.camera.model_copy(update={"address": addresses["camera"]}),
+            "cameras": cameras,
             "simulation": simulation and simulation.model_copy(update={"control": addresses["control"]}),
         }
     )

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.devices.camera import Camera
 from drivers.devices.flap import Flap
-from drivers.devices.protocols import Actuator
+from drivers.devices.protocols import Actuator, Camera
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays
 from drivers.devices.stage import Axis
@@ -19,6 +18,7 @@ from stand.chamber.chamber import Chamber, ChamberLimits
 from stand.fault import Fault
 from stand.gate import OPERATOR, STOPPING, Gate
 from stand.imaging.camera_supply import CameraSupply, SupplyLimits
+from stand.imaging.cameras import Cameras
 from stand.imaging.imaging import Imaging
 from stand.interlock import Interlock
 from stand.motions import Motions
@@ -37,7 +37,7 @@ class Devices:
     thermometers: Thermometers
     axes: Mapping[str, Axis]
     flap: Flap
-    camera: Camera
+    cameras: Mapping[str, Camera]
 
 
 class Stand:
@@ -52,9 +52,10 @@ class Stand:
         self._hub = hub
         self._clock = clock
         self.interlock = interlock = Interlock(self.gate, (devices.flap, *devices.axes.values()))
-        camera = CameraSupply(devices.camera, devices.relays, supply, interlock, self.gate, hub, clock)
-        self.imaging = Imaging(devices.camera, devices.flap, camera, interlock, self.gate, self.motions, hub, clock)
-        self.chamber = Chamber(devices.regulator, devices.relays, chamber, interlock, camera.compare, hub, clock)
+        cameras = Cameras(devices.cameras, clock)
+        power = CameraSupply(cameras, devices.relays, supply, interlock, self.gate, hub, clock)
+        self.imaging = Imaging(cameras, devices.flap, power, interlock, self.gate, self.motions, hub, clock)
+        self.chamber = Chamber(devices.regulator, devices.relays, chamber, interlock, power.compare, hub, clock)
         self.table = Table(devices.axes, interlock, self.motions, hub, clock)
         self.safety = Safety(self.chamber.permits.revoke, hub, clock)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from foundation.readings import Reading
+from drivers.settings import CameraSettings, Identity
+from foundation.readings import Frame, Reading
 
 
 class Device(Protocol):
@@ -38,4 +39,36 @@ class Actuator(Device, Protocol):
 
     async def make_safe(self) -> None:
         """Bring it to its safe state, now; raises DeviceError when that could not be confirmed."""
+        ...
+
+
+class Camera(Sensor, Protocol):
+    """A camera; channels `<name>.image` and `<name>.temperature`. When it is lost, its calls raise Unreachable until it
+    is opened again. `restarted`: why it has, or may have, started anew between the last open and the one before; "" if
+    it has not."""
+
+    restarted: str
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What it is set to at each open."""
+        ...
+
+    @property
+    def identity(self) -> Identity:
+        """Which camera has answered; Unreachable before `open`."""
+        ...
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it is open and has not been lost since."""
+        ...
+
+    async def grab(self, exposure_s: float | None = None, due_ns: int = 0) -> Frame:
+        """One complete frame that was exposed after the call, at `due_ns` when that is still ahead; `exposure_s` holds
+        for this frame, that of the settings otherwise. Unreachable when the camera was lost."""
+        ...
+
+    async def temperature_place(self) -> str:
+        """Where its temperature is read, and what else the camera offers, in words; "" when nothing was found."""
         ...

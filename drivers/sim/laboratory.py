@@ -56,7 +56,7 @@ class EndpointSpec(Document):
 class LaboratorySpec(Document):
     """What the simulator process is told on its standard input.
 
-    Port 0, "serial:" without a path and a camera without an address stand for free ones.
+    Port 0, "serial:" without a path and a camera without an address stand for free ones. All cameras see the same.
     """
 
     virtual: bool
@@ -74,7 +74,7 @@ class LaboratorySpec(Document):
     thermometer_channels: dict[str, int]
     axes: dict[Literal["linear", "rotary"], AxisSpec]
     flap: EndpointSpec
-    camera: EndpointSpec
+    cameras: dict[str, EndpointSpec]
     camera_boot_s: float = Field(default=3.0, ge=0)
 
 
@@ -97,6 +97,7 @@ class Laboratory:
         self.plant = Plant(plant_spec, self._clock.now_ns())
         self._scene = Scene(SceneSpec(), spec.seed)
         self.axes: dict[str, FakeAxis] = {}
+        self.cameras: dict[str, FakeCamera] = {}
         self.addresses: dict[str, str] = {}
         self.ssr_welded_share = 0.0
         self.camera_sensor_degC: float | None = None
@@ -115,6 +116,11 @@ class Laboratory:
             self.close()
             raise
 
+    @property
+    def camera(self) -> FakeCamera:
+        """The camera that is named so, or the first."""
+        return self.cameras.get("camera") or next(iter(self.cameras.values()))
+
     def advance(self, now_ns: int) -> None:
         """Virtual time moves to `now_ns`; ValueError in real time or backwards."""
         if self._followed is None:
@@ -122,7 +128,8 @@ class Laboratory:
         with self.plant.lock:
             self._followed.follow(now_ns)
             self.plant.advance(now_ns)
-        self.camera.advance(now_ns)
+        for camera in self.cameras.values():
+            camera.advance(now_ns)
 
     def state(self) -> dict[str, float]:
         """The plant's true state now; `now_ns` is the laboratory's time."""
@@ -161,31 +168,38 @@ class Laboratory:
         self.flap = FakeFlap(plant, clock, spec.flap.serial_number or "")
         usb = UsbServer(*tcp_place(spec.flap.address or "", may_be_free=True), [self.flap])
         self._closers.append(usb.close)
-        self.camera = self._camera_at(spec.camera.address) if spec.camera.address else self._camera_at_a_free_address()
-        self._closers.append(self.camera.close)
-        self.camera.start()
-        self.addresses |= {"flap": usb.address, "camera": self.camera.address}
+        self.addresses["flap"] = usb.address
+        for name, settings in spec.cameras.items():
+            serial_number = settings.serial_number or ""
+            camera = (
+                self._camera_at(settings.address, serial_number)
+                if settings.address
+                else self._camera_at_a_free_address(serial_number)
+            )
+            self._closers.append(camera.close)
+            camera.start()
+            self.cameras[name], self.addresses[name] = camera, camera.address
 
-    def _camera_at(self, address: str) -> FakeCamera:
+    def _camera_at(self, address: str, serial_number: str) -> FakeCamera:
         spec = self.spec
         return FakeCamera(
             self.plant,
             self._clock,
             self._render,
             address,
-            spec.camera.serial_number or "",
+            serial_number,
             real_time=not spec.virtual,
             pace_MBps=_PACE_MBps[spec.virtual],
             boot_s=spec.camera_boot_s,
         )
 
-    def _camera_at_a_free_address(self) -> FakeCamera:
+    def _camera_at_a_free_address(self, serial_number: str) -> FakeCamera:
         """GVCP's port is fixed, so cameras side by side need addresses of their own: any of 127.0.0.0/8 will do."""
         number, tries_left = secrets.SystemRandom(), _FREE_ADDRESS_TRIES
         while True:
             address = f"127.{number.randrange(64, 255)}.{number.randrange(256)}.{number.randrange(1, 255)}"
             try:
-                return self._camera_at(address)
+                return self._camera_at(address, serial_number)
             except OSError:
                 tries_left -= 1
                 if not tries_left:

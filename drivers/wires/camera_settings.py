@@ -9,7 +9,7 @@ from typing import Literal, Self, cast
 
 from pydantic import Field, model_validator
 
-from drivers.settings import CameraSettings
+from drivers.settings import CameraSettings, Identity
 from drivers.wires.aravis import GigeDevice
 from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from foundation.addresses import IpAddress
@@ -89,6 +89,7 @@ class GigeCameraSettings(CameraSettings):
     again. buffers: frames that the host keeps in reserve.
     """
 
+    protocol: Literal["gige"] = "gige"
     address: IpAddress
     pixel_format: PixelFormat = "Mono8"
     packet_size: int | None = Field(default=None, ge=220, le=16112)
@@ -128,16 +129,6 @@ class EffectiveSettings:
     heartbeat_s: float
     payload_bytes: int
     receive_buffer_bytes: int
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Who answered, from the bootstrap registers."""
-
-    vendor: str
-    model: str
-    serial_number: str
-    version: str
 
 
 def lacks_control(error: AravisError) -> bool:

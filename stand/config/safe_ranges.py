@@ -83,7 +83,7 @@ def _values(config: object, thermometers: Mapping[str, ThermometerSettings]) -> 
     for safe in SAFE_RANGES:
         yield safe, float(attrgetter(safe.path)(config))
     for name, entry in thermometers.items():
-        path = f"thermometers.channels.{name}.polynomial"
+        path = f"thermometers.{name}.polynomial"
         yield SafeRange(path, " K", _CORRECTION, high=10), largest_correction_K(entry.offset_K, entry.polynomial)
 
 

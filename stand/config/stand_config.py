@@ -5,25 +5,27 @@ addresses differ. A wrong key, unit or range is a ConfigError that names the fil
 from __future__ import annotations
 
 import importlib.resources
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal, Self, get_args
+from typing import Annotated, Literal, Self, cast
 
 from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
+from drivers.devices.cameras import AnyCameraSettings
 from drivers.devices.flap import FlapSettings
 from drivers.devices.relays import RelaysSettings
 from drivers.devices.stage import AxisSettings
 from drivers.devices.thermometers import ThermometerSettings
-from drivers.settings import Line, OnBus, ascending
+from drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
 from drivers.wires.bus import BusSettings
-from drivers.wires.camera_settings import GigeCameraSettings
 from experiments.parameters import Chamber_degC
 from foundation.addresses import TcpAddress
 from foundation.documents import Document, load_document
 from foundation.errors import ConfigError
 from stand.config.guard import GuardConfig
 from stand.config.looks import ChamberConfig
+from stand.config.older_forms import CAMERA, renewed
 from stand.config.safe_ranges import check, outside
 
 
@@ -39,22 +41,9 @@ def _of_this_century(start: datetime) -> datetime:
     return start
 
 
-ThermometerName = Literal["granite_inside", "granite_outside", "artifact", "air", "laboratory"]
-
-
-class ThermometersConfig(OnBus):
-    """The five contact thermometers on one RTD module."""
-
-    channels: dict[ThermometerName, ThermometerSettings]
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        missing = set(get_args(ThermometerName)) - set(self.channels)
-        if missing:
-            raise ValueError(f"channels lacks {', '.join(sorted(missing))}")
-        if len({entry.channel for entry in self.channels.values()}) < len(self.channels):
-            raise ValueError("two thermometers share one channel")
-        return self
+LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
+_GUARDED = {"air", "granite_inside"}  # thermometers without which nothing is heated
+_DEVICES = ("bus", "regulator", "relays", "thermometers", "flap", "stand", "control")  # names that are taken
 
 
 class LimitsConfig(Document):
@@ -115,10 +104,11 @@ class StandConfig(Document):
     bus: BusSettings
     regulator: OnBus
     relays: RelaysSettings
-    thermometers: ThermometersConfig
-    axes: dict[Literal["linear", "rotary"], AxisSettings] = Field(default_factory=dict)
+    thermometer_module: OnBus
+    thermometers: dict[DeviceName, ThermometerSettings]
+    axes: dict[DeviceName, AxisSettings] = Field(default_factory=dict)
     flap: FlapSettings
-    camera: GigeCameraSettings
+    cameras: dict[DeviceName, AnyCameraSettings] = Field(default_factory=dict)
     chamber: ChamberConfig = ChamberConfig()
     limits: LimitsConfig = LimitsConfig()
     guard: GuardConfig = GuardConfig()
@@ -126,47 +116,79 @@ class StandConfig(Document):
     recording: RecordingConfig = RecordingConfig()
     simulation: SimulationConfig | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_today(cls, data: object) -> object:
+        return renewed(cast("dict[str, object]", data)) if isinstance(data, dict) else data
+
     @model_validator(mode="after")
     def _cross_checks(self) -> Self:
-        units = [self.regulator.unit, self.relays.unit, self.thermometers.unit]
+        faults = next(self._faults(), None)
+        if faults is not None:
+            raise ValueError(faults)
+        check(self, self.thermometers, self.guard.accept)
+        return self
+
+    def _faults(self) -> Iterator[str]:
+        """What of one section does not fit another."""
+        yield from self._unfit_devices()
+        yield from self._unfit_limits()
+        yield from self._unfit_periods()
+
+    def _unfit_devices(self) -> Iterator[str]:
+        units = [self.regulator.unit, self.relays.unit, self.thermometer_module.unit]
         if len(set(units)) < len(units):
-            raise ValueError(f"regulator, relays and thermometers need different units on one bus, not {units}")
+            yield f"regulator, relays and thermometer_module need different units on one bus, not {units}"
         addresses = [self.bus.address, *(axis.address for axis in self.axes.values())]
-        twice = next((address for address in addresses if addresses.count(address) > 1), None)
-        if twice is not None:
-            raise ValueError(f"bus and axes need addresses of their own, {twice} is given twice")
-        if self.limits.chamber_degC[1] >= self.guard.max_air_degC:
-            raise ValueError("guard.max_air_degC must be above the upper limits.chamber_degC, or a normal run trips it")
-        if self.guard.heat_max_Wh_per_h >= self.chamber.heater_W:
-            raise ValueError(
-                f"guard.heat_max_Wh_per_h {self.guard.heat_max_Wh_per_h:g} is never reached by a heater of "
+        addresses += [camera.address for camera in self.cameras.values()]
+        if twice := [address for address in addresses if addresses.count(address) > 1]:
+            yield f"bus, axes and cameras need addresses of their own, {twice[0]} is given twice"
+        names = [*self.axes, *self.cameras, *_DEVICES]
+        if twice := [name for name in names if names.count(name) > 1]:
+            yield f"the name {twice[0]} is that of two devices; axes and cameras need names of their own"
+        if missing := _GUARDED - self.thermometers.keys():
+            yield f"thermometers lacks {', '.join(sorted(missing))}, without which nothing is heated"
+        if len({entry.channel for entry in self.thermometers.values()}) < len(self.thermometers):
+            yield "thermometers: two thermometers share one channel"
+        if self.cameras and LEADING not in self.cameras:
+            yield f"cameras: one of them has to be named {LEADING}: soaks, cool-downs and models go by its temperature"
+        if self.cameras and "camera_power" not in self.relays.channels:
+            yield "relays.channels lacks camera_power, the supply of the cameras"
+
+    def _unfit_limits(self) -> Iterator[str]:
+        highest_degC, guard = self.limits.chamber_degC[1], self.guard
+        if highest_degC >= guard.max_air_degC:
+            yield "guard.max_air_degC must be above the upper limits.chamber_degC, or a normal run trips it"
+        if guard.heat_max_Wh_per_h >= self.chamber.heater_W:
+            yield (
+                f"guard.heat_max_Wh_per_h {guard.heat_max_Wh_per_h:g} is never reached by a heater of "
                 f"{self.chamber.heater_W:g} W (chamber.heater_W); take about 0.7 of its power"
             )
-        for name in ("granite", "camera"):  # they follow the air
-            limit_degC = getattr(self.guard, f"max_{name}_degC")
-            if limit_degC < self.limits.chamber_degC[1]:
-                raise ValueError(f"guard.max_{name}_degC {limit_degC} is below the upper limits.chamber_degC")
-        if self.flap.poll_s * 2 > self.guard.flap_open_s:
-            raise ValueError(f"guard.flap_open_s must be at least twice flap.poll_s ({self.flap.poll_s} s)")
-        slowest_s = max(self.regulator.poll_s, self.thermometers.poll_s, self.camera.poll_s)
-        if slowest_s * 2 > self.guard.stale_after_s:
-            raise ValueError(f"guard.stale_after_s must be at least twice the slowest safety poll ({slowest_s} s)")
-        if self.camera.poll_s * 2 > self.guard.camera_temperature_s:
-            raise ValueError(
-                f"guard.camera_temperature_s must be at least twice camera.poll_s ({self.camera.poll_s} s)"
-            )
+        for name, limit_degC in (("granite", guard.max_granite_degC), ("camera", guard.max_camera_degC)):
+            if limit_degC < highest_degC:  # they follow the air
+                yield f"guard.max_{name}_degC {limit_degC} is below the upper limits.chamber_degC"
+
+    def _unfit_periods(self) -> Iterator[str]:
+        guard, cameras_s = self.guard, [camera.poll_s for camera in self.cameras.values()]
+        if self.flap.poll_s * 2 > guard.flap_open_s:
+            yield f"guard.flap_open_s must be at least twice flap.poll_s ({self.flap.poll_s} s)"
+        slowest_s = max(self.regulator.poll_s, self.thermometer_module.poll_s, *cameras_s)
+        if slowest_s * 2 > guard.stale_after_s:
+            yield f"guard.stale_after_s must be at least twice the slowest safety poll ({slowest_s} s)"
+        if max(cameras_s, default=0.0) * 2 > guard.camera_temperature_s:
+            yield f"guard.camera_temperature_s must be at least twice the poll_s of each camera ({max(cameras_s)} s)"
         slowest_s = max(self.regulator.poll_s, self.relays.poll_s)
-        if slowest_s * 2 > self.guard.keys_s:
-            raise ValueError(f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)")
-        check(self, self._thermometers(), self.guard.accept)
-        return self
+        if slowest_s * 2 > guard.keys_s:
+            yield f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)"
 
     def accepted(self) -> dict[str, float]:
         """The values outside their safe ranges, which guard.accept names, by their paths."""
-        return outside(self, self._thermometers())
+        return outside(self, self.thermometers)
 
-    def _thermometers(self) -> dict[str, ThermometerSettings]:
-        return {str(name): entry for name, entry in self.thermometers.channels.items()}
+    @property
+    def camera(self) -> CameraSettings | None:
+        """The leading camera: soaks, cool-downs and models go by its temperature. None on a stand without cameras."""
+        return self.cameras.get(LEADING)
 
 
 def load_config(path: Path) -> StandConfig:

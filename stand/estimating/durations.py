@@ -154,11 +154,15 @@ def _usual(step: Step, found: Situation, config: StandConfig, chamber: ChamberMo
             )
         case CoolDown():
             work = kind_of(step) if found.camera_was_on else COOL_DOWN_AS_FOUND
-            return Expectation(work, estimate_s(step, config.camera.boot_s), 0.0)
+            return Expectation(work, estimate_s(step, _boot_s(config)), 0.0)
         case SoakUntilSettled():
             return Expectation(kind_of(step), settling_s(step, found, chamber), 0.0)
         case _:
-            return Expectation(kind_of(step), estimate_s(step, config.camera.boot_s), 0.0)
+            return Expectation(kind_of(step), estimate_s(step, _boot_s(config)), 0.0)
+
+
+def _boot_s(config: StandConfig) -> float:
+    return max((camera.boot_s for camera in config.cameras.values()), default=0.0)
 
 
 def _move_s(axis: AxisSettings, begin: float, end: float) -> float:

@@ -14,6 +14,7 @@ from experiments.steps import (
     CoolDown,
     MoveTo,
     PlannedStep,
+    PowerCamera,
     SetTemperature,
     SoakUntilSettled,
     StartChamber,
@@ -95,7 +96,9 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
     """Every step priced; ConfigError naming the first step that goes outside the stand's limits, or saying that
     the whole would take more than a year."""
     learned = learned or Learned()
-    frame_px = (config.camera.width_px or _SENSOR_PX[0]) * (config.camera.height_px or _SENSOR_PX[1])
+    frame_px = sum(
+        (camera.width_px or _SENSOR_PX[0]) * (camera.height_px or _SENSOR_PX[1]) for camera in config.cameras.values()
+    )
     telemetry_bytes_per_s = _messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
     found, approach = Situation(), _Approach(LABORATORY_degC, LABORATORY_degC)
     priced: list[PricedStep] = []
@@ -169,7 +172,8 @@ def _minutes(duration_s: float) -> str:
 
 
 def _messages_per_s(config: StandConfig) -> float:
-    polled = (config.regulator, config.relays, config.thermometers, config.flap, config.camera, *config.axes.values())
+    polled = (config.regulator, config.relays, config.thermometer_module, config.flap)
+    polled = (*polled, *config.cameras.values(), *config.axes.values())
     return sum(1.0 / device.poll_s for device in polled)
 
 
@@ -207,6 +211,13 @@ def _check(planned: PlannedStep, config: StandConfig) -> None:
                 f"{where}: homing {step.axis} goes to {outside[0]:g} {axis.unit}, which axes.{step.axis}.limits "
                 f"{axis.limits} exclude"
             )
-    if isinstance(step, Capture) and step.frames > 1 and step.interval_s < 1 / config.camera.frame_rate_hz - 1e-9:
-        rate_hz = config.camera.frame_rate_hz
-        raise ConfigError(f"{where}: a frame every {step.interval_s} s is faster than camera.frame_rate_hz {rate_hz}")
+    if isinstance(step, Capture | SoakUntilSettled | PowerCamera | CoolDown) and not config.cameras:
+        raise ConfigError(
+            f"{where}: needs a camera, and this stand has none; name it under cameras in the stand's file"
+        )
+    for name, camera in config.cameras.items():
+        if isinstance(step, Capture) and step.frames > 1 and step.interval_s < 1 / camera.frame_rate_hz - 1e-9:
+            raise ConfigError(
+                f"{where}: a frame every {step.interval_s} s is faster than cameras.{name}.frame_rate_hz "
+                f"{camera.frame_rate_hz}"
+            )

@@ -47,7 +47,7 @@ PV, AIR, GRANITE, LABORATORY = (
     "thermometers.laboratory",
 )
 RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
-FLAP, CAMERA = "flap.position", "camera.temperature"
+FLAP = "flap.position"
 _CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
 VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these there is no heat
 
@@ -94,7 +94,10 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
         Watch(over_temperature(PV, limits.max_air_degC)),
         Watch(over_temperature(AIR, limits.max_air_degC)),
         Watch(over_temperature(GRANITE, limits.max_granite_degC)),
-        Watch(over_temperature(CAMERA, limits.max_camera_degC, cuts_camera=True)),
+        *(
+            Watch(over_temperature(f"{name}.temperature", limits.max_camera_degC, cuts_camera=True))
+            for name in config.cameras
+        ),
         *(Watch(trustworthy(channel, limits.stale_after_s), after_gap_s=limits.stale_after_s) for channel in VITAL),
     )
 
@@ -102,11 +105,11 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
 def _heat(config: StandConfig) -> tuple[Watch, ...]:
     """Heat that does not come, comes unasked, or is held back. The first may be a detached sensor, the second is out
     of control; a relay that does not close or answer, or a compressor that does not cool, can be put right."""
-    limits = config.guard
+    limits, around = config.guard, _surroundings(config)
     return (
         Watch(heater_not_warming(limits.heating, "regulator", PERMIT)),
-        Watch(warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, (LABORATORY, GRANITE))),
-        Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, (LABORATORY, GRANITE)), action="hold"),
+        Watch(warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, around)),
+        Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, around), action="hold"),
         Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
         Watch(trustworthy(PERMIT, limits.keys_s), limits.keys_s, "hold"),
     )
@@ -119,10 +122,7 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
         Watch(disagreement(PV, AIR, limits.warn_K), limits.warn_after_s, "warn"),
         Watch(disagreement(PV, AIR, limits.trip_K), limits.trip_after_s),
         Watch(stuck_while_other_moves(PV, AIR, limits.air_moves_K, limits.pv_stuck_after_s), action="hold"),
-        *(
-            Watch(stuck(f"thermometers.{name}", limits.stuck_after_s), action="warn")
-            for name in config.thermometers.channels
-        ),
+        *(Watch(stuck(f"thermometers.{name}", limits.stuck_after_s), action="warn") for name in config.thermometers),
     )
 
 
@@ -131,27 +131,36 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
     for how warm it is nobody knows; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
     found before anything is warm. The camera's own temperature is not required: one that is stale is a warning."""
     limits, chamber = config.guard, config.chamber
-    granite, camera, frost = limits.granite_feels, limits.camera_feels, limits.frozen
-    module = tuple(f"thermometers.{name}" for name in config.thermometers.channels)
+    granite, frost = limits.granite_feels, limits.frozen
+    module = tuple(f"thermometers.{name}" for name in config.thermometers)
     return (
         Watch(too_much_heat(limits.heat_max_Wh_per_h, chamber.heater_W, "regulator", PERMIT)),
         *(Watch(heat_not_felt(limits.heat_felt, chamber, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
         *(Watch(granite_feels(granite, chamber.granite_lag_s, GRANITE, probe)) for probe in (PV, AIR)),
-        *(Watch(camera_feels(camera, chamber.camera_lag_s, CAMERA, probe)) for probe in (AIR, PV)),
+        *(
+            Watch(camera_feels(limits.camera_feels, chamber.camera_lag_s, f"{name}.temperature", probe))
+            for name in config.cameras
+            for probe in (AIR, PV)
+        ),
         Watch(output_not_as_needed(limits.needed_output, "regulator", PERMIT, COMPRESSOR, FLAP)),
         *(
             Watch(frozen(channel, module, frost.step_K, frost.after_s, "regulator"), action="hold")
             for channel in (AIR, GRANITE)
         ),
-        Watch(camera_stale(config), action="warn"),
+        *(Watch(camera_stale(config, name), action="warn") for name in config.cameras),
         Watch(first_heat(limits.first_heat, AIR, "regulator", PERMIT), action="hold"),
     )
 
 
-def camera_stale(config: StandConfig) -> Rule:
-    """A frozen temperature of the camera: a warning, and recorded as STALE."""
+def _surroundings(config: StandConfig) -> tuple[str, ...]:
+    """What could warm the air, as far as it is measured."""
+    return (LABORATORY, GRANITE) if "laboratory" in config.thermometers else (GRANITE,)
+
+
+def camera_stale(config: StandConfig, name: str) -> Rule:
+    """A frozen temperature of the camera of that name: a warning, and recorded as STALE."""
     frost = config.guard.frozen
-    return stale_by_air(CAMERA, AIR, frost.air_moves_K, frost.camera_after_s)
+    return stale_by_air(f"{name}.temperature", AIR, frost.air_moves_K, frost.camera_after_s)
 
 
 def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
@@ -190,7 +199,13 @@ def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
 
 def camera_measured(config: StandConfig, frames_to_come: Callable[[], bool]) -> tuple[Watch, ...]:
     """The paper's T is the camera's own temperature; none is asked of a camera that is configured to have none."""
-    if not config.camera.has_temperature:
-        return ()
-    rule = camera_temperature_bad(CAMERA, frames_to_come)
-    return (Watch(rule, config.guard.camera_temperature_s, "hold", ends_itself=True),)
+    return tuple(
+        Watch(
+            camera_temperature_bad(f"{name}.temperature", frames_to_come),
+            config.guard.camera_temperature_s,
+            "hold",
+            ends_itself=True,
+        )
+        for name, camera in config.cameras.items()
+        if camera.has_temperature
+    )

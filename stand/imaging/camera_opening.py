@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from drivers.devices.camera import Camera
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
+from stand.imaging.cameras import Cameras
 
 LOST_LIMIT_S = 1800.0
 RETRY_S, LONGEST_RETRY_S = 1.0, 10.0
@@ -20,9 +20,9 @@ class CameraOpening:
     called with the reason when it has, or may have, restarted by itself since its last answer."""
 
     def __init__(
-        self, camera: Camera, hub: Hub, clock: Clock, is_wanted: Callable[[], bool], restarted: Callable[[str], None]
+        self, cameras: Cameras, hub: Hub, clock: Clock, is_wanted: Callable[[], bool], restarted: Callable[[str], None]
     ) -> None:
-        self._camera = camera
+        self._cameras = cameras
         self._hub = hub
         self._clock = clock
         self._is_wanted = is_wanted
@@ -82,16 +82,16 @@ class CameraOpening:
         self._given_up = self._is_lost()
 
     async def _open(self) -> None:
-        await self._camera.open()
-        if self._is_wanted() and (reason := self._camera.restarted):
+        await self._cameras.open()
+        if self._is_wanted() and (reason := self._cameras.restarted):
             self._restarted(reason)
 
     def _is_lost(self) -> bool:
-        return self._is_wanted() and not self._camera.is_usable
+        return self._is_wanted() and not self._cameras.is_usable
 
     def _receive(self, item: Item) -> None:
         """The hub's subscriber."""
-        if isinstance(item, Batch) and item.device == self._camera.name:
+        if isinstance(item, Batch) and item.device in self._cameras.names:
             is_lost = self._is_lost()
             self._given_up = self._given_up and is_lost
             if is_lost and not self._given_up:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from drivers.devices.camera import Camera
 from drivers.devices.relays import CAMERA_POWER, Relays
 from drivers.settings import EquilibriumSettings
 from foundation.clock import Clock, seconds_ns
@@ -18,7 +17,8 @@ from foundation.tasks import cancelled
 from stand.gate import CAMERA_LOST, Gate
 from stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
-from stand.imaging.equilibrium import CameraEquilibrium
+from stand.imaging.cameras import Cameras
+from stand.imaging.equilibrium import CAMERA, CameraEquilibrium
 from stand.interlock import Interlock
 
 _BOOT_LIMIT_S = 60.0
@@ -35,7 +35,7 @@ class SupplyLimits:
 
 
 class CameraSupply:
-    """The relay of one camera, and an actuator that is safe when it is off.
+    """The relay of all cameras, and an actuator that is safe when it is off.
 
     is_on: the supply is on and the camera has been opened since, as far as is known. was_on: what the relay read before
     this daemon switched it on; None before that. last: the camera's temperature when it was switched off.
@@ -43,7 +43,7 @@ class CameraSupply:
 
     def __init__(
         self,
-        camera: Camera,
+        cameras: Cameras,
         relays: Relays,
         limits: SupplyLimits,
         interlock: Interlock,
@@ -55,7 +55,7 @@ class CameraSupply:
         self.is_on = False
         self.was_on: bool | None = None
         self.last: CameraTemperature | None = None
-        self._camera = camera
+        self._cameras = cameras
         self._relays = relays
         self._limits = limits
         self._interlock = interlock
@@ -63,7 +63,7 @@ class CameraSupply:
         self._hub = hub
         self._clock = clock
         self.equilibrium = CameraEquilibrium(limits.equilibrium, hub, clock)
-        self.opening = CameraOpening(camera, hub, clock, lambda: self.is_on, self.equilibrium.lose)
+        self.opening = CameraOpening(cameras, hub, clock, lambda: self.is_on, self.equilibrium.lose)
 
     async def switch_on(self) -> None:
         """Return when the camera is open and configured."""
@@ -77,9 +77,9 @@ class CameraSupply:
         """Close the camera, then switch it off."""
         self._interlock.check()
         # A camera that was off already has no newer temperature.
-        self.last = last_temperature(self._hub.known("camera.temperature")) or self.last
+        self.last = last_temperature(self._hub.known(CAMERA)) or self.last
         self.is_on = False
-        await self._camera.close()
+        await self._cameras.close()
         await self._relays.switch(CAMERA_POWER, on=False)
 
     async def cool_down(self, band_K: float, time_constant_s: float, max_s: float) -> None:

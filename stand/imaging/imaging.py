@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 from dataclasses import replace
 
-from drivers.devices.camera import Camera
 from drivers.devices.flap import Flap
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import Unreachable
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.readings import Frame
+from stand.config.stand_config import LEADING
 from stand.gate import CAMERA_LOST, Gate
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
 from stand.imaging.camera_supply import CameraSupply
+from stand.imaging.cameras import Cameras
 from stand.interlock import Interlock
 from stand.motions import Motions
 
 
 class Imaging:
-    """Flap and camera; `supply` is the camera's."""
+    """Flap and cameras; `supply` is theirs."""
 
     def __init__(
         self,
-        camera: Camera,
+        cameras: Cameras,
         flap: Flap,
         supply: CameraSupply,
         interlock: Interlock,
@@ -34,7 +36,7 @@ class Imaging:
         clock: Clock,
     ) -> None:
         self.supply = supply
-        self._camera = camera
+        self._cameras = cameras
         self._flap = flap
         self._interlock = interlock
         self._gate = gate
@@ -63,22 +65,22 @@ class Imaging:
                 await self._flap.move_closed()
 
     async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0) -> bool:
-        """One frame of the step, published; exposed at `due_ns` when that is still ahead. False when the camera was
-        lost: see `_regain`; the flap may have been shut meanwhile."""
+        """One frame of each camera for the step, published; the first exposed at `due_ns` when that is still ahead.
+        False when a camera was lost: see `_regain`; the flap may have been shut meanwhile."""
         self._interlock.check()
         try:
-            self._publish(await self._camera.grab(exposure_s, due_ns), step_id)
+            self._publish(await self._cameras.grab(exposure_s, due_ns), step_id)
         except Unreachable as error:
             await self._regain(error)
             return False
         return True
 
     async def look(self, exposure_s: float, step_id: str) -> Frame | None:
-        """One frame of the step through the flap, which is open for it only; published. None when the camera was lost:
-        see `_regain`."""
+        """The leading camera's frame of the step through the flap, which is open for it only; each camera's is
+        published. None when a camera was lost: see `_regain`."""
         await self.open_flap()
         try:
-            return self._publish(await self._camera.grab(exposure_s), step_id)
+            return self._publish(await self._cameras.grab(exposure_s), step_id)[f"{LEADING}.image"]
         except Unreachable as error:
             lost = error
         finally:
@@ -86,11 +88,14 @@ class Imaging:
         await self._regain(lost)
         return None
 
-    def _publish(self, frame: Frame, step_id: str) -> Frame:
+    def _publish(self, frames: Iterable[Frame], step_id: str) -> dict[str, Frame]:
+        """By channel."""
         self._without_camera_ns = 0
-        frame = replace(frame, step_id=step_id)
-        self._hub.publish(frame)
-        return frame
+        published: dict[str, Frame] = {}
+        for frame in frames:
+            published[frame.channel] = replace(frame, step_id=step_id)
+            self._hub.publish(published[frame.channel])
+        return published
 
     async def _regain(self, lost: Unreachable) -> None:
         """Hold the gate until the camera, lost for that reason, is open again, or is found to be without supply; `lost`

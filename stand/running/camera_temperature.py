@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.devices.camera import Camera
+from drivers.devices.protocols import Camera
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import Refused
 from foundation.hub import Hub
@@ -12,12 +12,12 @@ from foundation.readings import Quality
 _TRIES, _PAUSE_S = 3, 1.0
 
 
-async def check_temperature(camera: Camera, hub: Hub, clock: Clock, *, has_temperature: bool) -> None:
+async def check_temperature(camera: Camera, hub: Hub, clock: Clock) -> None:
     """The camera, which is open, shows its temperature, or is configured to have none, which is told.
 
     Refused, with the feature and what the camera offers, when three readings in a row are BAD.
     """
-    if not has_temperature:
+    if not camera.settings.has_temperature:
         text = "the camera is configured to have no temperature: no drift over it can be fitted to this session"
         hub.publish(Event(clock.now_ns(), "warning", "no_camera_temperature", text))
         return
@@ -29,6 +29,7 @@ async def check_temperature(camera: Camera, hub: Hub, clock: Clock, *, has_tempe
         (reading,) = await camera.read()
     if reading.quality is Quality.BAD:
         place = await camera.temperature_place()
-        remedy = "correct camera.temperature in the configuration, or say camera.has_temperature: false there"
+        keys = f"cameras.{camera.name}"
+        remedy = f"correct {keys}.temperature in the configuration, or say {keys}.has_temperature: false there"
         where = f" ({place})" if place else ""
         raise Refused(camera.name, f"its temperature is BAD before the first step: {reading.reason}{where}; {remedy}")

@@ -36,12 +36,12 @@ class Address(NamedTuple):
 
 
 def addresses(config: StandConfig) -> tuple[Address, ...]:
-    """Where a run of this stand reads and switches: the bus, each axis, the flap and the camera.
+    """Where a run of this stand reads and switches: the bus, each axis, the flap and each camera.
 
     Real flaps, cameras and stages count by their serial numbers, too: behind another address they are the same ones. Of
     a simulated laboratory there may be several, with the same numbers. Asks the name service, and so may take a while.
     """
-    flap, camera, is_real = config.flap, config.camera, config.simulation is None
+    flap, is_real = config.flap, config.simulation is None
     found = [Address("bus", place) for place in _places(config.bus.address)]
     for name, axis in config.axes.items():
         found += [Address(name, place) for place in _places(axis.address)]
@@ -51,9 +51,10 @@ def addresses(config: StandConfig) -> tuple[Address, ...]:
         found += [Address("flap", place) for place in _places(flap.backend_address)]
     else:
         found.append(Address("flap", f"usb {flap.serial_number}"))
-    found.append(Address("camera", _of_host("camera", camera.address)))
-    if is_real and camera.serial_number is not None:
-        found.append(Address("camera", f"camera {camera.serial_number}"))
+    for name, camera in config.cameras.items():
+        found.append(Address(name, _of_host("camera", camera.address)))
+        if is_real and camera.serial_number is not None:
+            found.append(Address(name, f"camera {camera.serial_number}"))
     return tuple(found)
 
 

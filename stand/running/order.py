@@ -44,7 +44,7 @@ def load_order(recipe: str, config: str) -> Order:
     texts = {name: read_document(path) for name, path in paths.items()}
     order = parse_order(texts, {name: str(path) for name, path in paths.items()})
     stand = order.config
-    for registers in (stand.regulator.registers, stand.relays.registers, stand.thermometers.registers):
+    for registers in (stand.regulator.registers, stand.relays.registers, stand.thermometer_module.registers):
         load_register_map(packaged("registers", registers))
     price(order.recipe.plan(), stand)
     return order

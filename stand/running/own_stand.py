@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivers.settings import CameraSettings
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig, load_config, packaged
 
@@ -67,7 +68,7 @@ def on_this_stand(
         config = own.model_copy(
             update={
                 "target": recorded.target,
-                "camera": own.camera.model_copy(update={name: getattr(recorded.camera, name) for name in _CAMERA}),
+                "cameras": _cameras(recorded, own, session),
                 "recording": own.recording.model_copy(
                     update={name: getattr(recorded.recording, name) for name in _RECORDING}
                 ),
@@ -83,7 +84,7 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
     notified = {"notify": own.guard.notify, "notify_limit_s": own.guard.notify_limit_s}
     maps = {
         name: getattr(recorded, name).model_copy(update={"registers": getattr(simulated, name).registers})
-        for name in ("regulator", "relays", "thermometers")
+        for name in ("regulator", "relays", "thermometer_module")
     }
     state_file = {"state_file": simulated.compressor.state_file}
     return recorded.model_copy(
@@ -95,6 +96,21 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
             "flap": recorded.flap.model_copy(update={"backend": simulated.flap.backend}),
         }
     )
+
+
+def _cameras(recorded: StandConfig, own: StandConfig, session: Path) -> dict[str, CameraSettings]:
+    """Those of the session, by its names: where they are found is this stand's, what its frames depend on the
+    session's."""
+    if missing := recorded.cameras.keys() - own.cameras.keys():
+        raise ConfigError(
+            f"{session}: was recorded with a camera {min(missing)}, and {own.name!r} has none of that name"
+        )
+    return {
+        name: own.cameras[name].model_copy(
+            update={key: getattr(camera, key) for key in _CAMERA if key in type(camera).model_fields}
+        )
+        for name, camera in recorded.cameras.items()
+    }
 
 
 def _check_kind(recorded: StandConfig, own: StandConfig, session: Path) -> None:

@@ -27,7 +27,7 @@ from stand.running.claim import claimed
 from stand.running.guarded_run import GuardedRun, run_guarded
 from stand.running.order import Order
 from stand.running.resume import Interruption
-from stand.running.session_files import info_of, recorder_of, session_directory
+from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory
 from stand.running.stop import Interrupted, Stop
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
@@ -63,7 +63,7 @@ class _Job:
         if self.before is None:
             return info_of(self.order, directory, assembly)
         if self.before.kept.set_up.camera_on:
-            answers, recorded = assembly.devices.camera.identity.serial_number, self.before.info.camera_serial
+            answers, recorded = camera_serials(assembly), self.before.info.camera_serial
             if answers != recorded:
                 raise SessionError(f"{directory}: was recorded with camera {recorded}, now {answers} answers")
         return self.before.info
@@ -306,17 +306,17 @@ async def _open(assembly: Assembly, *, camera_on: bool) -> None:
         await axis.open()
         stand.opened(axis)
     await stand.chamber.test_dead_man()
-    if camera_on:
+    if camera_on and devices.cameras:
         await stand.imaging.supply.switch_on()
-        has_temperature = assembly.config.camera.has_temperature
-        await check_temperature(devices.camera, assembly.hub, assembly.clock, has_temperature=has_temperature)
+        for camera in devices.cameras.values():
+            await check_temperature(camera, assembly.hub, assembly.clock)
 
 
 async def _close(assembly: Assembly) -> None:
     devices = assembly.devices
-    for close in (devices.camera.close, *(axis.close for axis in devices.axes.values()), devices.flap.close):
+    for device in (*devices.cameras.values(), *devices.axes.values(), devices.flap):
         with suppress(StandError):  # closing never decides a run, and one device must not keep the next from it
-            await close()
+            await device.close()
     await assembly.bus.close()
 
 

@@ -38,12 +38,17 @@ def info_of(order: Order, directory: Path, assembly: Assembly) -> SessionInfo:
         session_id=directory.name,
         recipe=order.recipe.name,
         operator=config.operator,
-        camera_serial=assembly.devices.camera.identity.serial_number,
+        camera_serial=camera_serials(assembly),
         software_version=importlib.metadata.version("thermostand"),
         clock_source="virtual" if isinstance(assembly.clock, VirtualClock) else "wall",
         simulated=config.simulation is not None,
         host=platform.node(),
     )
+
+
+def camera_serials(assembly: Assembly) -> str:
+    """Which cameras have answered; "" on a stand without any."""
+    return ", ".join(camera.identity.serial_number for camera in assembly.devices.cameras.values())
 
 
 def recorder_of(
@@ -86,5 +91,6 @@ def _partial_frames(order: Order) -> RoiEncoder | None:
 
 def _kinds(config: StandConfig) -> dict[str, str]:
     """Device name -> what kind of device it is, for the recorder's topics."""
-    kinds = {name: name for name in ("regulator", "relays", "thermometers", "camera", "flap")}
-    return {**kinds, **{str(name): "axis" for name in config.axes}}
+    kinds = {name: name for name in ("regulator", "relays", "thermometers")}
+    kinds |= dict.fromkeys(config.cameras, "camera")
+    return {**kinds, "flap": "flap", **dict.fromkeys(config.axes, "axis")}

@@ -96,7 +96,7 @@ async def _trip_ms(assembly: Assembly, control: ControlSocket, trip: Trip, delay
     config = assembly.config
     permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, config.compressor)
     chamber = ChamberLimits(config.limits.chamber_degC, permits, config.guard.heater_renew_s)
-    supply = SupplyLimits(config.camera.boot_s, config.guard.heater_hold_s)
+    supply = SupplyLimits(config.cameras["camera"].boot_s, config.guard.heater_hold_s)
     stand = Stand(assembly.devices, chamber, supply, assembly.hub, assembly.clock)
     for actuator in (relays, assembly.devices.regulator, assembly.devices.flap, *assembly.devices.axes.values()):
         stand.opened(actuator)

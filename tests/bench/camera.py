@@ -12,8 +12,9 @@ import math
 import time
 from pathlib import Path
 
-from drivers.devices.camera import Camera, GigeCameraSettings
+from drivers.devices.camera_gige import Camera
 from drivers.wires.aravis_library import library
+from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
 from foundation.errors import StandError
 from tests.bench.fakes import fakes

@@ -7,10 +7,10 @@ diagonal ramp: pixel = (x + y + frame) mod 255 at 10 ms of exposure.
 import numpy as np
 import pytest
 
-from drivers.devices.camera import Camera, GigeCameraSettings, TemperatureFeature
+from drivers.devices.camera_gige import Camera
 from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from drivers.wires.camera_connection import FrameCount
-from drivers.wires.camera_settings import device_error
+from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature, device_error
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
 from foundation.errors import DeviceError, Refused, Unreachable
 from foundation.readings import Quality

@@ -17,12 +17,12 @@ from foundation.documents import parse_document
 from foundation.errors import InUse, SessionError
 from stand.config.stand_config import StandConfig, packaged
 from stand.running.claim import addresses, claimed
+from tests.sections import change
 
 
 def config(base: str = "simulated", **sections: dict[str, object]) -> StandConfig:
     data = yaml.safe_load(packaged("", base).read_text())
-    for section, entries in sections.items():
-        data[section].update(entries)
+    change(data, sections)
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
 

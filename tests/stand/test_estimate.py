@@ -100,7 +100,7 @@ def test_what_was_learned_replaces_what_is_usual(config: StandConfig):
     learned = Learned(overheads_s={"flap travel": 1.1, "PowerCamera": 2.5, "Capture": -5.0})
     plan = planned(OpenFlap(), PowerCamera(on=True), CAPTURE, Soak(60.0))
     durations_s = [step.duration_s for step in price(plan, config, learned)]
-    assert durations_s == pytest.approx([1.1, config.camera.boot_s + 2.5, 0.0, 60.0])
+    assert durations_s == pytest.approx([1.1, config.cameras["camera"].boot_s + 2.5, 0.0, 60.0])
 
 
 def test_a_soak_says_when_the_chamber_arrives(config: StandConfig):

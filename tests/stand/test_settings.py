@@ -18,8 +18,8 @@ import stand.chamber
 import stand.guarding
 import stand.imaging
 import stand.table
-from drivers.devices.camera import GigeCameraSettings
 from drivers.devices.thermometers import ThermometerSettings
+from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
 from foundation.documents import Document, parse_document
 from foundation.hub import Hub
@@ -95,10 +95,10 @@ def test_no_dataclass_repeats_settings():
 )
 def test_what_a_file_says_of_the_camera_is_what_the_driver_has(changes: dict[str, object]):
     data = yaml.safe_load(packaged("", "simulated").read_text())
-    data["camera"].update(changes)
+    data["cameras"]["camera"].update(changes)
     config = parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
-    camera = assemble(config, Hub(), WallClock()).devices.camera
-    settings = GigeCameraSettings.model_validate(data["camera"])
+    camera = assemble(config, Hub(), WallClock()).devices.cameras["camera"]
+    settings = GigeCameraSettings.model_validate(data["cameras"]["camera"])
     assert camera.settings == settings
     assert settings.model_dump(include=set(changes), exclude_unset=True).keys() == changes.keys()
 

@@ -15,6 +15,7 @@ from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import Order
 from stand.simulator import Simulator, laboratory_of
 from tests.addresses import camera_address, free_port
+from tests.sections import change
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.
@@ -59,10 +60,9 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
         for name, axis in data["axes"].items():
             axis["address"] = f"serial:{tmp_path / name}"
         data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
-        data["camera"] |= {"address": camera_address(), **frame}
+        data["cameras"]["camera"] |= {"address": camera_address(), **frame}
         data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
-        for section, entries in sections.items():
-            data.setdefault(section, {}).update(entries)
+        change(data, sections)
         return yaml.safe_dump(data)
 
     return build

@@ -22,11 +22,11 @@ def simulated_order(directory: Path, recipe: str, poll_s: float | None = None) -
     for name, axis in data["axes"].items():
         axis["address"] = f"serial:{directory / name}"
     data["flap"]["backend_address"] = f"tcp:127.0.0.1:{_free_port()}"
-    data["camera"]["address"] = CAMERA_ADDRESS
+    data["cameras"]["camera"]["address"] = CAMERA_ADDRESS
     data["simulation"]["control"] = f"tcp:127.0.0.1:{_free_port()}"
     if poll_s is not None:
-        sections = [data[name] for name in ("regulator", "thermometers", "relays", "flap", "camera")]
-        for section in [*sections, *data["axes"].values()]:
+        sections = [data[name] for name in ("regulator", "thermometer_module", "relays", "flap")]
+        for section in [*sections, *data["cameras"].values(), *data["axes"].values()]:
             section["poll_s"] = poll_s
     config_file, recipe_file = directory / "config.yaml", directory / "recipe.yaml"
     config_file.write_text(yaml.safe_dump(data))

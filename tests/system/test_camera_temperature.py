@@ -161,7 +161,7 @@ def test_frames_are_to_come_until_the_last_capture_of_the_plan_is_done():
 
 def test_a_camera_without_a_temperature_must_not_say_where_it_is(tmp_path: Path):
     data = yaml.safe_load(packaged("", "simulated").read_text())
-    data["camera"] |= {"has_temperature": False, "temperature": {"entry": "Sensor"}}
+    data["cameras"]["camera"] |= {"has_temperature": False, "temperature": {"entry": "Sensor"}}
     config = tmp_path / "stand.yaml"
     config.write_text(yaml.safe_dump(data))
     with pytest.raises(Exception, match="has_temperature is false, yet temperature says where it is"):

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.devices.camera import Camera, GigeCameraSettings, TemperatureFeature
+from drivers.devices.camera_gige import Camera
 from drivers.sim.camera import FakeCamera
 from drivers.wires.aravis_library import library
+from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
 from foundation.errors import Refused, StandError, Unreachable
 from foundation.readings import Quality
@@ -390,7 +391,8 @@ async def test_while_another_client_controls_the_camera_open_is_refused():
 
 CRASH = f"""
 import asyncio, os
-from drivers.devices.camera import Camera, GigeCameraSettings
+from drivers.devices.camera_gige import Camera
+from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
 asyncio.run(Camera("camera", GigeCameraSettings(address="{ADDRESS}", heartbeat_s=1.5), WallClock()).open())
 os._exit(0)

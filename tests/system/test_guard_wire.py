@@ -142,7 +142,7 @@ async def bench_from(order: Order, start_ns: int | None) -> AsyncIterator[Bench]
         await devices.thermometers.open()
         await devices.regulator.stop()
         await devices.flap.move_closed()
-        pollers = [poller for poller in assembly.pollers() if poller.sensor is not devices.camera]
+        pollers = [poller for poller in assembly.pollers() if poller.sensor is not devices.cameras["camera"]]
         for poller in pollers:
             await poller.first()
         tasks.extend(asyncio.create_task(poller.run()) for poller in pollers)

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from drivers.wires.camera_settings import TemperatureFeature
 from foundation.errors import ConfigError, StandTripped
 from recording.reading.session import Session
 from stand.commands.commands import app
@@ -20,6 +21,7 @@ from stand.running.order import Order
 from stand.running.own_stand import on_this_stand
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_real, run_virtual
+from tests.sections import change
 from tests.system.conftest import require_aravis
 from tests.system.test_real_time import BRIEF
 from tests.system.test_resume import findable
@@ -46,8 +48,7 @@ def _aravis() -> None:
 def config_of(tmp_path: Path, name: str = "laboratory", **sections: dict[str, object]) -> StandConfig:
     """An installed configuration with some entries of its sections replaced."""
     data = yaml.safe_load(packaged("", name).read_text())
-    for section, entries in sections.items():
-        data.setdefault(section, {}).update(entries)
+    change(data, sections)
     file = tmp_path / "changed.yaml"
     file.write_text(yaml.safe_dump(data))
     return load_config(file)
@@ -110,12 +111,16 @@ async def test_a_session_of_a_stand_at_other_addresses_is_resumed_at_those_of_th
     config = before.order.config
     assert config.bus == own.bus
     assert config.axes == own.axes
-    assert config.camera.address == own.camera.address
+    assert config.cameras["camera"].address == own.cameras["camera"].address
     assert config.guard == own.guard
     paths = [difference.path for difference in before.differences]
-    assert {"bus.address", "axes.linear.address", "camera.address", "guard.max_air_degC", "simulation.control"} <= set(
-        paths
-    )
+    assert {
+        "bus.address",
+        "axes.linear.address",
+        "cameras.camera.address",
+        "guard.max_air_degC",
+        "simulation.control",
+    } <= set(paths)
     with pytest.raises(ConfigError, match="was recorded on a simulated one, and 'laboratory-stand' is a real stand"):
         interruption(directory, config_of(tmp_path))
 
@@ -135,8 +140,9 @@ def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp
         compressor={"state_file": "/etc/passwd", "min_off_s": 181},
     )
     config, differences = on_this_stand(session, own, tmp_path, is_virtual=False)
+    temperature = TemperatureFeature(entry="Mainboard")
     kept = {
-        "camera": own.camera.model_copy(update={"exposure_s": 0.2, "temperature": session.camera.temperature}),
+        "cameras": {"camera": own.cameras["camera"].model_copy(update={"exposure_s": 0.2, "temperature": temperature})},
         "recording": own.recording.model_copy(update={"frame_encoding": "raw"}),
     }
     assert config == own.model_copy(update=kept)

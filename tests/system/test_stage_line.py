@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.camera import Camera, GigeCameraSettings
+from drivers.devices.camera_gige import Camera
 from drivers.devices.flap import Flap
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays
 from drivers.devices.stage import Axis, AxisSettings
 from drivers.devices.thermometers import Thermometers
 from drivers.wires.bus import Bus, BusSettings
+from drivers.wires.camera_settings import GigeCameraSettings
 from drivers.wires.registers import load_register_map
 from foundation.clock import Clock, WallClock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, Refused, Superseded, Unreachable
@@ -329,7 +330,7 @@ def stand_with(axis: Axis, clock: Clock) -> Stand:
     camera = Camera("camera", GigeCameraSettings(address="127.0.0.1"), clock)
     thermometers = Thermometers("thermometers", bus, maps[0], {}, clock)
     chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, CompressorConfig()), 5.0)
-    devices = Devices(regulator, relays, thermometers, {"linear": axis}, flap, camera)
+    devices = Devices(regulator, relays, thermometers, {"linear": axis}, flap, {"camera": camera})
     return Stand(devices, chamber, SupplyLimits(1.0, 15.0), Hub(), clock)
 
 

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.camera import Camera
+from drivers.devices.cameras import make_camera
 from foundation.clock import WallClock
-from stand.assembly import camera_settings
 from stand.config.stand_config import load_config
 from tests.stock_camera import ADDRESS, SERIAL
 
@@ -17,7 +16,7 @@ async def test_a_configuration_file_is_all_the_stock_camera_needs(tmp_path: Path
     file = tmp_path / "stock.yaml"
     section = {"address": ADDRESS, "serial_number": SERIAL, "width_px": 320, "height_px": 240, "packet_size": None}
     file.write_text(config_text(camera=section))
-    camera = Camera("camera", camera_settings(load_config(file).camera), WallClock())
+    camera = make_camera("camera", load_config(file).cameras["camera"], WallClock())
     await camera.open()
     try:
         frames = [await camera.grab(0.01) for _ in range(3)]

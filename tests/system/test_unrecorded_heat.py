@@ -39,7 +39,7 @@ experiments:
 """
 FAST = {
     "regulator": {"poll_s": 0.25},
-    "thermometers": {"poll_s": 0.25},
+    "thermometer_module": {"poll_s": 0.25},
     "relays": {"poll_s": 0.5, "self_test_s": 0.6},
     "flap": {"poll_s": 0.5},
     "camera": {"poll_s": 0.5, "boot_s": 0.2},

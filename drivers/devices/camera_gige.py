@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
+from drivers.settings import Identity
 from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_connection import Connection, FrameCount, Shot
 from drivers.wires.camera_settings import (
     EffectiveSettings,
     GigeCameraSettings,
-    Identity,
-    TemperatureFeature,
     device_error,
     lacks_control,
 )
@@ -24,8 +23,7 @@ from foundation.errors import DeviceError, Unreachable
 from foundation.lane import Lane, Result
 from foundation.readings import Frame, Reading, bad_reading
 
-__all__ = ["Camera", "GigeCameraSettings", "EffectiveSettings", "Identity", "TemperatureFeature"]
-
+Settings = GigeCameraSettings
 ATTEMPTS = 3  # frames in a row that may fail before the camera counts as lost
 
 _CLOCK_SLACK_S = 1.0  # its clock is read that well, and it is heard for longer than that before it may be lost

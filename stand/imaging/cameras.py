@@ -1,0 +1,53 @@
+"""All cameras of a stand as one: opened and closed together, and each exposes whenever frames are taken."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from drivers.devices.protocols import Camera
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import ConfigError
+from foundation.readings import Frame
+
+_APART_S = 0.001  # between two cameras' frames: an image and its description are found by their instant
+
+
+class Cameras:
+    """The cameras by name; there may be none, on which only `close` may be called."""
+
+    def __init__(self, cameras: Mapping[str, Camera], clock: Clock) -> None:
+        self.names = tuple(cameras)
+        self._cameras = tuple(cameras.values())
+        self._clock = clock
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether each is open and has not been lost since."""
+        return all(camera.is_usable for camera in self._cameras)
+
+    @property
+    def restarted(self) -> str:
+        """Why one has, or may have, started anew by itself; "" when none has."""
+        return "; ".join(camera.restarted for camera in self._cameras if camera.restarted)
+
+    async def open(self) -> None:
+        """Open every camera, those that are open already again."""
+        if not self._cameras:
+            raise ConfigError("the plan needs a camera, and this stand has none; name it under cameras in its file")
+        for camera in self._cameras:
+            await camera.open()
+
+    async def close(self) -> None:
+        """Close every camera; never raises."""
+        for camera in self._cameras:
+            await camera.close()
+
+    async def grab(self, exposure_s: float, due_ns: int = 0) -> tuple[Frame, ...]:
+        """One frame of each, one camera after the other, the first at `due_ns` when that is still ahead. Unreachable
+        when one was lost: then there is a frame of none."""
+        frames: list[Frame] = []
+        for camera in self._cameras:
+            if frames:
+                await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_APART_S))
+            frames.append(await camera.grab(exposure_s, due_ns if not frames else 0))
+        return tuple(frames)
