@@ -7,7 +7,7 @@ from typing import Protocol
 
 from foundation.errors import StandTripped
 from stand.fault import Fault
-from stand.gate import INTERLOCK, Gate
+from stand.gate import INTERLOCK, STOPPING, Gate
 
 
 class Interlocked(StandTripped):
@@ -31,8 +31,9 @@ class Interlock:
         self._movers = tuple(movers)
 
     def latch(self, fault: Fault) -> None:
-        """Closed for good; the first fault stays."""
+        """Closed for good; the first fault stays. Nothing earns time while the stand is being made safe."""
         self.fault = self.fault or fault
+        self._gate.hold(STOPPING)
 
     def check(self) -> None:
         """StandTripped after a fault, Interlocked while the guard holds the stand; else everything may move."""

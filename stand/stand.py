@@ -15,8 +15,7 @@ from foundation.clock import Clock
 from foundation.hub import Hub
 from foundation.items import Event
 from stand.chamber.chamber import Chamber, ChamberLimits
-from stand.fault import Fault
-from stand.gate import OPERATOR, STOPPING, Gate
+from stand.gate import OPERATOR, Gate
 from stand.imaging.camera_supply import CameraSupply, SupplyLimits
 from stand.imaging.cameras import Cameras
 from stand.imaging.imaging import Imaging
@@ -58,12 +57,6 @@ class Stand:
         self.chamber = Chamber(devices.regulator, devices.relays, chamber, interlock, power.compare, hub, clock)
         self.table = Table(devices.axes, interlock, self.motions, hub, clock)
         self.safety = Safety(self.chamber.permits.revoke, hub, clock)
-
-    def latch(self, fault: Fault) -> None:
-        """Nothing moves any more; the first fault stays. Nothing earns time while the stand is being made safe."""
-        self.interlock.latch(fault)
-        self.gate.hold(STOPPING)
-        self.chamber.permits.revoke()
 
     def opened(self, actuator: Actuator) -> None:
         """This actuator answers: from now on it is made safe whenever that is demanded."""

@@ -79,7 +79,7 @@ from stand.running.entries import (
     data_of,
 )
 from stand.running.fold import after, change_text, refusal
-from stand.running.logbook import Logbook
+from stand.running.journal import Logbook
 from stand.running.settling_watch import SettlingWatch
 from stand.running.state import Plan, RunState, SetUp, duration_of
 from stand.stand import Stand

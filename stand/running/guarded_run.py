@@ -31,8 +31,7 @@ from stand.running.entries import Cleared, Ended, Gap, Written
 from stand.running.executor import Executor
 from stand.running.fold import fold
 from stand.running.holds import end_endless_holds, keep_shut_in_holds
-from stand.running.journal import Journal
-from stand.running.logbook import Logbook
+from stand.running.journal import Journal, Logbook
 from stand.running.order import Order, check_plan
 from stand.running.resume import Interruption, begun, plan_hash
 from stand.running.settling_watch import SettlingWatch, load_for

@@ -52,7 +52,7 @@ class Stop:
         """Latch at once, begin to make safe, and return; the run is cancelled when every actuator has been tried."""
         self.fault = self.fault or fault
         if self._stand is not None:
-            self._stand.latch(fault)
+            self._stand.interlock.latch(fault)
         if self.phase in (Phase.ABORTING, Phase.ENDING, Phase.ENDED):
             if self._stand is not None and fault.rule == STOPPED_BY_OPERATOR:
                 self._stand.safety.give_up()

@@ -21,8 +21,7 @@ from stand.running.entries import Gap
 from stand.running.executor import Executor
 from stand.running.fold import fold
 from stand.running.holds import keep_shut_in_holds
-from stand.running.journal import JOURNAL_NAME, Journal
-from stand.running.logbook import Logbook
+from stand.running.journal import JOURNAL_NAME, Journal, Logbook
 from stand.running.resume import with_recorded
 from stand.running.settling_watch import SettlingWatch
 from stand.running.stop import Stop
@@ -41,7 +40,7 @@ class SmallStand:
 
     def __init__(self, clock, hub, wrong):
         self.gate = Gate()
-        self.chamber = self.imaging = self.supply = self.table = self
+        self.chamber = self.imaging = self.supply = self.table = self.interlock = self
         limits = EquilibriumSettings().model_copy(
             update={"time_constant_s": TIME_CONSTANT_S}
         )  # shorter than any camera's

@@ -34,7 +34,7 @@ async def test_a_fault_between_set_point_and_permission_leaves_no_heat():
     async with rooms() as here:
         starting = asyncio.create_task(here.stand.chamber.start(45.0))
         await here.passes(0.5)
-        here.stand.latch(Fault("air_hot", "the air is too hot"))
+        here.stand.interlock.latch(Fault("air_hot", "the air is too hot"))
         with pytest.raises(StandTripped, match="the air is too hot"):
             await starting
         assert here.calls == ["regulator sp 45"]

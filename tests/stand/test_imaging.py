@@ -68,7 +68,7 @@ async def test_a_look_opens_the_flap_for_its_frame_only_also_when_the_camera_is_
 
 async def test_after_a_trip_the_flap_closes_and_does_not_open():
     async with rooms() as here:
-        here.stand.latch(Fault("air_hot", "the air is too hot"))
+        here.stand.interlock.latch(Fault("air_hot", "the air is too hot"))
         with pytest.raises(StandTripped):
             await here.stand.imaging.open_flap()
         await here.stand.imaging.close_flap()

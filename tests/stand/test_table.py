@@ -24,7 +24,7 @@ async def test_a_fault_while_a_stage_homes_keeps_it_from_the_move():
         here.linear.has_scale = False
         moving = asyncio.create_task(here.stand.table.move_to("linear", 25.0))
         await here.passes(0.5)
-        here.stand.latch(Fault("door", "the door is open"))
+        here.stand.interlock.latch(Fault("door", "the door is open"))
         with pytest.raises(StandTripped):
             await moving
         assert here.calls == ["linear home"]

@@ -19,8 +19,7 @@ from foundation.readings import Frame
 from recording.writing.disk import Disk
 from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from stand.running.entries import Begun, Dwell, Ended
-from stand.running.journal import Journal
-from stand.running.logbook import Logbook
+from stand.running.journal import Journal, Logbook
 from stand.running.state import RunState
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
