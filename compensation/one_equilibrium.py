@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from foundation.errors import SessionError
 from foundation.instants import utc_text
 from foundation.items import Event
+from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
-from recording.reading.superseded import begins_of, is_superseded
 
 CHANGED = "camera_offset_changed"
 _TRANSIENT_ROLES = frozenset({"warm_up", "settling", "other"})  # of a camera that is not in equilibrium anyway
@@ -50,7 +50,7 @@ def _kelvin(event: Event, name: str) -> str:
 def _settled_frames_ns(session: Session) -> list[int]:
     """Instants of the frames that count and were taken at a settled set-point."""
     roles = {mark.step_id: mark.parameters.get("role") for mark in session.steps() if "role" in mark.parameters}
-    begins_ns = begins_of(session)
+    begins_ns = begins_of(session.events())
     return [
         time_ns
         for time_ns, meta in session.frame_metas

@@ -1,9 +1,12 @@
-"""The event `capture_restarted`: a capture has been begun anew, its frames so far do not count.
+"""The event `capture_restarted`: a capture that could not be continued was begun again, its frames so far do not count.
 
-Its data have `step_id` and the number of `frames`.
+Its data have `step_id` and the number of `frames`. One that was interrupted for long is such a capture, and a warm-up
+that was: it shows a camera that was cold when it was switched on.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
 
 from foundation.items import Event
 
@@ -21,3 +24,14 @@ def restarted_step(event: Event) -> str:
     """The id of the capture that was begun anew; "" when the event says something else."""
     named = event.data.get("step_id") if event.kind == KIND else None
     return named if isinstance(named, str) else ""
+
+
+def begins_of(events: Iterable[Event]) -> dict[str, int]:
+    """Of each capture that was begun again, by step id, the instant (ns) before which its frames do not count."""
+    found = ((restarted_step(event), event.time_ns) for event in events)
+    return {step_id: time_ns for step_id, time_ns in found if step_id}
+
+
+def is_superseded(time_ns: int, step_id: str, begins_ns: Mapping[str, int]) -> bool:
+    """Whether a frame of that instant and step does not count, by what `begins_of` its session says."""
+    return time_ns < begins_ns.get(step_id, time_ns)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from foundation.errors import SessionError
 from recording.format.messages import FrameMeta
+from recording.format.restarts import begins_of, is_superseded
 from recording.reading.interpolation import Float, interpolated
-from recording.reading.superseded import begins_of, is_superseded
 
 if TYPE_CHECKING:
     from recording.reading.session import Session
@@ -60,7 +60,7 @@ def frames_table(session: Session, files: list[str], times_ns: NDArray[np.int64]
     metas = [described[time_ns].pop(0) if described.get(time_ns) else None for time_ns in times_ns.tolist()]
     step_id = ["" if meta is None else meta.step_id for meta in metas]
     steps = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
-    begins_ns = begins_of(session)
+    begins_ns = begins_of(session.events())
     named = zip(times_ns.tolist(), step_id, strict=True)
     return FramesTable(
         file=np.array(files, np.str_),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import json
 import os
 import re
 import subprocess
@@ -140,3 +141,13 @@ def test_arrays_that_do_not_agree_are_refused(change: dict[str, object], sentenc
     given = {"centres_px": centres_px, "camera_degC": camera_degC, "chamber_degC": chamber_degC} | change
     with pytest.raises(ValueError, match=sentence):
         thermostand.observations_of(**given)  # type: ignore[arg-type]
+
+
+@pytest.mark.nightly
+def test_the_notebook_page_is_sound_for_a_strict_type_checker(tmp_path: Path):
+    (tmp_path / "page.py").write_text("\n".join(BLOCKS))
+    settings = {"include": ["."], "typeCheckingMode": "strict", "reportUnusedExpression": False}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({**settings, "extraPaths": [str(ROOT)]}))
+    command = [sys.executable, "-m", "pyright", "-p", str(tmp_path), "--pythonpath", sys.executable]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stdout

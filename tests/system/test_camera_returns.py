@@ -8,8 +8,8 @@ import pytest
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.readings import Frame
+from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
-from recording.reading.superseded import begins_of, is_superseded
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
@@ -42,7 +42,7 @@ async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_
 
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, watch))
     assert session.events()[-1].text == "complete"
-    begins_ns = begins_of(session)
+    begins_ns = begins_of(session.events())
     assert (
         len([meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]) == 3
     )

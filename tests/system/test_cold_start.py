@@ -14,8 +14,8 @@ from foundation.clock import NS_PER_S
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from foundation.readings import Frame
+from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
-from recording.reading.superseded import begins_of, is_superseded
 from stand.running.actions import cold_start
 from stand.running.entries import Step
 from stand.running.fold import fold
@@ -56,7 +56,7 @@ def test_a_warm_up_that_was_killed_begins_anew_from_a_cold_camera(tmp_path: Path
     (capture,) = (planned for planned in ordered.recipe.plan() if isinstance(planned.step, Capture))
     restarts = [event for event in session.events() if event.kind == "capture_restarted"]
     assert len(restarts) == 2
-    begins_ns = begins_of(session)
+    begins_ns = begins_of(session.events())
     assert begins_ns == {capture.step_id: restarts[-1].time_ns}
     frames = [
         frame
@@ -142,7 +142,7 @@ def test_nothing_is_superseded_in_a_run_that_was_not_interrupted(tmp_path: Path,
     before = interruption(directory)
     assert cold_start(before.state) == ()
     before.release()
-    assert begins_of(Session.open(directory)) == {}
+    assert begins_of(Session.open(directory).events()) == {}
     asyncio.run(end_laboratory(ordered))
 
 
@@ -180,7 +180,7 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_anew_from_a_cold_came
     await asyncio.gather(*tasks)
     session = Session.open(directory)
     (capture,) = (planned for planned in ordered.recipe.plan() if isinstance(planned.step, Capture))
-    begins_ns = begins_of(session)
+    begins_ns = begins_of(session.events())
     (restart,) = [event for event in session.events() if event.kind == "capture_restarted"]
     assert begins_ns == {capture.step_id: restart.time_ns}
     counted = [meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]
@@ -234,7 +234,7 @@ async def test_a_warm_up_that_is_paused_for_long_begins_anew_from_its_cool_down(
 ):
     ordered = order(WARM_UP)
     session = await paused(ordered, tmp_path / "out", 100.0)
-    begins_ns = begins_of(session)
+    begins_ns = begins_of(session.events())
     counted = [meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]
     assert len(counted) == 8
     assert len(session.frame_metas) == 8 + 3

@@ -13,8 +13,8 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.readings import Frame
+from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
-from recording.reading.superseded import begins_of, is_superseded
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from stand.serving.control_client import ask
@@ -100,7 +100,7 @@ async def interrupted(order: Order, out: Path, interrupter: Interrupter) -> Sess
 
 def counted_ns(session: Session) -> list[int]:
     """Instants of the frames that count."""
-    begins_ns, on_disk = begins_of(session), set(session.frame_times_ns.tolist())
+    begins_ns, on_disk = begins_of(session.events()), set(session.frame_times_ns.tolist())
     return [
         time_ns
         for time_ns, meta in session.frame_metas

@@ -15,10 +15,10 @@ from experiments.steps import Capture
 from foundation.errors import SessionError, StandTripped, Unreachable
 from foundation.hub import Hub
 from foundation.items import StepState
+from recording.format.restarts import begins_of, is_superseded
 from recording.reading.glance import glance
 from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
-from recording.reading.superseded import begins_of, is_superseded
 from recording.repair.verify import verify
 from stand.running.entries import Dwell, Gap, Step, encode_line, read_lines
 from stand.running.journal import JOURNAL_NAME
@@ -99,7 +99,7 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
     assert done == Counter(planned.step_id for planned in plan)
     times_ns = set(session.frame_times_ns.tolist())
     assert set(acknowledged) <= times_ns
-    begins_ns = begins_of(session)
+    begins_ns = begins_of(session.events())
     described = Counter(
         meta.step_id
         for time_ns, meta in session.frame_metas
