@@ -149,7 +149,7 @@ def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, confi
 def test_frames_of_ones_own_steps_have_a_report_of_what_there_is(role: str, out: Path, config_text: Callable[..., str]):
     recipe = out.parent / "recipe.yaml"
     recipe.write_text(OWN_STEPS.replace("capture", f"{{capture: {{role: {role}}}}}"))
-    ended = run_reported(str(recipe), config_text(), out, 600)
+    ended = run_reported(str(recipe), config_text(camera=WHOLE_SENSOR), out, 600)
     assert ended.returncode == 0, ended.stderr
     session, *lines = ended.stdout.splitlines()
     assert lines == [f"report   {Path(session) / REPORT_NAME}"]
