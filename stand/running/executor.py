@@ -127,8 +127,8 @@ class Executor:
                 await self._conclude(action)
 
     async def skip(self, step_id: str) -> None:
-        """Leave the step out, or break it off: a soak, capture, cool-down or prompt under way ends at once. Durable
-        when this returns; ConfigError when it cannot be left out."""
+        """Leave the step out, or break it off: a soak, capture, cool-down or prompt under way ends at once, but the
+        pause of a prompt is the operator's. Durable when this returns; ConfigError when it cannot be left out."""
         await self._change(Skipped(self._clock.now_ns(), step_id))
 
     async def extend(self, step_id: str, by_s: float) -> None:

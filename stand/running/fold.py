@@ -114,6 +114,8 @@ def after(state: RunState, entry: Entry) -> RunState:
 
 def refusal(state: RunState, change: Change) -> str:
     """Why the plan cannot be changed so, "" when it can."""
+    if state.index >= len(state.plan):
+        return "the plan is done"
     if isinstance(change, Edited):
         first = _first_free(state)
         if not first <= change.from_index <= len(state.plan):

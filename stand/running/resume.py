@@ -30,7 +30,7 @@ from stand.running.actions import cold_start
 from stand.running.camera_gap import CameraBefore, camera_before
 from stand.running.entries import Again, Begun, Ended, Entry, Step, Taken, Tripped, Written, change_of
 from stand.running.fold import after, fold
-from stand.running.journal import Journal
+from stand.running.journal import JOURNAL_NAME, Journal
 from stand.running.order import Order, parse_order
 from stand.running.own_stand import Difference, default_stand, on_this_stand
 from stand.running.state import RunState
@@ -104,14 +104,14 @@ def _interruption(
     first = entries[0] if entries else None
     if not entries or not (isinstance(first, Begun) or journal.damage):
         raise SessionError(f"{directory}: its run had not begun when it was killed; begin a new run")
-    _check_may_go_on(directory, fold((), entries), clear)
+    _check_may_go_on(directory, folded((), entries), clear)
     with late_progress("salvage", 1.0) as report:
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
     begun = first if isinstance(first, Begun) else _recorded_begun(session)
     lost = _recorded_end(session, entries) if journal.damage else ()  # nobody knows what else is lost
     told = (*with_recorded(entries, _recorded_items(session), _recorded_frames(session)), *lost)
-    _check_may_go_on(directory, fold((), told), clear)
+    _check_may_go_on(directory, folded((), told), clear)
     order = _order(session, begun)
     info = SessionInfo.of(session.metadata)
     config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
@@ -121,7 +121,7 @@ def _interruption(
         replace(order, config=config),
         info,
         journal,
-        fold(order.recipe.plan(), told),
+        folded(order.recipe.plan(), told),
         last_ns,
         begun.seed,
         salvaged,
@@ -129,6 +129,14 @@ def _interruption(
         session.utc.at(last_ns),
         differences,
     )
+
+
+def folded(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
+    """The state, of entries that may be anybody's; SessionError when they are not what a run has written."""
+    try:
+        return fold(plan, entries)
+    except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
+        raise SessionError(f"{JOURNAL_NAME}: no run has written such entries ({error}); begin a new run") from error
 
 
 def _check_may_go_on(directory: Path, state: RunState, clear: bool) -> None:

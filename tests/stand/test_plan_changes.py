@@ -269,6 +269,16 @@ def test_a_change_is_the_same_in_the_journal_and_in_the_recording(change: Change
     assert change_of(7, {"change": "Skipped"}) is None
 
 
+def test_a_plan_that_is_done_takes_no_more_steps(life: Callable[..., Life]):
+    here = life()
+    passes_until(here, "Soak")
+    here.do(here.executor.edit(2, []))
+    here.passes(150.0)
+    assert here.run.done()
+    with pytest.raises(ConfigError, match="the plan is done"):
+        here.do(here.executor.edit(2, [StopChamber()]))
+
+
 def test_a_soak_that_waits_for_the_camera_is_longer_at_the_least_and_at_the_most():
     step = SoakUntilSettled(900.0, 60.0, 240.0, 60.0, 0.2, 0.003, 0.1, 24.0)
     (planned,) = number_steps([step])

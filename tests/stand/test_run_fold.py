@@ -2,9 +2,11 @@
 
 import dataclasses
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from foundation.errors import ConfigError, SessionError
 from stand.running.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
 from stand.running.entries import (
     Again,
@@ -29,8 +31,9 @@ from stand.running.entries import (
     read_lines,
 )
 from stand.running.fold import after, fold
+from stand.running.resume import folded
 from stand.running.state import RunState
-from tests.stand.test_run_table import ID, PLAN, S
+from tests.stand.test_run_table import ID, PLAN, SOAK, S
 
 ids = st.sampled_from([*ID, "unknown"])
 soak = {"kind": "Soak", "parameters": {"duration_s": 5.0}}
@@ -131,6 +134,31 @@ d1ca24ec {"entry": "Cleared", "time_ns": 1767290560650000000}
 291ded75 {"entry": "Gap", "from_ns": 1767290508850000000, "time_ns": 1767290619500000000}
 4bf0d7d8 {"entry": "Ended", "time_ns": 1767291659150000000, "status": "complete", "text": "complete"}
 """
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        Dwell(0, SOAK, "long"),
+        Dwell(0, [], 1.0),
+        Step(0, {}, "done"),
+        Again(0, 7),
+        Extended(0, SOAK, "long"),
+        Edited(0, "first", []),
+        Edited(0, 13, [7]),
+        Edited(0, 13, 7),
+        Gap("then", 5),
+    ],
+)
+def test_entries_that_no_run_has_written_are_refused(entry):
+    with pytest.raises(SessionError, match="no run has written such entries"):
+        folded(PLAN, read_lines(encode_line(entry))[0])
+
+
+@pytest.mark.parametrize("by", [[{}], [{"kind": "Soak", "parameters": 5}], [{"kind": ["Soak"], "parameters": {}}]])
+def test_steps_that_are_none_are_refused(by):
+    with pytest.raises(ConfigError):
+        folded(PLAN, [Edited(0, 13, by)])
 
 
 def test_a_journal_of_the_version_before_changes_of_plans_is_read():
