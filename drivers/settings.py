@@ -14,7 +14,9 @@ from foundation.documents import Document
 
 DeviceName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]  # the first part of its channels
 PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]
-Line = Annotated[str, Field(pattern=r"^\P{Cc}*$", max_length=200)]  # free text without control characters
+Line = Annotated[
+    str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f]*$", max_length=200)
+]  # free text without control characters
 
 
 def ascending(bounds: tuple[float, float]) -> tuple[float, float]:

@@ -20,6 +20,7 @@ app = lazy_app(
         "continue": Lazy(_CONTROL, "End a pause."),
         "clear": Lazy(_CONTROL, "Let a run that an interlock holds go on, after you have seen to the cause."),
         "stop": Lazy(_CONTROL, "Make the stand safe and end the run, as Ctrl-C does."),
+        "config": Lazy("stand.commands.config_cli", "Configuration files: JSON Schemas for editors, older versions."),
         "queue": Lazy("stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
         "session": Lazy(
             "stand.commands.session_cli",

@@ -1,0 +1,70 @@
+"""The `stand config` commands: what a stand's files look like, and files of older versions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from foundation.documents import read_document
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.files import write_whole
+from foundation.usage import OneLineUsage
+from stand.config.migration import migrated
+from stand.config.schemas import write_schemas
+from stand.config.stand_config import packaged
+
+app = typer.Typer(
+    cls=OneLineUsage,
+    no_args_is_help=True,
+    add_completion=False,
+    help="Configuration files: JSON Schemas for editors, and files of older versions.\n\n"
+    "Example: stand config migrate my-stand.yaml",
+)
+
+
+@app.command()
+def migrate(
+    file: Annotated[Path, typer.Argument(help="A stand's file of an older version.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Where to; else in its place.")] = None,
+) -> None:
+    """A stand's file in today's form, with its comments. In its place the older one is kept beside it, as FILE.before.
+
+    Older files open as they are: this is for whoever edits them next.
+
+    Example: stand config migrate my-stand.yaml
+    """
+    with one_line_errors():
+        text = read_document(file)
+        found = migrated(text, str(file))
+        if found is None:
+            typer.echo(f"{file}: has today's form already; nothing was written")
+            return
+        place = out or file.resolve()
+        if out is None:
+            kept = place.with_name(f"{place.name}.before")
+            if kept.exists():
+                raise ConfigError(f"{kept}: is there already; move it away, or name another place with --out")
+            write_whole(kept, text)
+        write_whole(place, found.text)
+        typer.echo(place)
+        for section in found.without_comments_of:
+            typer.echo(f"comments were not kept in: {section}", err=True)
+
+
+@app.command()
+def schema(
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="A folder; else the installed configs/schema.")
+    ] = None,
+) -> None:
+    """Write the JSON Schemas of stands, recipes, register maps and targets. A file's first line names its schema to
+    an editor: `# yaml-language-server: $schema=schema/stand.json`.
+
+    Example: stand config schema --out schema
+    """
+    with one_line_errors():
+        for path in write_schemas(out or packaged("", "simulated").parent / "schema"):
+            typer.echo(path)
