@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,7 +56,8 @@ def figures(directory: Path) -> list[Figure]:
 def noisy(clean_DN: Float, sigma_DN: float, dtype: type[np.uint8] | type[np.uint16], seed: int) -> Image:
     """The clean image with Gaussian noise, rounded; it stays clear of the ends of its range."""
     rng = np.random.default_rng(seed)
-    return np.round(clean_DN + rng.normal(0, sigma_DN, clean_DN.shape)).astype(dtype)
+    noisy: Any = np.round(clean_DN + rng.normal(0, sigma_DN, clean_DN.shape)).astype(dtype)
+    return noisy
 
 
 def rounded_noise_bit(sigma_DN: float) -> float:

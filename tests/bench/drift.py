@@ -6,12 +6,13 @@ on its images (2.4 mpx) and a camera that tells its temperature in quarters of a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from compensation.drift.choosing import FORMS, Form, fit
+from compensation.drift.choosing import FORMS, fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
@@ -60,7 +61,7 @@ def _values(seed: int) -> Iterator[tuple[str, str, float | None, tuple[float, fl
             yield what, "mpx RMS", WARM_UP_GOAL_MPX, _left(models, elsewhere, Role.WARM_UP)
 
 
-def _left(models: dict[Form, DriftModel], seen: Seen, role: Role) -> tuple[float, float]:
+def _left(models: Mapping[Any, DriftModel], seen: Seen, role: Role) -> tuple[float, float]:
     return left_mpx(models["thermal"], seen, role), left_mpx(models["paper"], seen, role)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -52,19 +52,19 @@ def _grid(image: Image, size: tuple[int, int], detector: cv2.SimpleBlobDetector)
     return centres.reshape(-1, 2).astype(np.float64) if found else None
 
 
-def _centres(keypoints: tuple[cv2.KeyPoint, ...]) -> Float:
+def _centres(keypoints: Sequence[cv2.KeyPoint]) -> Float:
     return np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
 
 
 def _regions(image: Image) -> Float:
-    from skimage.measure import label, regionprops
+    from skimage.measure import label, regionprops  # pyright: ignore[reportMissingImports] - a peer for the bench only
 
     found = regionprops(label(image < _LEVEL_DN), intensity_image=np.float64(image.max()) - image)
     return np.array([one.centroid_weighted[::-1] for one in found if one.area >= _LEAST_AREA_px2]).reshape(-1, 2)
 
 
 def _contours(image: Image) -> Float:
-    from skimage.measure import EllipseModel, find_contours
+    from skimage.measure import EllipseModel, find_contours  # pyright: ignore[reportMissingImports] - as above
 
     centres: list[tuple[float, float]] = []
     for contour in find_contours(image.astype(np.float64), _LEVEL_DN):

@@ -171,9 +171,9 @@ def _honesty(name: str, found: list[Detection], truth: Float) -> list[Figure]:
     seen = np.isfinite(error[:, 0])
     covariance = np.concatenate([detection.covariance_px2 for detection in found])[seen]
     sigmas = np.sqrt(np.einsum("ni,nij,nj->n", error[seen], np.linalg.inv(covariance), error[seen]))
-    refitted = np.count_nonzero(flags & Flag.REFITTED)
+    refitted = float(np.count_nonzero(flags & Flag.REFITTED))
     return [
-        absolute(f"{name}: markers flagged, of {len(flags)}", "", [np.count_nonzero(flags)]),
+        absolute(f"{name}: markers flagged, of {len(flags)}", "", [float(np.count_nonzero(flags))]),
         absolute(f"{name}: markers refitted", "", [refitted]),
         at_most(5, absolute(f"{name}: worst unflagged or refitted", "of its sigmas", [float(sigmas.max())])),
     ]

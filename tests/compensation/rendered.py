@@ -138,7 +138,9 @@ def _coverage(level: Float) -> Float:
 def render(scene: Scene) -> Float:
     """The noise-free image, DN, shape (height, width)."""
     width, height = scene.size
-    image = scene.ground_DN * scene.light(np.arange(width)[None, :] * 1.0, np.arange(height)[:, None] * 1.0)
+    image = scene.ground_DN * scene.light(
+        np.arange(width, dtype=np.float64)[None, :], np.arange(height, dtype=np.float64)[:, None]
+    )
     image = np.array(np.broadcast_to(image, (height, width)))
     discs = [disc for number, disc in enumerate(scene.discs_mm(), 1) if number not in scene.missing]
     for disc in [*discs, *np.array(scene.clutter_mm).reshape(-1, 3)]:
@@ -176,4 +178,4 @@ def photograph(
     rng = np.random.default_rng(seed)
     sigma = np.sqrt(scene.read_DN**2 + np.maximum(clean, 0) / scene.electrons_per_DN)
     noisy = clean + sigma * rng.standard_normal(clean.shape)
-    return np.clip(np.round(noisy), 0, np.iinfo(dtype).max).astype(dtype)
+    return np.clip(np.round(noisy), 0, np.iinfo(dtype).max).astype(dtype)  # pyright: ignore[reportReturnType] - of one of the two

@@ -76,7 +76,7 @@ def session(
     air_degC, powered = np.array(air), np.array(power)
     sensor, lens, base = (_reservoir(air_degC, powered, *kind) for kind in (SENSOR, LENS, BASE))
     slack = [_slack(sensor - 24, kind) if plays else np.zeros(len(sensor)) for kind in (PLAYS_X, PLAYS_Y)]
-    truth = np.array([_image(sensor[k] - 39, lens[k] - 34, base[k] - 24, slack[0][k], slack[1][k]) for k in at])
+    truth = np.array([_image(*(float(own[k]) for own in (sensor - 39, lens - 34, base - 24, *slack))) for k in at])
     times_ns = START_NS + np.arange(len(air)) * STEP_S * NS_PER_S
     told = sensor + 0.01 * rng.standard_normal(len(sensor))
     on = powered > 0

@@ -241,6 +241,7 @@ def test_one_image_is_corrected_at_a_given_temperature(recorded: Recorded, files
     run("apply", files["paper"], tmp_path / "photo.png", "--camera-degC", 44, "-o", tmp_path / "out.tiff")
     moved = cv2.imread(str(tmp_path / "out.tiff"), cv2.IMREAD_UNCHANGED)
     assert moved.shape == image.shape
+    assert moved is not None
     assert not np.allclose(moved, image, atol=1)
 
 

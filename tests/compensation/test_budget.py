@@ -131,7 +131,8 @@ def test_means_leave_out_what_is_unknown():
 )
 def test_a_wrong_geometry_gets_a_sentence(line: str, message: str, tmp_path: Path):
     key = line.partition(":")[0]
-    kept = [old for old in packaged("geometry", "paper").read_text().splitlines() if not old.startswith(f"{key}:")]
+    geometry = packaged("", "simulated").parent / "geometry" / "paper.yaml"
+    kept = [old for old in geometry.read_text().splitlines() if not old.startswith(f"{key}:")]
     path = tmp_path / "stand.yaml"
     path.write_text("\n".join([*kept, line]))
     with pytest.raises(ConfigError, match=message):

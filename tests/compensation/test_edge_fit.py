@@ -110,7 +110,7 @@ def test_the_normal_equations_are_those_of_the_model():
     size = np.linalg.norm(slopes, axis=1)
     assert weights == seen.shape[1]
     assert squares == pytest.approx(np.sum(residual**2), rel=1e-3)
-    np.testing.assert_allclose(right / size, slopes @ residual / size, atol=0.02 * np.linalg.norm(residual))
+    np.testing.assert_allclose(right / size, slopes @ residual / size, atol=0.02 * float(np.linalg.norm(residual)))
     np.testing.assert_allclose(normal / np.outer(size, size), slopes @ slopes.T / np.outer(size, size), atol=0.07)
 
 

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -218,7 +219,8 @@ def test_light_discs_16_bits_and_colour_are_measured_too(light: bool):
     image = photograph(scene, render(scene), 4)
     deep = image.astype(np.uint16) * 16
     colour = np.repeat(image[:, :, None], 3, axis=2)
-    results = [detect(picture, target) for picture in (image, deep, colour)]
+    pictures: list[Any] = [image, deep, colour]
+    results = [detect(picture, target) for picture in pictures]
     for result in results:
         assert result.found == 54
         assert rms_mpx(result, scene) < 5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import cv2
 import numpy as np
@@ -64,6 +65,6 @@ def test_spots_on_a_line_and_in_one_place_are_no_plane():
 @pytest.mark.parametrize("level", [0, 255, -1])
 def test_an_image_of_one_colour_or_of_clipped_noise_has_no_target(kind: type[np.uint8] | type[np.uint16], level: int):
     noise = np.random.default_rng(5).normal(-300, 100, (480, 640)).clip(0, 255)
-    image = (np.full((480, 640), level) if level >= 0 else noise).astype(kind)
+    image: Any = (np.full((480, 640), level) if level >= 0 else noise).astype(kind)
     with pytest.raises(DetectionError):
         detect(image, TARGET)

@@ -1,6 +1,7 @@
 """A session whose camera came out of a gap with another temperature over the air is not fitted as one, silently."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -47,6 +48,6 @@ async def test_frames_of_both_sides_are_refused_unless_somebody_wants_them(tmp_p
 
 
 @pytest.mark.parametrize(("gap_index", "options"), [(0, {}), (6, {"superseded": True}), (6, {"role": "warm_up"})])
-async def test_frames_of_one_side_are_of_one_equilibrium(tmp_path: Path, gap_index: int, options: dict[str, object]):
+async def test_frames_of_one_side_are_of_one_equilibrium(tmp_path: Path, gap_index: int, options: dict[str, Any]):
     await record(tmp_path / "night", items=items(gap_index, **options))
     check_one_equilibrium(Session.open(tmp_path / "night"))

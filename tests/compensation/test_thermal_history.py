@@ -89,8 +89,9 @@ def test_samples_one_by_one_give_the_same_state_as_the_recording():
 
 
 def test_before_the_record_and_without_one_only_the_camera_is_known():
-    late = History(*(np.array([5000, 5005], np.int64) * S, np.full(2, 24.0)) * 3)
-    empty = History(*(np.empty(0, np.int64), np.empty(0)) * 3)
+    late_ns, nothing_ns = np.array([5000, 5005], np.int64) * S, np.empty(0, np.int64)
+    late = History(late_ns, np.full(2, 24.0), late_ns, np.full(2, 24.0), late_ns, np.full(2, 24.0))
+    empty = History(nothing_ns, np.empty(0), nothing_ns, np.empty(0), nothing_ns, np.empty(0))
     for record in (late, empty):
         found = at(record, 100)
         assert found.camera_degC[0] == 54.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from html.parser import HTMLParser
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ def validated(laboratory: Laboratory, camera: Camera, model: PaperModel) -> Vali
     return validate(observed, frames, camera, model)
 
 
-def undrifted(laboratory: Laboratory, camera: Camera, **options: object) -> Deviations:
+def undrifted(laboratory: Laboratory, camera: Camera, **options: Any) -> Deviations:
     observed, frames = validation_session(laboratory, TRUTH, **options)
     return deviations("as found", camera, observed, frames, observed.centres_px)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymodbus.constants import ExcCodes
@@ -44,7 +45,7 @@ class E5cc:
         return SimDevice(1, simdata=data, action=self.act)
 
     async def act(
-        self, function: int, start: int, address: int, count: int, registers: list[int], values: list[int] | None
+        self, function: int, start: int, address: int, count: int, registers: list[int], values: Any
     ) -> ExcCodes | None:
         if self.unplugged:
             return ExcCodes.GATEWAY_NO_RESPONSE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymodbus.constants import ExcCodes
@@ -53,7 +54,7 @@ class Module:
         )
 
     async def act(
-        self, function: int, start: int, address: int, count: int, registers: list[int], values: list[int] | None
+        self, function: int, start: int, address: int, count: int, registers: list[int], values: Any
     ) -> ExcCodes | None:
         self.requests.append(function)
         if self.unplugged:

@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from foundation.clock import NS_PER_S, VirtualClock
 from foundation.hub import Hub
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Quality, Reading, bad_reading
+from recording.format.images import ImageEncoding
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.records import frame_places, read_frame, telemetry_messages
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
@@ -38,7 +40,7 @@ def frame(time_ns, index, dtype=np.uint8):
     )
 
 
-def half_second(time_ns, index, dtype=np.uint8):
+def half_second(time_ns, index, dtype: Any = np.uint8):
     """What a stand publishes in half a second, the frame after the middle of its exposure."""
     air = Reading("thermometers.air", 20 + index / 7, "degC", time_ns - 3 * MS)
     if index == 4:
@@ -58,7 +60,7 @@ async def record(
     directory,
     count=12,
     items=half_second,
-    encoding="png",
+    encoding: ImageEncoding = "png",
     segment_s=2.0,
     period_ns=NS_PER_S // 2,
     attachments=ATTACHMENTS,

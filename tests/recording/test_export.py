@@ -18,7 +18,7 @@ from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from recording.exporting.export import export
 from recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
-from recording.format.images import CAMERA_IMAGE
+from recording.format.images import CAMERA_IMAGE, ImageEncoding
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.reading.session import Session
 from recording.writing.segment import Record, SeriesForm, Topic
@@ -49,7 +49,7 @@ def parquet_rows(path):
     return table.select([name for name in table.column_names if name != "time_utc"]).to_pylist()  # datetime has no ns
 
 
-async def exported(tmp_path, *, count=12, items=half_second, encoding="png", **choices):
+async def exported(tmp_path, *, count=12, items=half_second, encoding: ImageEncoding = "png", **choices):
     """The recorded session, and the folder it was exported to."""
     await record(tmp_path / "s", count, items, encoding)
     session = Session.open(tmp_path / "s")

@@ -8,6 +8,7 @@ import pytest
 
 from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
+from foundation.items import StepState
 from recording.exporting.export import export
 from recording.exporting.replay import replay_and_record
 from recording.exporting.trim import trim
@@ -162,7 +163,7 @@ async def test_steps_are_counted_against_the_plan(tmp_path):
     write_journal(directory, *entries(SECONDS // 2, "stopped"))
     found = overview(directory)
     assert (found.glance.run, found.planned_steps) == (Run.STOPPED, SECONDS)
-    assert [step.state for step in found.steps].count("done") == SECONDS // 2
+    assert [step.state for step in found.steps].count(StepState.DONE) == SECONDS // 2
 
 
 def test_a_gap_is_told_with_its_times_and_its_frames(session):

@@ -4,8 +4,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from click.testing import Result
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from compensation.cli import app as compensate
 from recording.exporting.replay import replay_and_record

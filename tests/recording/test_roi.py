@@ -1,6 +1,7 @@
 """Which frames are recorded whole, and what is kept of the others."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ WINDOWS = np.array([[10, 20, 30, 30], [30, 40, 25, 20], [90, 0, 10, 80]], np.int
 class Finder:
     """Gives `windows` and remembers what it was asked."""
 
-    def __init__(self, windows=WINDOWS):
+    def __init__(self, windows: Any = WINDOWS):
         self.windows = windows
         self.searched = []
 
@@ -26,7 +27,7 @@ class Finder:
         return self.windows
 
 
-def frame(second, step_id="capture-1", shape=(80, 100), dtype=np.uint8, level_DN=180):
+def frame(second, step_id="capture-1", shape=(80, 100), dtype: Any = np.uint8, level_DN=180):
     image = np.random.default_rng(int(second * 10)).normal(level_DN, 1.5, shape).round().astype(dtype)
     time_ns = START_NS + int(second * NS_PER_S)
     return Frame("camera.image", image, time_ns, 0.1, 0.0, 41.0, int(second), 1, step_id=step_id)

@@ -167,6 +167,7 @@ def test_a_lost_opening_is_taken_from_the_siblings(damaged, night, series):
     data = path.read_bytes()
     (done,) = salvage_session(folder.parent)
     assert read_segment(done.path) == written.untouched(data) == written.messages[len(written.blocks[0].messages) :]
+    assert done.path is not None
     assert read_head(done.path).attachments["config.yaml"] == ATTACHMENTS["config.yaml"]
 
 

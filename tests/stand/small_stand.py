@@ -4,6 +4,7 @@ while it is led. Each action takes a second; what is not allowed is noted in `wr
 import asyncio
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any, cast
 
 from drivers.settings import EquilibriumSettings
 from experiments.steps import Capture
@@ -26,9 +27,11 @@ from stand.running.resume import with_recorded
 from stand.running.settling_watch import SettlingWatch
 from stand.running.stop import Stop
 from stand.safety import Safety
+from stand.stand import Stand
 
 TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
 TIME_CONSTANT_S = 5.0  # of a camera that tells no temperature
+NOTHING: Any = None  # the executor never looks at an image
 COMMIT_S = 0.2  # what the disk takes to have all that was published
 COMMIT_EVERY_S = 1.0  # and what was published before that, it has in any case
 
@@ -52,7 +55,7 @@ class SmallStand:
         self.supplied, self.supplied_ns = True, None
         self.safe = self.heating = self.flap_open = self.broken = self.unconfirmed = False
         self.camera_back_ns = 0
-        self.image = None  # what a look shows
+        self.image: Any = None  # what a look shows
         self.started_at_degC = None  # what the chamber was at when it was last set going, None after a new set-point
         self.set_ns = 0  # when that was
         self._clock, self._hub, self._wrong = clock, hub, wrong
@@ -117,7 +120,7 @@ class SmallStand:
             self._wrong.append("a frame of a stand that is not set up")
         if self.supplied_ns is not None and self._clock.now_ns() < self.supplied_ns + seconds_ns(5 * TIME_CONSTANT_S):
             self._wrong.append("a frame of a cold camera")
-        self._hub.publish(Frame("camera.image", None, self._clock.now_ns(), exposure_s, 0.0, 40.0, 1, 1, 0, step_id))
+        self._hub.publish(Frame("camera.image", NOTHING, self._clock.now_ns(), exposure_s, 0.0, 40.0, 1, 1, 0, step_id))
         return True
 
     def drop_supply(self):
@@ -199,16 +202,17 @@ class Life:
         self._time = asyncio.create_task(self.clock.run())
         await self.log.begin(self._journal, *first)
         self.stand.gate.subscribe(self.log.held)
-        settling = SettlingWatch(self.stand, self.hub, self.clock, TARGET)
+        stand = cast(Stand, self.stand)  # run_stand.py holds the one against the other
+        settling = SettlingWatch(stand, self.hub, self.clock, TARGET)
         watches = settling, OffsetWatch(self.hub, self.clock)
-        self.executor = Executor(self.stand, self.hub, self.clock, self.log, self._flushed, *watches)
-        self._flap = asyncio.create_task(keep_shut_in_holds(self.stand, self.hub, self.clock))
+        self.executor = Executor(stand, self.hub, self.clock, self.log, self._flushed, *watches)
+        self._flap = asyncio.create_task(keep_shut_in_holds(stand, self.hub, self.clock))
         self.run = asyncio.create_task(self._run(self.executor))
 
     async def _run(self, executor):
         """As a guarded run has it."""
         async with self.stop:
-            self.stop.watch(self.stand)
+            self.stop.watch(cast(Stand, self.stand))
             self.stop.started()
             try:
                 await executor.run()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -34,7 +35,7 @@ def bus(address: object) -> StandConfig:
 _others = iter(range(1, 250))
 
 
-def elsewhere(seed: str) -> dict[str, dict[str, object]]:
+def elsewhere(seed: str) -> dict[str, Any]:
     number = next(_others)
     axis = {"profile": "8MT160-300", "limits": [0, 280]}
     axes = {"linear": {**axis, "address": f"serial:/dev/none{number}", "serial_number": number}}

@@ -4,11 +4,11 @@ import asyncio
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
-from click.testing import Result
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from foundation.clock import NS_PER_S
 from foundation.items import Event
@@ -96,7 +96,7 @@ def test_status_tells_utc_when_the_system_clock_was_stepped_after_the_present_st
 def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_its_warning_came():
     host, gate = Host(), Gate()
     clock = host.clock()
-    recorder = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
+    recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
     board = StatusBoard("night", (), RunState(()), gate, Stop(), lambda: None, recorder, clock)
     host.step(3600)
     board(Event(clock.now_ns(), "warning", "odd", "it is so"))

@@ -340,11 +340,11 @@ def test_following_a_run_reports_the_share_done_the_time_left_and_what_is_wrong(
 
 
 def test_a_terminal_that_is_gone_does_not_end_what_it_follows(config: StandConfig):
-    def gone(*_: object) -> None:
+    def gone(done: float, text: str) -> None:
         raise BrokenPipeError
 
     plan = planned(Soak(60.0))
-    follow = Follow(price(plan, config), gone, gone)
+    follow = Follow(price(plan, config), gone, lambda line: gone(0.0, line))
     follow(Event(BEGIN_NS, "error", "guard.rule", "it is so"))
     follow(marks(plan, [60.0])[0])
 

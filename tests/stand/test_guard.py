@@ -6,6 +6,7 @@ import select
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -53,7 +54,7 @@ class Bench:
 
     def __init__(
         self,
-        *actions: str,
+        *actions: Any,
         can_hold: bool = True,
         command: tuple[str, ...] = (),
         limit_s: float = 5.0,

@@ -1,6 +1,7 @@
 """A run as a table: for every state and everything that may happen in it, what is done next."""
 
 import math
+from typing import Any
 
 import pytest
 
@@ -236,7 +237,7 @@ def test_a_warm_up_begins_anew_from_the_switch_that_made_it_cold_without_what_th
     assert isinstance(next_action(state, Surroundings(20 * S)), Restore)
 
 
-def walk(state: RunState, around: dict[str, object], *entries_and_actions) -> RunState:
+def walk(state: RunState, around: dict[str, Any], *entries_and_actions) -> RunState:
     """After each entry, or change of the surroundings, the action named behind it comes next."""
     for given, expected in entries_and_actions:
         around |= given if isinstance(given, dict) else {}

@@ -3,8 +3,9 @@ twice, no step is done twice, and a stop makes safe before anything unwinds and 
 
 import itertools
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
+from typing import Any
 
 from hypothesis import Phase as HPhase
 from hypothesis import settings
@@ -76,7 +77,8 @@ class RunMachine(RuleBasedStateMachine):
         super().__init__()
         self.folder = tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None)
         self.disk, self.holding = [], set()
-        self.life = self.soak = None
+        self.life: Any = None
+        self.soak: Any = None
 
     @initialize(steps=st.integers(0, len(PLAN) - 1), late_s=st.sampled_from([0.0, 0.6, 2.0, 6.4]))
     def begin(self, steps, late_s):
@@ -254,7 +256,7 @@ class RunMachine(RuleBasedStateMachine):
 
     @invariant()
     def a_soak_earns_at_most_the_time_that_passes_and_all_of_its_duration(self):
-        earned_s, last_ns = Counter(), {}
+        earned_s, last_ns = defaultdict[str, float](float), dict[str, int]()
         for entry in self._entries() if self.life is not None else ():
             if isinstance(entry, Dwell):
                 gained_s = entry.earned_s - earned_s[entry.step_id]

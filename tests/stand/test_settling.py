@@ -1,6 +1,7 @@
 """The judge of a soak against rates of known truth."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,17 +26,17 @@ NOW_S = 1.8e9
 LOOK_PX = 0.0003  # of the mean of 54 markers
 
 
-def polls(value: float | NDArray[np.float64], length_s: float = 900.0) -> NDArray[np.float64]:
+def polls(value: float | NDArray[Any], length_s: float = 900.0) -> NDArray[Any]:
     """Readings every 5 s until now."""
     times_s = NOW_S - np.arange(length_s, -1.0, -5.0)
     return np.stack((times_s, np.broadcast_to(value, times_s.shape)))
 
 
-def look_times(count: int = 6) -> NDArray[np.float64]:
+def look_times(count: int = 6) -> NDArray[Any]:
     return NOW_S - 120.0 * np.arange(count)[::-1]
 
 
-def looks(moved_px: NDArray[np.float64], count: int = 6) -> NDArray[np.float64]:
+def looks(moved_px: NDArray[np.float64], count: int = 6) -> NDArray[Any]:
     """Looks every 2 min until now that see the image at `moved_px` (n, 4)."""
     return np.column_stack((look_times(count), moved_px, np.full(count, LOOK_PX)))
 
@@ -103,12 +104,14 @@ def test_the_drift_is_the_largest_in_the_window():
     minutes = 2.0 * np.arange(6)
     moved = np.zeros((6, 4))
     moved[:, 0] = -0.1 * np.exp(-minutes / 20.0)
-    assert drift_rate(60.0 * minutes, moved, np.full(6, LOOK_PX)).per_min == pytest.approx(0.1 / 20.0, rel=0.03)
+    assert drift_rate(np.float64(60.0) * minutes, moved, np.full(6, LOOK_PX)).per_min == pytest.approx(
+        0.1 / 20.0, rel=0.03
+    )
 
 
 def test_the_uncertainty_of_the_drift_is_that_of_its_scatter():
     draw = np.random.default_rng(3)
-    times_s, known = 120.0 * np.arange(6), np.full(6, LOOK_PX)
+    times_s, known = 120.0 * np.arange(6, dtype=np.float64), np.full(6, LOOK_PX)
     found = [drift_rate(times_s, draw.normal(0.0, LOOK_PX, (6, 1)), known) for _ in range(4000)]
     exceeding = np.mean([abs(rate.per_min) > 2.0 * rate.uncertainty for rate in found])
     assert 0.02 < exceeding < 0.10  # of the larger of two ends, 95 % each
@@ -144,7 +147,7 @@ def test_the_digit_is_the_smallest_step_seen():
     assert digit_K(np.array([])) == 0.0
 
 
-def detection(centres_px: NDArray[np.float64]) -> Detection:
+def detection(centres_px: NDArray[Any]) -> Detection:
     count = len(centres_px)
     return Detection(
         centres_px=centres_px,

@@ -38,7 +38,9 @@ class Marks:
 
     def __init__(self, path, control):
         self.path, self.control = os.open(path, os.O_WRONLY), control.open("ab", buffering=0)
-        self.counts = dict.fromkeys(("rounds", "frames", "telemetry", "journal", "queue", "compressor", "control"), 0)
+        self.counts: dict[str, int] = dict.fromkeys(
+            ("rounds", "frames", "telemetry", "journal", "queue", "compressor", "control"), 0
+        )
 
     def note(self, **counts):
         if all(self.counts[name] == count for name, count in counts.items()):

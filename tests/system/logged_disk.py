@@ -98,7 +98,7 @@ class LoggedDisk:
             data, error = (b"", error) if data is None else (data, 0)
             os.write(self.fuse, REPLY.pack(REPLY.size + len(data), error, unique) + data)
 
-    def answer(self, opcode, node, body):
+    def answer(self, opcode, node, body) -> bytes | None:
         """The data of the reply (the structures of linux/fuse.h), None when it is an error."""
         match opcode:
             case Op.INIT:
@@ -106,7 +106,7 @@ class LoggedDisk:
                 return struct.pack("<IIIIHHIIHHI28x", 7, 31, 0, flags, 16, 12, GREATEST_WRITE_BYTES, 1, pages, 0, 0)
             case Op.LOOKUP:
                 child = NODES.get(body.rstrip(b"\0"))
-                return child and struct.pack("<Q32x", child) + self.attributes(child)
+                return struct.pack("<Q32x", child) + self.attributes(child) if child else None
             case Op.GETATTR | Op.SETATTR:
                 return bytes(16) + self.attributes(node)
             case Op.OPEN | Op.OPENDIR:

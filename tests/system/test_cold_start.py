@@ -209,7 +209,12 @@ async def paused(order: Order, out: Path, pause_s: float) -> Session:
         await asyncio.to_thread(ask, directory, {"do": "pause"})
 
     act, tasks, _ = acting({3: pause}, operator)
-    directory = await run_virtual(order, out, None, lambda hub: (hub.subscribe(watcher), act(hub)))
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(watcher)
+        act(hub)
+
+    directory = await run_virtual(order, out, None, watch)
     await asyncio.gather(*tasks)
     return Session.open(directory)
 

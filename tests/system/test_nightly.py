@@ -35,7 +35,9 @@ async def night(ordered: Order, out: Path) -> Path:
 
 
 def score(session: Path) -> Evaluation:
-    return analyse([session], session.parent / "model.json", session.parent / "report.html", progress)
+    found = analyse([session], session.parent / "model.json", session.parent / "report.html", progress)
+    assert found is not None
+    return found
 
 
 def digests(session: Path) -> dict[str, str]:

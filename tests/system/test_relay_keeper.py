@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from typing import Any
 
 import pytest
 
@@ -146,7 +147,10 @@ def with_exchanged_relays(bench: Bench) -> Assembly:
     exchanged = {**relays.channels, "heater_enable": 2, "camera_power": 0}
     config = bench.order.config.model_copy(update={"relays": relays.model_copy(update={"channels": exchanged})})
     theirs = assemble(config, Hub(), bench.clock)
-    theirs.stand.imaging.supply.opening = CameraOpening(SilentCamera(), theirs.hub, bench.clock, lambda: False, list)
+    camera: Any = SilentCamera()
+    theirs.stand.imaging.supply.opening = CameraOpening(
+        camera, theirs.hub, bench.clock, lambda: False, lambda why: None
+    )
     return theirs
 
 

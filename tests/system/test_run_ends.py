@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -139,4 +140,4 @@ async def test_a_run_in_real_time_leaves_no_thread_behind(
     with pytest.raises(Interrupted):
         await run_real(ordered, tmp_path / "second", stop)
     assert held_now() == before
-    assert not [name for name in before["threads"] if name != "MainThread"]
+    assert not [name for name in cast("list[str]", before["threads"]) if name != "MainThread"]

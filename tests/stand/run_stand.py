@@ -1,0 +1,85 @@
+"""What a run asks of its stand, of which the stand in memory has a copy: the type checker holds both against it."""
+
+from typing import Protocol
+
+from foundation.readings import Frame
+from stand.fault import Fault
+from stand.gate import Gate
+from stand.imaging.equilibrium import CameraEquilibrium
+from stand.safety import Safety
+from stand.stand import Stand
+from tests.stand.small_stand import SmallStand
+
+
+class RunChamber(Protocol):
+    """Heat and cold."""
+
+    async def start(self, setpoint_degC: float, /) -> None: ...
+
+    async def set_temperature(self, setpoint_degC: float, /) -> None: ...
+
+    async def stop(self) -> None: ...
+
+
+class RunSupply(Protocol):
+    """The camera's supply."""
+
+    @property
+    def equilibrium(self) -> CameraEquilibrium: ...
+
+    async def cool_down(self, band_K: float, time_constant_s: float, max_s: float) -> None: ...
+
+    async def restore(self) -> None: ...
+
+
+class RunImaging(Protocol):
+    """Flap and camera."""
+
+    @property
+    def supply(self) -> RunSupply: ...
+
+    @property
+    def flap_open(self) -> bool: ...
+
+    async def open_flap(self) -> None: ...
+
+    async def close_flap(self) -> None: ...
+
+    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int) -> bool: ...
+
+    async def look(self, exposure_s: float, step_id: str) -> Frame | None: ...
+
+
+class RunTable(Protocol):
+    """The stages."""
+
+    async def approach_again(self) -> None: ...
+
+    async def check_home(self, axis: str) -> None: ...
+
+
+class RunStand(Protocol):
+    """The whole."""
+
+    @property
+    def gate(self) -> Gate: ...
+
+    @property
+    def safety(self) -> Safety: ...
+
+    @property
+    def chamber(self) -> RunChamber: ...
+
+    @property
+    def imaging(self) -> RunImaging: ...
+
+    @property
+    def table(self) -> RunTable: ...
+
+    def latch(self, fault: Fault) -> None: ...
+
+    async def prompt(self, text: str) -> None: ...
+
+
+def alike(stand: Stand, small: SmallStand) -> tuple[RunStand, RunStand]:
+    return stand, small
