@@ -58,6 +58,12 @@ class RunTable(Protocol):
     async def check_home(self, axis: str) -> None: ...
 
 
+class RunInterlock(Protocol):
+    """What the guard has found."""
+
+    def latch(self, fault: Fault, /) -> None: ...
+
+
 class RunStand(Protocol):
     """The whole."""
 
@@ -68,6 +74,9 @@ class RunStand(Protocol):
     def safety(self) -> Safety: ...
 
     @property
+    def interlock(self) -> RunInterlock: ...
+
+    @property
     def chamber(self) -> RunChamber: ...
 
     @property
@@ -75,8 +84,6 @@ class RunStand(Protocol):
 
     @property
     def table(self) -> RunTable: ...
-
-    def latch(self, fault: Fault) -> None: ...
 
     async def prompt(self, text: str) -> None: ...
 
