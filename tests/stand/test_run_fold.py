@@ -137,17 +137,17 @@ d1ca24ec {"entry": "Cleared", "time_ns": 1767290560650000000}
 
 
 @pytest.mark.parametrize(
-    "entry",
+    "entry",  # of wrong types, as a damaged or foreign line may hold
     [
-        Dwell(0, SOAK, "long"),
-        Dwell(0, [], 1.0),
-        Step(0, {}, "done"),
-        Again(0, 7),
-        Extended(0, SOAK, "long"),
-        Edited(0, "first", []),
-        Edited(0, 13, [7]),
-        Edited(0, 13, 7),
-        Gap("then", 5),
+        Dwell(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
+        Dwell(0, [], 1.0),  # pyright: ignore[reportArgumentType]
+        Step(0, {}, "done"),  # pyright: ignore[reportArgumentType]
+        Again(0, 7),  # pyright: ignore[reportArgumentType]
+        Extended(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
+        Edited(0, "first", []),  # pyright: ignore[reportArgumentType]
+        Edited(0, 13, [7]),  # pyright: ignore[reportArgumentType]
+        Edited(0, 13, 7),  # pyright: ignore[reportArgumentType]
+        Gap("then", 5),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_entries_that_no_run_has_written_are_refused(entry):

@@ -4,6 +4,7 @@ import json
 import re
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -22,7 +23,7 @@ def validator(kind: str) -> Draft202012Validator:
     return Draft202012Validator(json.loads(schema_text(kind)))
 
 
-def as_json(value: object) -> object:
+def as_json(value: object) -> Any:
     """As an editor sees it: YAML's instants are texts, and keys too."""
     if isinstance(value, dict):
         return {str(key): as_json(each) for key, each in value.items()}
