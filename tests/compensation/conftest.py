@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import itertools
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -14,9 +15,12 @@ import pytest
 from numpy.typing import NDArray
 
 from foundation.clock import NS_PER_S, VirtualClock
+from foundation.documents import parse_document
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame, Reading
+from markers.detection import detect
+from markers.target import Target
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
@@ -93,6 +97,14 @@ async def record(
         with suppress(asyncio.CancelledError):
             await task
     await recorder.finish()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Machine code is made once: workers that begin together would each make the same for half a minute."""
+    with (tmp_path_factory.getbasetemp().parent / "compiling").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        detect(photo(GLARE[0]), parse_document(TARGET_YAML, Target, "target.yaml"))
 
 
 @pytest.fixture(scope="session")
