@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foundation.errors import SessionError
+from foundation.items import Event, StepMark
 from recording.format.messages import FrameMeta
 from recording.format.restarts import begins_of, is_superseded
+from recording.reading.columns import Column
 from recording.reading.interpolation import Float, interpolated
-
-if TYPE_CHECKING:
-    from recording.reading.session import Session
 
 _AIR = "thermometers.air"
 
@@ -52,7 +51,32 @@ class FramesTable:
         return own | {f"{axis}_position": column for axis, column in self.positions.items()}
 
 
-def frames_table(session: Session, files: list[str], times_ns: NDArray[np.int64]) -> FramesTable:
+class Recorded(Protocol):
+    """What is asked of a session."""
+
+    @property
+    def frame_metas(self) -> list[tuple[int, FrameMeta]]:
+        """(time_ns, description) of every frame."""
+        ...
+
+    def steps(self) -> list[StepMark]:
+        """Every step mark."""
+        ...
+
+    def events(self) -> list[Event]:
+        """Every event."""
+        ...
+
+    def channels(self) -> list[str]:
+        """The channels that have readings."""
+        ...
+
+    def readings(self, channel: str) -> Column:
+        """(time_ns, value); SessionError when there is no such channel."""
+        ...
+
+
+def frames_table(session: Recorded, files: list[str], times_ns: NDArray[np.int64]) -> FramesTable:
     """The table of the frames at these instants (F,), which lie in these files."""
     described: dict[int, list[FrameMeta]] = {}
     for time_ns, meta in session.frame_metas:
@@ -79,13 +103,13 @@ def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
 
-def _axes(session: Session) -> list[str]:
+def _axes(session: Recorded) -> list[str]:
     """The devices that tell a position and whether they move."""
     channels = set(session.channels())
     return [name.removesuffix(".moving") for name in sorted(channels) if name.endswith(".moving")]
 
 
-def _at(session: Session, channel: str, times_ns: NDArray[np.int64]) -> Float:
+def _at(session: Recorded, channel: str, times_ns: NDArray[np.int64]) -> Float:
     try:
         return interpolated(*session.readings(channel), times_ns)
     except SessionError:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from foundation.files import sync_folder
 from foundation.helper import Line
@@ -16,72 +16,11 @@ from recording.writing.forms import SessionForm
 from recording.writing.notices import Notice, SpaceWatch
 from recording.writing.segment import Record
 from recording.writing.series import Series
+from recording.writing.writers import SeriesFace, SpaceFace
 
 _NAME = "store"
 
 Waiting = TypeVar("Waiting")
-
-
-class SeriesFace(Protocol):
-    """What a writer needs of a series; see Series."""
-
-    troubles: deque[str]
-
-    @property
-    def is_open(self) -> bool:
-        """Whether a segment is open."""
-        ...
-
-    def check(self) -> None:
-        """See Series.check, SpaceWatch.check."""
-        ...
-
-    def commit(self, records: Sequence[Record], time_ns: int) -> None:
-        """See Series.commit."""
-        ...
-
-    def probe(self, size_bytes: int, time_ns: int) -> None:
-        """See Series.probe."""
-        ...
-
-    def refound(self) -> bool:
-        """See Series.refound."""
-        ...
-
-    def finish_full(self, time_ns: int) -> None:
-        """See Series.finish_full."""
-        ...
-
-    def finish(self) -> bool:
-        """See Series.finish."""
-        ...
-
-    def close(self) -> None:
-        """See Series.close."""
-        ...
-
-
-class SpaceFace(Protocol):
-    """What a writer needs of the watch over the disk; see SpaceWatch."""
-
-    @property
-    def frames_stopped(self) -> bool:
-        """Whether frames may not be written now."""
-        ...
-
-    @property
-    def stop_reason(self) -> str:
-        """Why, as a sentence."""
-        ...
-
-    @property
-    def free_bytes(self) -> int:
-        """When it was looked at last."""
-        ...
-
-    def check(self) -> None:
-        """See Series.check, SpaceWatch.check."""
-        ...
 
 
 class Store:

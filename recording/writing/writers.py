@@ -3,9 +3,10 @@ its own thread; its counts may be read from any."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from foundation.items import Batch, Event, Item, StepMark
 from foundation.readings import Frame, Quality
@@ -16,12 +17,71 @@ from recording.writing.home import FolderLost
 from recording.writing.notices import Losses
 from recording.writing.segment import Record, Topic
 
-if TYPE_CHECKING:
-    from recording.writing.store import SeriesFace, SpaceFace
-
 PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second
 _OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
 SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; FrameMeta has all 64
+
+
+class SeriesFace(Protocol):
+    """What a writer needs of a series; see Series."""
+
+    troubles: deque[str]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a segment is open."""
+        ...
+
+    def check(self) -> None:
+        """See Series.check, SpaceWatch.check."""
+        ...
+
+    def commit(self, records: Sequence[Record], time_ns: int) -> None:
+        """See Series.commit."""
+        ...
+
+    def probe(self, size_bytes: int, time_ns: int) -> None:
+        """See Series.probe."""
+        ...
+
+    def refound(self) -> bool:
+        """See Series.refound."""
+        ...
+
+    def finish_full(self, time_ns: int) -> None:
+        """See Series.finish_full."""
+        ...
+
+    def finish(self) -> bool:
+        """See Series.finish."""
+        ...
+
+    def close(self) -> None:
+        """See Series.close."""
+        ...
+
+
+class SpaceFace(Protocol):
+    """What a writer needs of the watch over the disk; see SpaceWatch."""
+
+    @property
+    def frames_stopped(self) -> bool:
+        """Whether frames may not be written now."""
+        ...
+
+    @property
+    def stop_reason(self) -> str:
+        """Why, as a sentence."""
+        ...
+
+    @property
+    def free_bytes(self) -> int:
+        """When it was looked at last."""
+        ...
+
+    def check(self) -> None:
+        """See Series.check, SpaceWatch.check."""
+        ...
 
 
 class TelemetryEncoder:
