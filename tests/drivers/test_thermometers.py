@@ -80,7 +80,7 @@ def module() -> Module:
 async def thermometers(serve_modbus: Serve, module: Module) -> AsyncIterator[Thermometers]:
     """Not yet opened."""
     bus = Bus(
-        "rs485", BusSettings(address=await serve_modbus([module.device()], []), timeout_s=0.1, gap_s=0.0), WallClock()
+        "rs485", BusSettings(address=await serve_modbus([module.device()], []), timeout_s=0.5, gap_s=0.0), WallClock()
     )
     await bus.open()
     yield Thermometers("thermometers", bus, M7015, SENSORS, WallClock())
