@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
 from compensation.history.history import History, recorded_history
+from compensation.one_camera import others_ns
 from compensation.one_equilibrium import check_sessions
 from experiments.steps import Role
 from foundation.documents import parse_document
@@ -117,7 +118,8 @@ def session_target(session: Session) -> Target:
 def session_noise(session: Session) -> Noise | None:
     """The camera's noise, from the first frames; None when they do not tell."""
     try:
-        first = list(islice(session.frames(), _NOISE_FRAMES))
+        others = others_ns(session)
+        first = list(islice((each for each in session.frames() if each.time_ns not in others), _NOISE_FRAMES))
     except SessionError:  # the search for the markers comes to the same frame, and tells where it is
         return None
     partial = [frame.windows for frame in first if frame.windows is not None]
@@ -196,23 +198,25 @@ def _continued(report: Report, done_before: float) -> Report:
 def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -> Observations:
     """first: the first frame with the target, whose size the others must have."""
     known = session.frames_table()
-    reasons = _reasons(found, first, known.camera_degC, known.superseded)
-    purposes = [_purpose(role, chamber_degC) for role, chamber_degC in zip(known.role, known.chamber_degC, strict=True)]
+    own = np.flatnonzero(~np.isin(known.time_ns, list(others_ns(session))))
+    camera_degC, step_id = known.camera_degC[own], known.step_id[own]
+    reasons = _reasons(found, first, camera_degC, known.superseded[own])
+    purposes = [_purpose(role, degC) for role, degC in zip(known.role[own], known.chamber_degC[own], strict=True)]
     unusable = (found.flags != 0) | np.array([bool(reason) for reason in reasons])[:, None]
-    image = session.frame(first).image
+    image = session.frame(int(own[first])).image
     return Observations(
         target=target,
         sessions=(_facts(session),),
         image_size=(image.shape[1], image.shape[0]),
         preview=_preview(image),
         session=np.zeros(len(reasons), np.int64),
-        frame=np.arange(len(reasons)),
+        frame=own,
         time_ns=found.time_ns,
         role=np.array([str(role) for role, _ in purposes]),
-        step_id=tuple(known.step_id.tolist()),
+        step_id=tuple(step_id.tolist()),
         chamber_degC=np.array([chamber_degC for _, chamber_degC in purposes]),
-        camera_degC=known.camera_degC,
-        air_degC=known.air_degC,
+        camera_degC=camera_degC,
+        air_degC=known.air_degC[own],
         centres_px=np.where(unusable[:, :, None], np.nan, found.centres_px),
         covariance_px2=np.where(unusable[:, :, None, None], np.nan, found.covariance_px2),
         flags=np.where((found.reason == "")[:, None], found.flags, 0).astype(np.uint8),

@@ -60,7 +60,7 @@ def laboratory_of(
             name: {"address": None if is_anywhere else camera.address, "serial_number": camera.serial_number}
             for name, camera in config.cameras.items()
         },
-        "camera_boot_s": min(_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())),
+        "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
     }
 
 

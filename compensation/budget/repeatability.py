@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.budget.states import CaptureState, capture_states
+from compensation.one_camera import others_ns
 from foundation.items import Event
 from markers.detection import Detection, DetectionError, detect
 from markers.target import Target
@@ -68,8 +69,9 @@ def _mean_centres(session: Session, target: Target, wanted: set[str]) -> dict[st
     """Step -> mean centres (N, 2) of its frames, NaN for markers that one of them lacks."""
     seen: dict[str, list[NDArray[np.float64]]] = {}
     previous: Detection | None = None
+    others = others_ns(session)
     for frame in session.frames():
-        if frame.step_id not in wanted:
+        if frame.step_id not in wanted or frame.time_ns in others:
             continue
         try:
             previous = detect(frame.image, target, previous)

@@ -17,6 +17,7 @@ from compensation.calibration.averages import MeanCentres, mean_centres, scatter
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
 from compensation.calibration.visits import AXES, place, visits_for
+from compensation.one_camera import others_ns
 from foundation.errors import SessionError
 from foundation.progress import Report
 from markers.detection import Detection, DetectionError, detect
@@ -126,8 +127,10 @@ def _detect_all(
     previous: Detection | None = None
     size: tuple[int, int] | None = None
     refused = ""
+    others = others_ns(session)
     for number, image in enumerate(session.images(), 1):
-        detections = None if image.meta is None else wanted.get(image.meta.step_id)
+        is_own = image.meta is not None and image.time_ns not in others
+        detections = wanted.get(image.meta.step_id) if image.meta is not None and is_own else None
         if report is not None:
             report(number, f"frame {number} of {session.frame_count}")
         if detections is None:

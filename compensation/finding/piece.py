@@ -18,6 +18,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from compensation.finding.png_rows import decode_rows
+from compensation.one_camera import others_ns
 from foundation.errors import SessionError
 from foundation.instants import utc_text
 from markers.detection import Detection, DetectionError, Noise, detect, nothing_found
@@ -36,7 +37,8 @@ FRAMES_PER_PIECE = 64
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """The `frames` frames of `segment` whose middles of exposure lie in [begin_ns, end_ns]."""
+    """The `frames` frames of `segment` whose middles of exposure lie in [begin_ns, end_ns], without those at
+    `others_ns`, which are other cameras'."""
 
     segment: Path
     begin_ns: int
@@ -44,6 +46,7 @@ class Piece:
     frames: int
     target: Target
     noise: Noise | None
+    others_ns: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,13 +70,16 @@ class FoundMarkers:
 def pieces_of(
     session: Session, target: Target, noise: Noise | None = None, frames_per_piece: int = FRAMES_PER_PIECE
 ) -> list[Piece]:
-    """All the frames of a session: its segments in order, each in order of time."""
+    """All the frames of a session's (leading) camera: its segments in order, each in order of time."""
     pieces: list[Piece] = []
+    others = others_ns(session)
     for segment in session.frame_segments:
-        places = _in_order(segment)
+        places = [place for place in _in_order(segment) if place.time_ns not in others]
         for first in range(0, len(places), frames_per_piece):
             part = places[first : first + frames_per_piece]
-            pieces.append(Piece(segment.resolve(), part[0].time_ns, part[-1].time_ns, len(part), target, noise))
+            begin_ns, end_ns = part[0].time_ns, part[-1].time_ns
+            theirs = frozenset(time_ns for time_ns in others if begin_ns <= time_ns <= end_ns)
+            pieces.append(Piece(segment.resolve(), begin_ns, end_ns, len(part), target, noise, theirs))
     return pieces
 
 
@@ -116,7 +122,7 @@ def joined(parts: list[FoundMarkers]) -> FoundMarkers:
 
 def _images(piece: Piece) -> Iterator[tuple[Message, ImageArray]]:
     for place in _in_order(piece.segment):
-        if piece.begin_ns <= place.time_ns <= piece.end_ns:
+        if piece.begin_ns <= place.time_ns <= piece.end_ns and place.time_ns not in piece.others_ns:
             try:
                 message = read_frame(place)
                 with naming(place.path):

@@ -29,7 +29,6 @@ class _Whole:
 
     time_ns: int
     step_id: str
-    channel: str
     shape: tuple[int, ...]
     dtype: np.dtype[np.uint8] | np.dtype[np.uint16]
     windows: Windows | None
@@ -39,26 +38,26 @@ class _Whole:
 class RoiEncoder:
     """Frames in order of time to messages, one thread at a time.
 
-    A frame is recorded whole and searched for windows when it is the first one, of another channel, size, type or
-    step than the one before, or `whole_every_s` after the last search (on the frames' own time). When windows were
-    found, the frames up to the next search keep only those; else they are whole.
+    A frame is recorded whole and searched for windows when it is the first one of its channel, of another size, type
+    or step than that channel's before, or `whole_every_s` after the last search (on the frames' own time). When
+    windows were found, the frames up to the next search keep only those; else they are whole.
     """
 
     def __init__(self, find_windows: FindWindows, whole_every_s: float = 60.0) -> None:
         self.tell: Callable[[str], None] = lambda text: None  # of a search that failed; whoever records listens
         self._find_windows = find_windows
         self._whole_every_ns = seconds_ns(whole_every_s)
-        self._whole: _Whole | None = None
+        self._wholes: dict[str, _Whole] = {}  # channel -> its last whole frame
 
     def __call__(self, frame: Frame) -> bytes:
         """The frame's message; ValueError when the image is none, or a window is not within it. A frame that is
         partial already is recorded as it is."""
         if frame.windows is not None:
             return encode_image(frame, "roi")
-        whole = self._whole
+        whole = self._wholes.get(frame.channel)
         if whole is None or not self._holds(whole, frame):
             data = encode_image(frame, "roi")
-            self._whole = self._searched(frame)
+            self._wholes[frame.channel] = self._searched(frame)
             return data
         if whole.windows is None:
             return encode_image(frame, "roi")
@@ -66,8 +65,8 @@ class RoiEncoder:
 
     def _holds(self, whole: _Whole, frame: Frame) -> bool:
         image = frame.image
-        before = (whole.step_id, whole.channel, whole.shape, whole.dtype)
-        now = (frame.step_id, frame.channel, image.shape, image.dtype)
+        before = (whole.step_id, whole.shape, whole.dtype)
+        now = (frame.step_id, image.shape, image.dtype)
         return before == now and 0 <= frame.time_ns - whole.time_ns < self._whole_every_ns
 
     def _searched(self, frame: Frame) -> _Whole:
@@ -75,7 +74,6 @@ class RoiEncoder:
         return _Whole(
             time_ns=frame.time_ns,
             step_id=frame.step_id,
-            channel=frame.channel,
             shape=image.shape,
             dtype=image.dtype,
             windows=self._windows_in(image),

@@ -146,7 +146,10 @@ def overview(path: Path) -> Overview:
 
 def _steps(contents: Contents) -> Iterator[Step]:
     """The steps in order of their index; of one that was begun again the last time counts."""
-    frames = Counter(meta.step_id for _, meta in contents.metas)
+    by_camera = Counter((meta.step_id, meta.channel) for _, meta in contents.metas)
+    frames = Counter[str]()
+    for (of_step, _), count in by_camera.items():
+        frames[of_step] = max(frames[of_step], count)
     last: dict[str, list[StepMark]] = {}
     for mark in sorted(contents.marks, key=lambda mark: mark.time_ns):
         if mark.state is StepState.STARTED or mark.step_id not in last:

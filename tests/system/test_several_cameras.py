@@ -1,0 +1,75 @@
+"""Stands with two cameras, and with none: recorded, verified, and read again."""
+
+import asyncio
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import yaml
+
+from compensation.observations import observe
+from foundation.documents import parse_document
+from recording.reading.session import Session
+from recording.repair.verify import Files, verify
+from stand.config.recipe import Recipe
+from stand.config.stand_config import StandConfig, packaged
+from stand.running.order import Order
+from stand.running.run import run_virtual
+
+from .conftest import require_aravis
+
+CAPTURES = """
+name: captures
+experiments:
+  - calibration: {equilibrium_s: 60, linear_mm: [0, 40], rotary_deg: [0], frames_per_position: 2}
+"""
+NO_FRAMES = """
+name: no-frames
+experiments:
+  - steps: [{start_chamber: 24}, {soak: 30}, stop_chamber]
+"""
+
+
+def recorded(data: dict[str, object], recipe: str, out: Path) -> Path:
+    text = yaml.safe_dump(data)
+    target = packaged("targets", "paper-9x6").read_text()
+    config, plan = parse_document(text, StandConfig, "config"), parse_document(recipe, Recipe, "recipe")
+    return asyncio.run(run_virtual(Order(config, plan, text, recipe, target), out, 1, lambda _: None))
+
+
+def simulated() -> dict[str, dict[str, object]]:
+    return yaml.safe_load(packaged("", "simulated").read_text())
+
+
+@pytest.mark.parametrize("encoding", ["png", "roi"])
+def test_each_camera_exposes_at_each_capture_and_a_model_takes_the_leading_ones_frames(tmp_path: Path, encoding: str):
+    require_aravis()
+    data = simulated()
+    data["cameras"]["side"] = {"address": "127.0.0.21", "serial_number": "TS-0002", "boot_s": 4.0, "poll_s": 5.0}
+    data["recording"]["frame_encoding"] = encoding
+    session = Session.open(recorded(data, CAPTURES, tmp_path))
+    assert verify(session.path).files is Files.SOUND
+    assert session.metadata["camera_serial"] == "TS-0001, TS-0002"
+    metas = session.frame_metas
+    assert Counter(meta.channel for _, meta in metas) == {"camera.image": 4, "side.image": 4}
+    assert len({time_ns for time_ns, _ in metas}) == 8
+    assert {frame.channel for frame in session.frames()} == {"camera.image", "side.image"}
+    if encoding == "roi":  # each camera has a whole frame at each step, and only there
+        whole = Counter(frame.channel for frame in session.frames() if frame.windows is None)
+        assert whole == {"camera.image": 2, "side.image": 2}
+    assert {"camera.temperature", "side.temperature"} <= set(session.channels())
+    own_ns = [time_ns for time_ns, meta in metas if meta.channel == "camera.image"]
+    assert observe(session.path).time_ns.tolist() == own_ns
+
+
+def test_a_stand_without_cameras_axes_and_spare_thermometers_runs(tmp_path: Path):
+    data = simulated()
+    del data["cameras"], data["axes"]
+    data["relays"]["channels"] = {"heater_enable": 0, "compressor": 1}
+    data["thermometers"] = {name: data["thermometers"][name] for name in ("air", "granite_inside")}
+    session = Session.open(recorded(data, NO_FRAMES, tmp_path))
+    assert verify(session.path).files is Files.SOUND
+    assert session.frame_count == 0
+    assert {name for name in session.channels() if "thermometers" in name} == {
+        f"thermometers.{name}" for name in ("air", "air_raw", "granite_inside", "granite_inside_raw")
+    }
