@@ -24,15 +24,16 @@ _AIR = "thermometers.air"
 class FramesTable:
     """F frames in order of time; each column has shape (F,).
 
-    file: the segment that holds the image, within the session. time_ns: middle of the exposure, int64. step_id: the
-    step that took it, role: what for, as the step says, "" when neither is known. superseded: whether its capture was
-    begun again after it, so that it does not count. chamber_degC: the step's set-point. camera_degC: the camera's own
-    temperature. air_degC: near the camera, interpolated. positions: of each axis of the table, by its name, in its unit
-    (mm or deg), interpolated. Numbers are NaN when unknown.
+    file: the segment that holds the image, within the session. time_ns: middle of the exposure, int64. camera:
+    whose it is, "" when unknown. step_id: the step that took it, role: what for, as the step says, "" when neither
+    is known. superseded: whether its capture was begun again after it, so that it does not count. chamber_degC: the
+    step's set-point. camera_degC: the camera's own temperature. air_degC: near the camera, interpolated. positions:
+    of each axis of the table, by its name, in its unit (mm or deg), interpolated. Numbers are NaN when unknown.
     """
 
     file: NDArray[np.str_]
     time_ns: NDArray[np.int64]
+    camera: NDArray[np.str_]
     step_id: NDArray[np.str_]
     role: NDArray[np.str_]
     superseded: NDArray[np.bool_]
@@ -46,7 +47,17 @@ class FramesTable:
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """Name -> column, the axes as `linear_position`: what pandas.DataFrame and the like take."""
-        names = ("file", "time_ns", "step_id", "role", "superseded", "chamber_degC", "camera_degC", "air_degC")
+        names = (
+            "file",
+            "time_ns",
+            "camera",
+            "step_id",
+            "role",
+            "superseded",
+            "chamber_degC",
+            "camera_degC",
+            "air_degC",
+        )
         own: dict[str, NDArray[np.generic]] = {name: getattr(self, name) for name in names}
         return own | {f"{axis}_position": column for axis, column in self.positions.items()}
 
@@ -89,6 +100,7 @@ def frames_table(session: Recorded, files: list[str], times_ns: NDArray[np.int64
     return FramesTable(
         file=np.array(files, np.str_),
         time_ns=times_ns,
+        camera=np.array(["" if meta is None else meta.channel.partition(".")[0] for meta in metas], np.str_),
         step_id=np.array(step_id, np.str_),
         role=np.array([str(steps.get(name, {}).get("role") or "") for name in step_id], np.str_),
         superseded=np.array([is_superseded(time_ns, name, begins_ns) for time_ns, name in named], bool),
