@@ -232,7 +232,7 @@ def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: ND
     reasons: list[str] = []
     for size_px, reason, degC, begun_anew in zip(*columns, strict=True):
         if begun_anew:
-            reason = "its capture was begun anew"
+            reason = "its capture was restarted"
         elif size_px != [width, height]:
             reason = f"the image has {size_px[0]} x {size_px[1]} pixels, the session's {width} x {height}"
         elif not reason and math.isnan(degC):

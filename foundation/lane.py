@@ -67,7 +67,7 @@ class Lane:
         self.close()
 
     def _left(self) -> TimeoutError:
-        return TimeoutError(f"{self._name} has not answered and is waited for no longer")
+        return TimeoutError(f"{self._name} has not answered; no longer waiting for it")
 
     def close(self) -> None:
         """End the thread after the calls handed over; may be called twice."""

@@ -65,7 +65,7 @@ def _imported(module: str, name: str) -> Any:
     try:
         group = get_group(importlib.import_module(module).app)
     except KeyboardInterrupt as error:
-        typer.echo("interrupted; nothing was begun", err=True)
+        typer.echo("interrupted; nothing was started", err=True)
         raise typer.Exit(_INTERRUPTED) from error
     return group.commands.get(name, group)
 

@@ -12,7 +12,7 @@ def app() -> None:
     try:
         from stand.commands.commands import app as commands
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted; nothing was begun\n")
+        sys.stderr.write("interrupted; nothing was started\n")
         sys.exit(_INTERRUPTED)
     commands()
 

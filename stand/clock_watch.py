@@ -59,7 +59,7 @@ class ClockWatch:
     def _tell_step(self, now_ns: int, offset_ns: int) -> None:
         by_s, utc_s = (offset_ns - self._recorded_ns) / NS_PER_S, offset_ns / NS_PER_S
         text = (
-            f"the system clock went {by_s:+.3f} s against the stand's clock, which goes on as it was; UTC is now "
+            f"the system clock moved {by_s:+.3f} s against the stand's clock, which is not changed; UTC is now "
             f"{utc_s:+.3f} s from recorded instants"
         )
         data = {

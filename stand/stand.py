@@ -81,4 +81,4 @@ class Stand:
         if self.attended:
             self.gate.hold(OPERATOR)
             return await self.gate.passed()
-        self._hub.publish(Event(self._clock.now_ns(), "warning", "prompt_skipped", f"nobody attends; not done: {text}"))
+        self._hub.publish(Event(self._clock.now_ns(), "warning", "prompt_skipped", f"no operator; not done: {text}"))

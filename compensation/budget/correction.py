@@ -59,7 +59,7 @@ def stand_correction(state: StandState, reference: StandState, geometry: Geometr
     for name in StandState.__dataclass_fields__:
         for role, which in (("state", state), ("reference state", reference)):
             if not math.isfinite(getattr(which, name)):
-                raise ValueError(f"{name} of the {role} is unknown: the stand's part cannot be told")
+                raise ValueError(f"{name} of the {role} is unknown: the stand's part cannot be computed")
     return StandCorrection(state, reference, geometry)
 
 

@@ -22,8 +22,8 @@ def table_from_poses(
     """
     if np.ptp(rotary_deg) < _LEAST_TURN_DEG or np.ptp(linear_mm) < _LEAST_TRAVEL_MM:
         raise CalibrationError(
-            f"the positions span {np.ptp(linear_mm):g} mm and {np.ptp(rotary_deg):g} deg; to tell camera from table, "
-            f"{_LEAST_TRAVEL_MM:g} mm and {_LEAST_TURN_DEG:g} deg are needed"
+            f"the positions span {np.ptp(linear_mm):g} mm and {np.ptp(rotary_deg):g} deg; "
+            f"{_LEAST_TRAVEL_MM:g} mm and {_LEAST_TURN_DEG:g} deg are needed to separate camera and table"
         )
     rotary = _axis(rotary_deg, rotations)
     turns = Rotation.from_rotvec(rotary_deg[:, None] * rotary, degrees=True)

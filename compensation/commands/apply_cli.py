@@ -32,7 +32,7 @@ app = typer.Typer(add_completion=False)
 
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")]
 CameraOption = Annotated[
-    float | None, typer.Option("--camera-degC", help="The camera's own temperature, where nothing recorded tells it.")
+    float | None, typer.Option("--camera-degC", help="The camera's own temperature, where it was not recorded.")
 ]
 INDEX_COLUMNS = ("image", "frame", "time_ns", "camera_degC", "outside")
 
@@ -64,7 +64,7 @@ def apply_model(
     with one_line_errors():
         used = load_model(model)
         if source.is_dir():
-            _refuse(("--session", session), ("--camera-degC", camera_degC), why="a session tells its own temperatures")
+            _refuse(("--session", session), ("--camera-degC", camera_degC), why="a session has temperatures of its own")
             _correct_session(used, open_whole(source, said_if(incomplete)), out, frames, form)
         elif source.suffix.lower() == ".csv":
             _refuse(("--frames", frames), why="it selects frames of a session")
@@ -109,7 +109,7 @@ def _correct_points(
     rows = read_points(source)
     xy_px = np.column_stack([numbers(source, rows, X), numbers(source, rows, Y)])
     if session is not None:
-        _refuse(("--camera-degC", camera_degC), why="the session tells it")
+        _refuse(("--camera-degC", camera_degC), why="the session has it")
         states = _recorded_states(model, session, times(source, rows))
     elif camera_degC is not None or (rows and CAMERA in rows[0]):
         model = _without_history(model)
@@ -131,7 +131,7 @@ def _without_history(model: DriftModel) -> DriftModel:
         return model
     if not isinstance(model.other, PaperModel):
         raise ConfigError(
-            f"a model of the form {model.form} needs the thermal state, which nothing here tells; give --session"
+            f"a model of the form {model.form} needs the thermal state, which is not known here; give --session"
         )
     left, usual = (" and ".join(f"{px:.3f}" for px in one.discrepancy_px) for one in (model.other, model))
     typer.echo(
@@ -154,7 +154,7 @@ def _check_known(model: DriftModel, xy_px: np.ndarray[tuple[int, ...], np.dtype[
     known = np.isfinite(xy_px).all(axis=1)
     if known.any() and np.isnan(model.shift(xy_px, states)[known]).all():
         raise ConfigError(
-            f"a model of the form {model.form} needs the thermal state, which nothing here tells; give --session"
+            f"a model of the form {model.form} needs the thermal state, which is not known here; give --session"
         )
 
 

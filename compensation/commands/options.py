@@ -23,14 +23,12 @@ AcrossGap = Annotated[
         help="Use frames from before and after a gap together, though camera minus air has changed in it.",
     ),
 ]
-Incomplete = Annotated[
-    bool, typer.Option("--incomplete", help="Use what is there of a session of which something is missing.")
-]
+Incomplete = Annotated[bool, typer.Option("--incomplete", help="Use a session although part of it is missing.")]
 Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
 Cluster = Annotated[
     str | None, typer.Option("--cluster", help="A Dask scheduler, host:port, whose workers see the same files.")
 ]
-Cache = Annotated[bool, typer.Option("--cache/--no-cache", help="Keep what was found, and take what is kept.")]
+Cache = Annotated[bool, typer.Option("--cache/--no-cache", help="Keep the markers found, and reuse those kept.")]
 
 
 def installed_target(name: str) -> Target:

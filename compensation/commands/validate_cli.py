@@ -44,7 +44,7 @@ def validate_session(
     model: Annotated[Path, typer.Option(help="The drift model of `compensate fit`.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write; a JSON file is written beside it.")],
     budget: Annotated[
-        str | None, typer.Option(help="Tell the stand's part, too: its geometry, a file or the installed `paper`.")
+        str | None, typer.Option(help="Compute the stand's part, too: its geometry, a file or the installed `paper`.")
     ] = None,
     lens: Annotated[
         LensModel, typer.Option(help="Which model of the camera file gives the poses.")

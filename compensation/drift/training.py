@@ -84,7 +84,7 @@ def training(observations: Observations, terms: tuple[Term, ...], memory: Memory
     frames = observations.of(Role.REFERENCE, Role.FIT, Role.WARM_UP) & np.isfinite(found).all(axis=1)
     frames &= _trusted(observations, states, against)
     if not (frames & reference).any():
-        raise SessionError("the sessions' telemetry does not tell the thermal state at the reference frames")
+        raise SessionError("the sessions' telemetry does not give the thermal state at the reference frames")
     relative, first = _relative(observations, terms, found, against & frames)
     rows = displacements(observations, frames & _anchored(observations, against & frames), against)
     rows = rows.where(_same_place(rows)[rows.frame])

@@ -12,7 +12,7 @@ _FIGURES = (
     (
         figures.residual_vectors,
         "residuals",
-        "Residuals of all markers, drawn longer as the bar tells; they should have no pattern.",
+        "Residuals of all markers, enlarged as the scale bar shows; they should have no pattern.",
     ),
     (figures.residual_sizes, "sizes", "RMS residual of each table position and of each marker."),
     (
@@ -31,7 +31,7 @@ _FIGURES = (
     (
         figures.corrections,
         "corrections",
-        "What the adjustment made of the board's coordinates and of the table's positions.",
+        "How the adjustment changed the board's coordinates and the table's positions.",
     ),
 )
 

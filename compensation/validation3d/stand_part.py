@@ -65,7 +65,7 @@ def _check_known(session: Session, states: list[StandState]) -> None:
             silent = name.removesuffix("_degC")
             raise SessionError(
                 f"{session.path}: the thermometer {silent} was silent while poses were taken, so the stand's part "
-                "cannot be told; leave out --budget"
+                "cannot be computed; leave out --budget"
             )
 
 

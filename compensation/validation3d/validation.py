@@ -97,7 +97,7 @@ def validate(
     """SessionError when the model has no answer for any frame. CalibrationError when the reference has no pose."""
     compensated = corrected(observations, frames, model)
     if not np.isfinite(compensated.centres_px).any():
-        raise SessionError("the drift model has no answer for any frame: the session does not tell what it needs")
+        raise SessionError("the drift model has no answer for any frame: the session lacks what it needs")
     before = deviations("before compensation", camera, observations, frames, observations.centres_px)
     after = deviations(
         "after compensation", camera, observations, frames, compensated.centres_px, compensated.model_px2

@@ -197,9 +197,9 @@ class Camera:
         if self._heard_ns is None:
             return ""
         if clock_began_ns is None:
-            return "the camera was lost, and has no clock that tells whether it has started anew"
+            return "the camera was lost, and has no clock that shows whether it has restarted"
         is_younger = clock_began_ns > self._heard_ns - seconds_ns(_CLOCK_SLACK_S)
-        return "the camera was lost and has started anew: its clock began after it was last heard" if is_younger else ""
+        return "the camera was lost and has restarted: its clock began after its last answer" if is_younger else ""
 
     def _connect(self) -> None:
         self._disconnect()

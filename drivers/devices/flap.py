@@ -131,7 +131,7 @@ class Flap:
         span = self._settings.open_target - self._settings.closed_target
         openness = (variables.position - self._settings.closed_target) / span
         if variables.halting & ~_AWAITING_COMMAND or (variables.halting and self._commanded):
-            reason = f"the motor is without force: {_names(variables.halting)}"
+            reason = f"the motor is not driven: {_names(variables.halting)}"
             return Reading(channel, openness, "1", now_ns, Quality.STALE, reason), current
         return Reading(channel, openness, "1", now_ns), current
 
@@ -224,7 +224,7 @@ class Flap:
             try:
                 serial_number = str(usb.util.get_string(device, device.iSerialNumber, _ENGLISH))
             except (usb.core.USBError, ValueError, LookupError) as error:
-                serial_number = f"one that does not tell its own ({error})"
+                serial_number = f"one that does not report its own ({error})"
                 if isinstance(error, usb.core.USBError) and error.errno == errno.EACCES:
                     denied = error
             present.append(serial_number)

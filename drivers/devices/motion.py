@@ -22,7 +22,7 @@ class Turn:
     def check(self) -> None:
         """Superseded unless this is still the command that counts; from any thread."""
         if self._motion.newest is not self:
-            raise Superseded(self._motion.device, "a newer command, or making safe, has taken over; not carried out")
+            raise Superseded(self._motion.device, "superseded by a newer command or by making safe; not carried out")
 
 
 class Motion:

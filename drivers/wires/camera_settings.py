@@ -38,7 +38,7 @@ SILENT = {2, 4, 5, 6}  # not connected, transfer error, timeout, device not foun
 # Vision camera has its data and a stream channel; Aravis (arvgvdevice.c) takes a count it could not read for 0.
 NOT_READY = {8, 9, 18}
 NO_CONTROL = {10, 17}  # not controller, access denied
-NO_CONTROL_HINT = "another client controls the camera, or one that died held it less than its heartbeat ago"
+NO_CONTROL_HINT = "another client controls the camera, or one that died holds it until the heartbeat times out"
 
 
 class TemperatureFeature(Document):
@@ -66,7 +66,7 @@ class TemperatureFeature(Document):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if (self.feature is None) == (self.register_address is None):
-            raise ValueError("a temperature is a feature or a register_address, one of them")
+            raise ValueError("give exactly one of feature and register_address")
         if (self.selector is None) != (self.entry is None):
             raise ValueError("selector and entry go together")
         if self.min_degC >= self.max_degC:

@@ -99,7 +99,7 @@ def read_head(path: Path) -> Head:
         summary = _open(path, file)
         head = _head(path, file)
         if len(head.attachments) != summary.statistics.attachment_count:
-            raise ValueError("its attachments are not those its index tells of")
+            raise ValueError("its attachments are not those that its index lists")
         return head
 
 
@@ -154,7 +154,7 @@ def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterato
                 counts[number] += 1
                 yield _message(topics[number], chunk, offset, end)
         if counts != {number: summary.statistics.channel_message_counts.get(number, 0) for number in topics}:
-            raise ValueError("it does not hold the messages its index tells of")
+            raise ValueError("it does not hold the messages that its index lists")
 
 
 def _channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
@@ -262,7 +262,7 @@ def read_frame(place: FramePlace) -> Message:
         image = _read(file, chunk.offset + begin, chunk.length - begin)
         check_crc(image, head.crc, "a chunk", data[content_begin:begin])
         if (number, time_ns) != (place.channel, place.time_ns):
-            raise ValueError("the index tells of another frame")
+            raise ValueError("the index lists another frame")
         return Message(CAMERA_IMAGE, sequence, time_ns, image)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from foundation.items import Event
 
 KIND = "capture_restarted"
-_TEXT = "capture {} begins anew, {}; its {} frames so far do not count"
+_TEXT = "capture {} is restarted, {}; its {} frames so far do not count"
 
 
 def restarted(time_ns: int, step_id: str, frames: int, how: str) -> Event:

@@ -93,9 +93,9 @@ def _why(
     if journal.status and not is_ended:
         return f"{JOURNAL_NAME} says that the run ended at {utc.date_time(journal.ended_ns)} UTC, {stops}"
     if journal.resumed_ns > (last.time_ns if is_ended and last is not None else end_ns + AHEAD_NS):
-        return f"{JOURNAL_NAME} says that the run went on at {utc.date_time(journal.resumed_ns)} UTC, {stops}"
+        return f"{JOURNAL_NAME} says that the run was resumed at {utc.date_time(journal.resumed_ns)} UTC, {stops}"
     if done and (more := len(journal.done - done)):
         return f"{JOURNAL_NAME} says that {len(journal.done)} steps are done, {more} more than the telemetry; {stops}"
     if journal.last_ns > end_ns + AHEAD_NS and not is_salvaged and not is_ended:
-        return f"{JOURNAL_NAME} goes on to {utc.date_time(journal.last_ns)} UTC, {stops}"
+        return f"{JOURNAL_NAME} continues to {utc.date_time(journal.last_ns)} UTC, {stops}"
     return ""

@@ -181,9 +181,9 @@ def _misfits(seen: Sequence[_Seen], metadata: dict[str, str]) -> Iterator[str]:
     """Segments of another session, or of another place in this one."""
     for each in seen:
         if each.head.session != metadata:
-            yield f"{each.file.name}: tells of another session than the other segments"
+            yield f"{each.file.name}: belongs to another session than the other segments"
         if misplaced(each.file.series, each.file.number, each.head.place, each.head.session):
-            yield f"{each.file.name}: tells of another place in the session than its name does"
+            yield f"{each.file.name}: records another place in the session than its name"
 
 
 def _kept(files: Sequence[SegmentFile], seen: Sequence[_Seen]) -> Iterator[str]:
@@ -194,7 +194,7 @@ def _kept(files: Sequence[SegmentFile], seen: Sequence[_Seen]) -> Iterator[str]:
         if file.state is State.DAMAGED and (
             each is None or not is_recovered(file, each.head.salvaged, each.link.count)
         ):
-            yield f"{file.name}: is what a salvage could not recover all of"
+            yield f"{file.name}: is an original that a salvage could not recover completely"
 
 
 def _missing(coverage: Coverage) -> Iterator[str]:
@@ -208,7 +208,7 @@ def _missing(coverage: Coverage) -> Iterator[str]:
             yield f"{segments_text(series, hole.first or 0, hole.last)} missing"
     for hole in coverage.holes:
         if not hole.excused:
-            yield "it is a copy of a session that was not whole"
+            yield "it is a copy of an incomplete session"
             return
 
 

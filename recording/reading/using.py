@@ -35,8 +35,8 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
     plan = frames_of_plan(session.events(), session.frame_count) if session.run is Run.COMPLETE else ""
     sentence = f"{session.path}: is incomplete; missing: {'; '.join([*texts[:_MOST], *more])}{plan}"
     if incomplete is None:
-        raise SessionError(f"{sentence}; with --incomplete what is there is used")
-    incomplete(f"{sentence}; only what is there is used")
+        raise SessionError(f"{sentence}; use --incomplete to read the rest")
+    incomplete(f"{sentence}; only the rest is used")
 
 
 def _check_finished(path: Path, incomplete: Say | None) -> None:

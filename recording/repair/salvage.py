@@ -335,9 +335,9 @@ def _reason(original: _Original) -> str:
     if found.is_session_wrong:
         reasons.append("its metadata do not fit their CRC")
     if original.opening is None:
-        reasons.append("no segment tells which session it belongs to")
+        reasons.append("no segment records which session it belongs to")
     elif original.unknown:
-        reasons.append(f"{original.unknown} messages are of channels no segment tells of")
+        reasons.append(f"{original.unknown} messages are of channels that no segment describes")
     if not reasons:
         reasons.append("its index is damaged" if original.path == original.finished else "it was not finished")
     return "; ".join(reasons)

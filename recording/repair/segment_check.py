@@ -164,7 +164,7 @@ class _Walk:
         places = sorted(ends)
         last = index.begin - _DATA_END_BYTES
         if [ends[place] for place in places] != [*places[1:], last]:
-            raise ValueError("the records its index tells of do not follow each other")
+            raise ValueError("the records that its index lists do not follow each other")
         return [*places, last]
 
     def _part(self, place: int, end: int, read: Callable[[int, bytes], None]) -> None:
@@ -275,7 +275,7 @@ class _Walk:
             schema_count=len(index.schemas),
         )
         if found != index.statistics:
-            raise ValueError("it does not hold the messages its index tells of")
+            raise ValueError("it does not hold the messages that its index lists")
 
 
 class _Placed(NamedTuple):

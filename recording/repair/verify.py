@@ -132,7 +132,7 @@ def _link(file: SegmentFile, check: SegmentCheck) -> Link:
 def _format(session: Mapping[str, str]) -> Iterator[Finding]:
     """What a later version of thermostand may have recorded is not known here."""
     if text := later_format(session):
-        yield Finding(Severity.ERROR, "", f"{text}: what is new in that was not checked", Files.UNKNOWN)
+        yield Finding(Severity.ERROR, "", f"{text}: what that format adds was not checked", Files.UNKNOWN)
     elif unknown := sorted(session.keys() - {field.name for field in fields(SessionInfo)}):
         names = ", ".join(name[:40] for name in unknown[:6])
         yield _note(
@@ -211,7 +211,7 @@ def _not_finished(files: Iterable[SegmentFile], checks: Mapping[str, SegmentChec
                     file.name,
                 )
             case State.DAMAGED:
-                yield _error("is what a salvage kept of a segment because it could not recover all of it", file.name)
+                yield _error("is an original that a salvage kept because it could not recover all of it", file.name)
             case State.RECORDING:
                 yield _note("is being recorded now and was not read", file.name)
             case State.FINISHED:
@@ -292,10 +292,10 @@ def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
         if not is_whole and read.checks[file.name].damages:
             continue  # a finding already
         if _entries(metadata.get(SESSION_METADATA)) != sessions.most_common(1)[0][0]:
-            yield _error("tells of another session than the other segments", file.name)
+            yield _error("belongs to another session than the other segments", file.name)
         segment, session = metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})
         if misplaced(file.series, file.number, segment, session):
-            yield _error("tells of another place in the session than its name does", file.name)
+            yield _error("records another place in the session than its name", file.name)
         if (salvage := metadata.get(SALVAGE_METADATA)) is not None:
             yield _note(f"was salvaged ({', '.join(f'{key}: {text}' for key, text in salvage.items())})", file.name)
 

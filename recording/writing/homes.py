@@ -125,7 +125,7 @@ class Homes:
         data = {"what": list(anew), "from_ns": from_ns, "to_ns": to_ns, "counts": counts, "reason": self._reason}
         lost = "".join(f", {counts[name]} {_UNITS[name]}" for name in counts)
         text = (
-            f"{self._reason}; {' and '.join(anew)} go on in a new place without what was recorded from "
+            f"{self._reason}; {' and '.join(anew)} continue in a new place without what was recorded from "
             f"{utc_text(from_ns)} to {utc_text(to_ns)}{lost}"
         )
         return Notice("error", "recording_lost", text, data)

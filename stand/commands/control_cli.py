@@ -65,7 +65,7 @@ def pause(directory: DirectoryArgument = None, config: ConfigOption = "simulated
     with one_line_errors():
         session, answer = _ask(directory, config, "pause")
         moving = cast("list[str]", answer.get("moving", []))
-        typer.echo(f"{session}: paused; `stand continue` goes on; {_moving(moving)}")
+        typer.echo(f"{session}: paused; `stand continue` ends the pause; {_moving(moving)}")
 
 
 @app.command("continue")
@@ -81,7 +81,7 @@ def continue_(directory: DirectoryArgument = None, config: ConfigOption = "simul
 
 @app.command()
 def clear(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
-    """Let a run that an interlock holds go on, after you have seen to the cause.
+    """Continue a run that an interlock holds, once you have removed the cause.
 
     Example: stand clear
     """
@@ -141,10 +141,10 @@ def _warning(found: RunStatus) -> str:
 
 
 def _still(answer: Mapping[str, object]) -> str:
-    """Whether the run goes on, and if not, what may be done about it."""
+    """Whether the run continues, and if not, what may be done about it."""
     reasons = cast("list[str]", answer.get("reasons", []))
     if not reasons:
-        return "the run goes on"
+        return "the run continues"
     remedies = {OPERATOR: "`stand continue` ends the pause", INTERLOCK: "`stand clear` once the cause is gone"}
     known = [remedies[reason] for reason in reasons if reason in remedies]
     return "; ".join([f"still held: {', '.join(reasons)}", *known])

@@ -73,7 +73,7 @@ def list_runs(config: ConfigOption = "simulated", out: OutOption = None, as_json
         if not found.entries:
             _say(f"{directory}: nothing is queued there")
         if found.halted:
-            _say(f"halted by {found.halted}; see to it, then `stand queue start --clear`")
+            _say(f"halted by {found.halted}; remove the cause, then `stand queue start --clear`")
 
 
 @app.command()
@@ -108,7 +108,7 @@ def start(
     virtual_time: Annotated[
         bool, typer.Option("--virtual-time", help="As fast as it goes, each with a simulated laboratory of its own.")
     ] = False,
-    clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="After a trip whose cause has been removed.")] = False,
     report: Annotated[bool, typer.Option("--report", help="As of `stand run`, after each run with a drift.")] = False,
 ) -> None:
     """Run what is queued, one after another, until nothing is left; what was interrupted is resumed first.

@@ -39,7 +39,7 @@ ReportOption = Annotated[
 ]
 
 AttendedOption = Annotated[
-    bool, typer.Option("--attended", help="Somebody is there: the run waits at each prompt until `stand continue`.")
+    bool, typer.Option("--attended", help="Wait at each prompt until an operator's `stand continue`.")
 ]
 
 
@@ -106,11 +106,11 @@ def resume_run(
     config: Annotated[
         str, typer.Option("--config", help="This stand's configuration: a file, or the name of an installed one.")
     ] = "simulated",
-    clear: Annotated[bool, typer.Option("--clear", help="The stand tripped, you have seen to it: go on.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="After a trip whose cause has been removed.")] = False,
     attended: AttendedOption = False,
     report: ReportOption = False,
 ) -> None:
-    """Go on with a run that was killed or interrupted, in its session: what is done is not done again.
+    """Resume a run that was killed or interrupted, in its session: what is done is not done again.
 
     Recipe, seed, target and camera settings are the session's; programs, files, addresses and limits are this stand's.
 

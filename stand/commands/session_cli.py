@@ -57,9 +57,7 @@ app = typer.Typer(
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a recorded session.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to make; it must not exist.")]
-IncompleteOption = Annotated[
-    bool, typer.Option("--incomplete", help="Use what is there of a session of which something is missing.")
-]
+IncompleteOption = Annotated[bool, typer.Option("--incomplete", help="Use a session although part of it is missing.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
 
 
@@ -149,7 +147,7 @@ def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
     help_text = f"`stand session salvage {directory}`"
     growing = [file.name for file in files if file.state is State.RECORDING]
     if growing:
-        _warn(f"{directory}: is being recorded; without what is not finished yet: {', '.join(growing)}")
+        _warn(f"{directory}: is being recorded; left out because they are not finished yet: {', '.join(growing)}")
     try:
         session = Session.open(directory)
         check_whole(session, _warn if incomplete else None)

@@ -119,9 +119,9 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
         yield from _row(
             "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {told('clock_source', '?')} clock"
         )
-    ending = "the recording does not tell" if found.ending is None else found.ending.text
+    ending = "not recorded" if found.ending is None else found.ending.text
     yield from _row("ended", ending)
-    yield from _row("operator", told("operator", "") or "not told")
+    yield from _row("operator", told("operator", "") or "not named")
     yield from _row("camera", told("camera_serial", "?") + (f"; {seen.lacks}" if seen.lacks else ""))
     host = f", host {told('host')}" if told("host") else ""
     yield from _row("software", f"thermostand {told('software_version', '?')}{host}")

@@ -45,7 +45,7 @@ def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
         raise ValueError(f"{name}: {_package(point)} makes no steps of these ({_told(error)})") from error
     faults = (f"step {number} {fault}" for number, step in enumerate(steps) if (fault := _fault(step)))
     if fault := next(faults, ""):
-        raise ValueError(f"{name}: {_package(point)} makes what cannot be done: {fault}; correct the package")
+        raise ValueError(f"{name}: {_package(point)} makes a step that cannot be done: {fault}; correct the package")
     return cast("tuple[Step, ...]", steps)
 
 

@@ -114,7 +114,7 @@ class CameraSupply:
         equilibrium; event `camera_supply_off`."""
         if self.is_on and not coils.get(CAMERA_POWER, True):
             self.is_on = False
-            text = "the camera's supply is off though it was switched on: a brown-out of the relay board, or a hand"
+            text = "the camera's supply is off though it was switched on: a brown-out of the relay board, or a person"
             self._hub.publish(Event(self._clock.now_ns(), "error", "camera_supply_off", text))
             self.equilibrium.lose(text)
 

@@ -117,7 +117,7 @@ class CameraEquilibrium:
         known = not math.isnan(rate_K_per_min)
         data = {"soaked_s": soaked_s, "rate_K_per_min": rate_K_per_min if known else None}
         how = f"moves by up to {rate_K_per_min:.3f} K/min" if known else "is known at times only"
-        text = f"the camera is not in equilibrium after {soaked_s / 60:.0f} min: its temperature {how}; waiting on"
+        text = f"the camera is not in equilibrium after {soaked_s / 60:.0f} min: its temperature {how}; still waiting"
         self._hub.publish(Event(now_ns, "warning", "camera_equilibrium_late", text, data))
 
     def _receive(self, item: Item) -> None:

@@ -79,7 +79,7 @@ def take(directory: Path, now_ns: int) -> Entry | None:
     with changing(directory) as draft:
         queue = draft.queue
         if queue.halted:
-            remedy = "see to it, then `stand queue start --clear`"
+            remedy = "remove the cause, then `stand queue start --clear`"
             raise StandTripped(f"{directory}: the queue was halted: {queue.halted}; {remedy}")
         running = next((entry for entry in queue.entries if entry.state is State.RUNNING), None)
         if running is not None:

@@ -132,7 +132,7 @@ def working(directory: Path) -> Generator[None]:
     with _opened(directory / _WORKER_NAME) as worker:
         with _locked(directory):  # whoever only looks if the queue is worked does so inside the same lock
             if not _try_lock(worker):
-                raise SessionError(f"{directory}: its queue is being worked already")
+                raise SessionError(f"{directory}: another process is running its queue already")
             found = _load(directory)
             if _running(found):
                 _store(directory, _interrupted(found))

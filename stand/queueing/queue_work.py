@@ -73,7 +73,7 @@ class _Run:
     async def perform(self, run_one: RunOne) -> None:
         """Run it, or go on with it; raises what ends the work."""
         entry = self._entry
-        self._tell(f"{self._name} " + (f"goes on in {entry.session}" if entry.session else "begins"))
+        self._tell(f"{self._name} " + (f"is resumed in {entry.session}" if entry.session else "begins"))
         try:
             session = await run_one(entry, Notes(self._note_session, self._note_step))
         except (Interrupted, InUse, asyncio.CancelledError) as error:

@@ -272,8 +272,8 @@ def worth_of_soaks(state: RunState, set_up: SetUp, around: Surroundings) -> Wort
     if not begun or set_up.chamber_degC is None:
         return Worth()
     if state.is_cold and set_up.camera_on:
-        return Worth("soak_restarted", "the camera was or may have been off; it soaks anew", begun)
+        return Worth("soak_restarted", "the camera was or may have been off; the soak is restarted", begun)
     text = f"the chamber is at {around.pv_degC:.2f} degC, {{}}within {CREDITED_WITHIN_K:g} K of its set-point"
     if abs(around.pv_degC - set_up.chamber_degC) <= CREDITED_WITHIN_K:
         return Worth("soak_credited", text.format(""))
-    return Worth("soak_restarted", text.format("not ") + "; it soaks anew", begun)
+    return Worth("soak_restarted", text.format("not ") + "; the soak is restarted", begun)

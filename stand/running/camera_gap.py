@@ -141,7 +141,7 @@ def doubt(before: CameraBefore, boot_id: str | None, was_supplied: bool | None, 
     if not was_supplied:
         return "its supply was found off after the gap"
     if boot_id is not None and (not boot_id or boot_id != before.boot_id):
-        return "the host has been started anew since, maybe after a power cut"
+        return "the host has restarted since, maybe after a power cut"
     if reading is not None and reading.quality is Quality.GOOD and before.last is not None:
         change_K = reading.value - before.last.camera_degC
         if abs(change_K) > _SAME_K:

@@ -202,7 +202,7 @@ async def _answer(work: GuardedRun, board: StatusBoard, log: Logbook) -> None:
         async with serve(work.recorder.directory, work.order.config.name, table):
             await asyncio.Event().wait()
     except SessionError as error:
-        log.tell("warning", "no_control", f"the run cannot be asked or paused: {error}")
+        log.tell("warning", "no_control", f"the run cannot be queried or paused: {error}")
         await asyncio.Event().wait()
 
 
@@ -230,7 +230,7 @@ def _tell_interruption(work: GuardedRun, before: Interruption, log: Logbook) -> 
     log.tell(
         "info",
         "run.resume",
-        f"recipe {before.order.recipe.name} goes on, {done}; thermostand {version}",
+        f"recipe {before.order.recipe.name} is resumed, {done}; thermostand {version}",
         _begin_data(work, before.state),
     )
 

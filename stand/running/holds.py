@@ -77,5 +77,5 @@ async def end_endless_holds(gate: Gate, clock: Clock, limit_h: float) -> None:
         ends_ns = since_ns + seconds_ns(3600.0 * limit_h)
         if clock.now_ns() >= ends_ns:
             reasons = ", ".join(sorted(gate.reasons))
-            raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody let it go on")
+            raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody continued it")
         await clock.sleep_until(ends_ns)

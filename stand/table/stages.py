@@ -52,7 +52,7 @@ class Table:
     async def approach_again(self) -> None:
         """Before frames: approach again, from below, each stage whose motor has been switched off since its move."""
         self._interlock.check()
-        with self._motions.under_way("stages", "back to where the plan put them, should they stand elsewhere"):
+        with self._motions.under_way("stages", "back to the plan's positions, where they are elsewhere"):
             await ready(self._axes, self._commanded, self._hub, self._clock)
 
     def _axis(self, axis: str) -> Axis:

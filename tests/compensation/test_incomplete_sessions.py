@@ -36,7 +36,7 @@ def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path
     status, said = ask("detect", holed, "-o", out)
     assert status == 1
     assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in said
-    assert "frames that are described); with --incomplete what is there is used" in said
+    assert "frames that are described); use --incomplete to read the rest" in said
     assert not out.exists()
     status, said = ask("detect", holed, "-o", out, "--incomplete")
     assert status == 0
@@ -58,7 +58,7 @@ def test_each_command_refuses_it_with_the_same_sentence(holed: Path, tmp_path: P
     status, said = ask(*(text.format(session=holed, out=out) for text in command))
     assert status == 1
     assert said.startswith(f"error: {holed}: is incomplete; missing: frames/0000.mcap (to ")
-    assert said.endswith("with --incomplete what is there is used")
+    assert said.endswith("use --incomplete to read the rest")
     assert not out.exists()
     _, said = ask(*(text.format(session=holed, out=out) for text in command), "--incomplete")
     assert said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap (to ")
@@ -73,7 +73,7 @@ def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded,
         out = tmp_path / "out"
         status, said = ask("apply", model, *source, "-o", out)
         assert status == 1
-        assert said.endswith("with --incomplete what is there is used")
+        assert said.endswith("use --incomplete to read the rest")
         assert not out.exists()
     status, said = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")
     assert (status, said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap")) == (0, True)

@@ -115,7 +115,7 @@ def test_frames_of_a_capture_that_was_begun_anew_do_not_count(tmp_path: Path):
     asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))
     session = Session.open(tmp_path / "night")
     seen = observe_session(session, session_target(session))
-    assert seen.reasons == ("", "its capture was begun anew", "", "")
+    assert seen.reasons == ("", "its capture was restarted", "", "")
     assert np.isnan(seen.centres_px[1]).all()
 
 

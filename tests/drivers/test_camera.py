@@ -99,7 +99,7 @@ def test_settings_no_camera_could_take_are_refused_at_once(changes: dict[str, ob
     ],
 )
 def test_a_temperature_is_one_place(changes: dict[str, object]):
-    with pytest.raises(ValueError, match=r"one of them|go together"):
+    with pytest.raises(ValueError, match=r"exactly one of|go together"):
         TemperatureFeature.model_validate(changes)
 
 

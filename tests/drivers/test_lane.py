@@ -70,7 +70,7 @@ async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goe
     waiting = asyncio.create_task(lane.call(int))
     await asyncio.sleep(0)
     lane.abandon()
-    with pytest.raises(TimeoutError, match="test has not answered and is waited for no longer"):
+    with pytest.raises(TimeoutError, match="test has not answered; no longer waiting for it"):
         await waiting
     with pytest.raises(TimeoutError):
         await lane.call(int)

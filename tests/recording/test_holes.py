@@ -66,10 +66,10 @@ def refused(directory):
     said = []
     open_whole(directory, said.append)
     (text,) = said
-    sentence = text.removesuffix("; only what is there is used")
+    sentence = text.removesuffix("; only the rest is used")
     with pytest.raises(SessionError) as raised:
         open_whole(directory)
-    assert str(raised.value) == f"{sentence}; with --incomplete what is there is used"
+    assert str(raised.value) == f"{sentence}; use --incomplete to read the rest"
     return sentence
 
 
@@ -138,7 +138,7 @@ async def test_what_was_recorded_after_a_resumption_and_is_gone_is_missed(tmp_pa
         {"entry": "Ended", "time_ns": after_ns + NS_PER_S, "status": "complete", "text": "complete"},
     )
     assert words(directory) == (Run.COMPLETE, Files.INCOMPLETE)
-    assert any("says that the run went on at 2026-01-01 19:00:00 UTC" in text for text in errors(directory))
+    assert any("says that the run was resumed at 2026-01-01 19:00:00 UTC" in text for text in errors(directory))
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ def test_of_a_later_format_it_is_unknown_whether_everything_is_there(session):
     assert found.files is seen.state is Files.UNKNOWN
     assert not found.is_sound
     assert "is of format '3'; this version of thermostand reads up to 2" in seen.state_text
-    assert "what is new in that was not checked" in str(found.findings[0])
+    assert "what that format adds was not checked" in str(found.findings[0])
 
 
 def test_a_field_that_this_version_does_not_know_is_named(session):

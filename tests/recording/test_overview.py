@@ -133,7 +133,8 @@ async def test_a_session_without_telemetry_is_not_complete(session):
         path.rename(path.with_name(f"{path.name}.damaged"))
     kept = len(list((session / "telemetry").iterdir()))
     assert glance(session).state_text == (
-        f"damaged: telemetry/0000.mcap.damaged: is what a salvage could not recover all of and {kept - 1} more"
+        "damaged: telemetry/0000.mcap.damaged: is an original that a salvage could not recover completely "
+        f"and {kept - 1} more"
     )
     shutil.rmtree(session / "telemetry")
     assert glance(session).state_text == "incomplete: telemetry is missing"
@@ -158,7 +159,7 @@ async def test_what_a_salvage_kept_and_what_is_no_segment(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
     (session / "frames" / "notes.txt").write_text("a cloudy night")
     assert glance(session).state_text == (
-        "damaged: frames/0000.2.mcap.damaged: is what a salvage could not recover all of"
+        "damaged: frames/0000.2.mcap.damaged: is an original that a salvage could not recover completely"
     )
 
 

@@ -300,7 +300,7 @@ def attachment_without_end(records):
     [
         (value_beside_a_bad_quality, r"thermometers\.air: the recorded value 20\.0 does not fit its quality 3"),
         (unknown_quality, "does not fit its quality 9"),
-        (message_removed, r"0000\.mcap: damaged .*it does not hold the messages its index tells of"),
+        (message_removed, r"0000\.mcap: damaged .*it does not hold the messages that its index lists"),
         (attachment_without_end, r"0000\.mcap: damaged .*OverflowError"),
     ],
 )

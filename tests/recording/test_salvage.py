@@ -177,7 +177,7 @@ def test_without_a_sibling_the_channels_stay_unknown_and_the_original_is_kept(tm
     part.write_bytes(hole(written.opening_bytes, written.opening_bytes + 100)(written.data))
     (done,) = salvage_session(tmp_path)
     assert (done.path, done.messages, done.kept) == (None, 0, tmp_path / TELEMETRY / "0000.mcap.damaged")
-    assert "messages are of channels no segment tells of" in done.reason
+    assert "messages are of channels that no segment describes" in done.reason
 
 
 def test_without_a_sibling_a_lost_session_is_not_guessed(tmp_path):
@@ -185,7 +185,7 @@ def test_without_a_sibling_a_lost_session_is_not_guessed(tmp_path):
     (tmp_path / TELEMETRY / "0000.mcap.part").write_bytes(hole(0, written.opening_bytes)(written.data))
     (done,) = salvage_session(tmp_path)
     assert (done.path, done.kept) == (None, tmp_path / TELEMETRY / "0000.mcap.damaged")
-    assert "no segment tells which session it belongs to" in done.reason
+    assert "no segment records which session it belongs to" in done.reason
 
 
 def test_the_other_series_tells_the_session(tmp_path):

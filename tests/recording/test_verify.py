@@ -300,7 +300,7 @@ async def test_a_session_without_telemetry_is_told_so(session):
 
 async def test_a_segment_of_another_place_is_told(session):
     shutil.copy(session / "frames" / "0001.mcap", session / "frames" / "0002.mcap")
-    assert "error: frames/0002.mcap: tells of another place in the session than its name does" in errors(session)
+    assert "error: frames/0002.mcap: records another place in the session than its name" in errors(session)
 
 
 async def test_losses_the_recording_tells_of_are_notes(tmp_path):
@@ -388,4 +388,4 @@ async def test_a_segment_of_another_session_is_told(session, tmp_path):
     other = await recorded(tmp_path / "other")
     data = (other / "frames" / "0001.mcap").read_bytes().replace(b"night-1", b"night-2")
     (session / "frames" / "0001.mcap").write_bytes(data)
-    assert "error: frames/0001.mcap: tells of another session than the other segments" in errors(session)
+    assert "error: frames/0001.mcap: belongs to another session than the other segments" in errors(session)

@@ -53,7 +53,7 @@ def test_a_step_is_recorded_with_both_offsets_and_both_instants():
         "utc_ns": begin_ns + NS_PER_S + seconds_ns(3600),
     }
     assert event.text == (
-        "the system clock went +3600.000 s against the stand's clock, which goes on as it was; UTC is now "
+        "the system clock moved +3600.000 s against the stand's clock, which is not changed; UTC is now "
         "+3600.000 s from recorded instants"
     )
     watched.host.step(-3600)

@@ -102,7 +102,7 @@ def test_what_uses_all_of_it_refuses_it_with_a_sentence(holed: Path, tmp_path: P
         f"error: {holed}: is incomplete; missing: telemetry/0001.mcap to 0002.mcap (from 2026-01-01 18:00:02 to "
         "2026-01-01 18:00:11 UTC, 8 frames without their descriptions); frames/0003.mcap (from 2026-01-01 18:00:11 to "
         "2026-01-01 18:00:16 UTC, 4 frames that are described); 16 of the 20 frames of the plan are there; "
-        "with --incomplete what is there is used"
+        "use --incomplete to read the rest"
     )
     assert not (tmp_path / "new").exists()
 

@@ -85,8 +85,8 @@ async def test_a_camera_that_goes_on_moving_is_told_and_waited_for():
         (True, None, 40.3, "", ""),  # virtual time has no host that is started
         (False, "a", 40.0, "", "its supply was found off"),
         (None, "a", 40.0, "", "its supply was found off"),
-        (True, "b", 40.0, "", "the host has been started anew"),
-        (True, "", 40.0, "", "the host has been started anew"),
+        (True, "b", 40.0, "", "the host has restarted"),
+        (True, "", 40.0, "", "the host has restarted"),
         (True, "a", 38.5, "", "it is -1.5 K from its last temperature"),
         (True, "a", 40.0, "its equilibrium had been lost before", "its equilibrium had been lost before"),
     ],

@@ -46,7 +46,7 @@ def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):
         assert process.stdout.readline() == "importing\n"
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
-        assert process.stderr.read() == "interrupted; nothing was begun\n"
+        assert process.stderr.read() == "interrupted; nothing was started\n"
 
 
 def test_an_unknown_command_is_told_with_the_nearest_one():

@@ -51,7 +51,7 @@ def test_what_has_ended_and_why_nothing_is_begun_are_listed(tmp_path: Path):
     result = invoke(tmp_path, "list")
     assert "2:05:00" in result.stdout
     assert result.stdout.rstrip().endswith("too\\nwarm")
-    assert result.stderr == "halted by run 1: too\\nwarm; see to it, then `stand queue start --clear`\n"
+    assert result.stderr == "halted by run 1: too\\nwarm; remove the cause, then `stand queue start --clear`\n"
     invoke(tmp_path, "add", "demo")
     refused = invoke(tmp_path, "start", "--virtual-time")
     assert refused.exit_code == 1

@@ -199,7 +199,7 @@ def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
     with working(tmp_path):
         queue.take(tmp_path, 2)
         queue.finish(tmp_path, 1, State.FAILED, 3, "air is too warm", halt=True)
-        with pytest.raises(StandTripped, match=r"halted: run 1: air is too warm; see to it"):
+        with pytest.raises(StandTripped, match=r"halted: run 1: air is too warm; remove the cause"):
             queue.take(tmp_path, 4)
         assert states(tmp_path) == [(1, "failed"), (2, "waiting")]
         queue.clear(tmp_path)
@@ -207,7 +207,11 @@ def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
 
 
 def test_only_one_works_a_queue(tmp_path: Path):
-    with working(tmp_path), pytest.raises(SessionError, match="its queue is being worked already"), working(tmp_path):
+    with (
+        working(tmp_path),
+        pytest.raises(SessionError, match="another process is running its queue already"),
+        working(tmp_path),
+    ):
         pass
     with working(tmp_path):
         pass

@@ -124,7 +124,7 @@ async def test_a_run_that_an_operator_stops_is_resumed_first_next_time(tmp_path:
     queue.remove(tmp_path, 3)
     await runs.work()
     assert runs.seen == [(1, ""), (1, "session-1"), (2, "")]
-    assert runs.lines[2] == "run 1 (warm-up) goes on in session-1"
+    assert runs.lines[2] == "run 1 (warm-up) is resumed in session-1"
     assert [entry[0] for entry in runs.entries()] == ["done", "done"]
 
 
@@ -145,7 +145,7 @@ async def test_a_queue_that_cannot_be_noted_in_does_not_end_a_run(tmp_path: Path
 
 async def test_a_second_worker_is_refused(tmp_path: Path):
     runs = Runs(tmp_path, None)
-    with working(tmp_path), pytest.raises(SessionError, match="being worked already"):
+    with working(tmp_path), pytest.raises(SessionError, match="is running its queue already"):
         await runs.work()
 
 

@@ -123,7 +123,7 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
         "files sound",
         "recipe thermal_cycle",
         "recorded 2026-01-01 18:00:00 to 2026-01-01 18:00:05 UTC, 5.5 s, wall clock",
-        "ended the recording does not tell",
+        "ended not recorded",
         "operator M. Adamczyk",
         "camera DA1234567",
         "software thermostand 0.1.0, host laboratory",
@@ -319,7 +319,9 @@ def test_of_a_session_being_recorded_what_is_finished_is_used(session: Path, tmp
     with part.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         result = ask(command, session, option, tmp_path / "new", *speed)
-    warning = f"warning: {session}: is being recorded; without what is not finished yet: frames/0002.mcap.part"
+    warning = (
+        f"warning: {session}: is being recorded; left out because they are not finished yet: frames/0002.mcap.part"
+    )
     assert warning in result.stderr.splitlines()
     assert (tmp_path / "new").is_dir()
 

@@ -165,4 +165,4 @@ def test_ctrl_c_while_the_commands_are_imported_ends_with_a_line(tmp_path: Path)
         assert process.stdout.readline() == "importing\n"
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
-        assert process.stderr.read() == "interrupted; nothing was begun\n"
+        assert process.stderr.read() == "interrupted; nothing was started\n"

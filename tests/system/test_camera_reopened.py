@@ -58,5 +58,5 @@ async def test_a_camera_that_started_anew_by_itself_in_a_soak_is_soaked_anew(
         await happens(watcher, "camera_equilibrium_lost")
         await happens(watcher, "camera_back")
         (lost,) = [event for event in watcher.events if event.kind == "camera_equilibrium_lost"]
-        assert "has started anew" in lost.data["reason"]
+        assert "has restarted" in lost.data["reason"]
         await happens(watcher, "restored")  # the run goes on; the soak that follows waits for the equilibrium

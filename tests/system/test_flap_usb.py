@@ -80,7 +80,7 @@ async def test_another_controller_that_keeps_its_serial_number_to_itself_does_no
     for _ in range(2):
         with pytest.raises(Unreachable):
             await bench.flap.read()
-    with pytest.raises(Unreachable, match=r"only one that does not tell its own \(.*Pipe error"):
+    with pytest.raises(Unreachable, match=r"only one that does not report its own \(.*Pipe error"):
         await bench.flap.read()
 
 

@@ -146,7 +146,7 @@ async def test_an_error_of_the_drive_ends_the_move_and_stays_in_the_readings(
         await asyncio.gather(flap.move_open(), bench.after(0.5, strike))
     position = await bench.position()
     assert (position.quality, position.value) == (Quality.STALE, pytest.approx(0.5, abs=0.001))
-    assert position.reason == f"the motor is without force: {names}"
+    assert position.reason == f"the motor is not driven: {names}"
     with pytest.raises(DeviceFault, match=names):
         await flap.make_safe()
 
@@ -158,7 +158,7 @@ async def test_when_the_cause_is_gone_the_flap_closes_though_the_error_is_latche
     await flap.move_open()
     bench.fake.active_errors = bits
     bench.fake.active_errors = 0
-    assert (await bench.position()).reason == f"the motor is without force: {names}"
+    assert (await bench.position()).reason == f"the motor is not driven: {names}"
     await flap.make_safe()
     assert bench.openness == 0
     assert (await bench.position()).quality is Quality.GOOD
@@ -195,7 +195,7 @@ async def test_a_restart_while_open_shows_in_the_readings_and_closing_works(benc
     bench.fake.restart()
     position = await bench.position()
     assert (position.value, position.quality) == (1.0, Quality.STALE)
-    assert position.reason == "the motor is without force: awaiting command"
+    assert position.reason == "the motor is not driven: awaiting command"
     await flap.make_safe()
     assert bench.openness == 0
     assert (await bench.position()).quality is Quality.GOOD
@@ -232,7 +232,7 @@ async def test_make_safe_turns_an_opening_flap_round(bench: Bench, flap: Flap) -
     opening = asyncio.create_task(flap.move_open())
     await bench.after(0.5, flap.make_safe)
     assert bench.openness == 0
-    with pytest.raises(Superseded, match=r"^flap: a newer command, or making safe, has taken over"):
+    with pytest.raises(Superseded, match=r"^flap: superseded by a newer command or by making safe"):
         await opening
     assert bench.fake.targets == [3500, 500]
 

@@ -52,7 +52,7 @@ def kill_at_once(directory: Path) -> None:
     """Start the queue and kill it when it has told that its run goes on."""
     with subprocess.Popen([*COMMAND, str(directory)], stderr=subprocess.PIPE, text=True) as daemon:
         assert daemon.stderr is not None
-        assert "goes on in" in daemon.stderr.readline()
+        assert "is resumed in" in daemon.stderr.readline()
         daemon.kill()
 
 
@@ -73,7 +73,7 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
 
     ended = subprocess.run([*COMMAND, str(out), "--report"], capture_output=True, text=True, check=False, timeout=300)
     assert ended.returncode == 0, ended.stderr
-    assert f"run 1 (queued) goes on in {first.session}" in ended.stderr
+    assert f"run 1 (queued) is resumed in {first.session}" in ended.stderr
     entries = queue.queued(out).entries
     assert [(entry.state, entry.reason) for entry in entries] == [("done", ""), ("done", "")]
     for entry in entries:

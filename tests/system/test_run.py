@@ -296,7 +296,7 @@ async def test_a_virtual_run_whose_disk_never_takes_frames_ends_with_a_sentence(
     tmp_path: Path, order: Callable[..., Order]
 ):
     watch = refusing_from_the_first_capture(until=lambda item: False)
-    with pytest.raises(StandError, match=r"held for 1 h of virtual time .*, and nobody let it go on"):
+    with pytest.raises(StandError, match=r"held for 1 h of virtual time .*, and nobody continued it"):
         await run_virtual(order(camera=WHOLE_SENSOR, guard={"pause_limit_h": 0.5}), tmp_path / "out", None, watch)
     session = Session.open(next((tmp_path / "out").iterdir()))
     assert session.frame_count == 0

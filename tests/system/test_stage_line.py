@@ -193,7 +193,7 @@ async def test_make_safe_stops_a_running_move_and_the_move_says_so(bench: Bench)
     stopped = bench.mechanical
     assert 10 < stopped < 13.5
     assert (await axis.read())[1].value == 0
-    with pytest.raises(Superseded, match=r"^linear: a newer command, or making safe, has taken over"):
+    with pytest.raises(Superseded, match=r"^linear: superseded by a newer command or by making safe"):
         await move
     await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(10.0))
     assert bench.mechanical == stopped
