@@ -28,7 +28,7 @@ SETTLED_TAUS = 3.0
 _COLD_K = 3.0
 """A camera this close to the air around it has been off for long: nothing of it is warm."""
 _UNPOWERED_TAU_S = 900.0
-"""An unpowered camera tells no temperature; its excess over the air is taken to decay like this until it does again."""
+"""An unpowered camera reports no temperature; its excess over the air is assumed to decay so until it does."""
 _SPAN_K, _MARGIN, _HULL_MARGIN_PX, _SWITCHED_ON_S = 20.0, 0.02, 1.0, 1.0
 
 
@@ -55,7 +55,7 @@ class ThermalState:
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them
-        powered; at their end the camera tells its temperature (NaN: it does not). An ambient of NaN is a gap."""
+        powered; at their end the camera has this temperature (NaN: unknown). An ambient of NaN is a gap."""
         if math.isnan(ambient_degC) or math.isnan(power_on):
             self.begun = False
             return

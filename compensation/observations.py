@@ -116,11 +116,11 @@ def session_target(session: Session) -> Target:
 
 
 def session_noise(session: Session) -> Noise | None:
-    """The camera's noise, from the first frames; None when they do not tell."""
+    """The camera's noise, from the first frames; None when they do not determine it."""
     try:
         others = others_ns(session)
         first = list(islice((each for each in session.frames() if each.time_ns not in others), _NOISE_FRAMES))
-    except SessionError:  # the search for the markers comes to the same frame, and tells where it is
+    except SessionError:  # the search for the markers comes to the same frame, and reports where it is
         return None
     partial = [frame.windows for frame in first if frame.windows is not None]
     return estimate_noise([frame.image for frame in first if frame.image.ndim == 2], partial[-1] if partial else None)
@@ -151,7 +151,7 @@ def observe_session(
 
 
 def read_frames(session: Session) -> Iterator[Frame]:
-    """The session's frames in order; the SessionError of one that cannot be read tells which it is."""
+    """The session's frames in order; the SessionError of one that cannot be read names it."""
     done = 0
     try:
         for frame in session.frames():

@@ -53,7 +53,7 @@ class EquilibriumSettings(Document):
 
 
 class CameraSettings(Polled):
-    """What the stand asks of a camera, whatever its protocol (a file in drivers/devices), and where it is found.
+    """What the stand asks of a camera of any protocol (a file in drivers/devices), and where it is found.
 
     serial_number: refused when another camera answers; none takes any. width_px, height_px: from the sensor's first
     pixel; none the whole sensor. trigger: one frame per software trigger, or frames at frame_rate_hz all the time

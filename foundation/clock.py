@@ -166,7 +166,7 @@ class FollowedClock:
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
-        """The last time it was told."""
+        """The last time it was given."""
         return self._now_ns
 
     def follow(self, time_ns: int) -> None:
@@ -183,7 +183,7 @@ class VirtualClock:
     one before set in motion has come to rest. So a run is repeatable to the byte, however the host schedules threads.
     There is one such clock to an event loop: two would each wait for the other to have nothing to run.
 
-    When time moves, `advance(time_ns)` tells the simulator and waits for its answer before anybody is woken. The new
+    When time moves, `advance(time_ns)` informs the simulator and waits for its answer before anybody is woken. The new
     time holds from then on: what comes from outside meanwhile, such as a signal, must not date what it does to the
     simulator before it, or the time between would seem to have passed without effect.
     """
@@ -220,7 +220,7 @@ class VirtualClock:
             self._changed.set()
 
     async def run(self) -> None:
-        """Drive time until cancelled; run it as a task beside whatever sleeps on this clock."""
+        """Drive time until cancelled; run it as a task beside the tasks that sleep on this clock."""
         while True:
             await self._rest()
             deadline_ns, _, future = heapq.heappop(self._sleepers)

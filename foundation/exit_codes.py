@@ -25,7 +25,7 @@ def one_line_errors() -> Generator[None]:
     except ConfigError as error:
         tell(error)
         raise typer.Exit(BAD_INPUT) from error
-    except BrokenPipeError:  # whoever reads our output has enough; typer ends quietly
+    except BrokenPipeError:  # the reader of our output has closed it; typer ends quietly
         raise
     except (StandError, OSError) as error:
         tell(error)

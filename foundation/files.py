@@ -15,8 +15,8 @@ from foundation.errors import SessionError
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """`data` as the file `path`, whole and on the disk when this returns, whoever else writes one of the same name at
-    the same time; its folder is made. Raises OSError, and then whatever was there before still is."""
+    """`data` as the file `path`, complete and on the disk when this returns, also when others write one of that name at
+    the same time; its folder is made. Raises OSError, and then a file that was there before is unchanged."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
     try:
@@ -68,7 +68,7 @@ def whole_file(path: Path) -> Generator[TextIO]:
 
 
 def check_writable(path: Path) -> None:
-    """SessionError when nothing could be written to `path`: to be told before the work, not after it."""
+    """SessionError when nothing could be written to `path`: to be raised before the work, not after it."""
     _check_place(path)
     _temporary(path).unlink()
 
@@ -83,7 +83,7 @@ def make_folder(path: Path) -> None:
 
 def check_folder_writable(path: Path, names: Iterable[str]) -> None:
     """SessionError when files of these names could not be written into the folder, which need not be there yet: to be
-    told before the work. Nothing is made."""
+    raised before the work. Nothing is made."""
     if path.is_dir():
         for name in names:
             check_writable(path / name)

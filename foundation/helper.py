@@ -40,9 +40,9 @@ class Line:
         return self._asked(Request(method, args, name))
 
     def close(self) -> None:
-        """No more requests; the one under way goes on to its end."""
+        """No more requests; the one under way is completed."""
         with suppress(OSError):
-            self._connection.shutdown(socket.SHUT_RDWR)  # wakes whoever waits for an answer
+            self._connection.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for an answer
         self._connection.close()
 
     def _asked(self, request: Request) -> Any:
@@ -75,7 +75,7 @@ class Helper:
                 pass_fds=numbers,
                 start_new_session=True,
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,  # whoever reads what the daemon says need not wait for this one
+                stdout=subprocess.DEVNULL,  # the daemon's readers need not wait for this one
                 stderr=subprocess.DEVNULL,
             )
         except BaseException:

@@ -79,7 +79,7 @@ def answer(request: Request, kept: dict[str, object]) -> Answer:
             kept[request.keep] = result
             return Answer()
         return Answer(result)
-    except BaseException as error:  # noqa: BLE001 - whatever it is, the daemon is waiting for it
+    except BaseException as error:  # noqa: BLE001 - the daemon waits for any error
         return Answer(error=error)
 
 

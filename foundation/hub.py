@@ -13,7 +13,7 @@ Subscriber = Callable[[Item], None]
 class Hub:
     """Keeps the latest reading of each channel and hands each item to every subscriber, in order of subscription.
 
-    Subscribers must return at once (enqueue, count, compare); whoever does slow work has a queue of its own.
+    Subscribers must return at once (enqueue, count, compare); one that does slow work has a queue of its own.
     """
 
     def __init__(self) -> None:

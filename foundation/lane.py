@@ -25,7 +25,7 @@ class Lane:
 
     Several devices on one bus share one lane. A cancelled caller waits for the call under way to end (it is bounded
     by the wire's own time-out), so that no half transaction stays on the wire. Where nothing bounds a call (`patient`
-    false: a disk that hangs), a cancelled caller leaves at once and the call goes on. The thread never keeps the
+    false: a disk that hangs), a cancelled caller leaves at once and the call continues. The thread never keeps the
     process from ending.
 
     In virtual time nothing may happen meanwhile, so there is no thread to hand over to: the call is made at once, and
@@ -84,7 +84,7 @@ class Lane:
         def work() -> None:
             try:
                 settle = partial(_settled, future, function(*args))
-            except BaseException as error:  # noqa: BLE001 - whatever it is, the caller is waiting for it
+            except BaseException as error:  # noqa: BLE001 - the caller waits for any error
                 settle = partial(_failed, future, error)
             with suppress(RuntimeError):  # the loop has ended, and nobody waits any more
                 loop.call_soon_threadsafe(settle)

@@ -39,7 +39,7 @@ def progress(title: str, total: float) -> Generator[Report]:
 
 @contextmanager
 def unwatched(title: str, total: float) -> Generator[Report]:
-    """As `progress`, for whoever does not want to see any."""
+    """As `progress`, but shows nothing."""
     yield lambda done, text: None
 
 

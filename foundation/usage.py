@@ -18,7 +18,7 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
 
 
 class OneLineUsage(TyperGroup):
-    """Says what is wrong with the arguments in one line, as every other error is said; no arguments ask for help."""
+    """Says what is wrong with the arguments in one line, like all other errors; without arguments it shows the help."""
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **extra: Any) -> Any:
         """Parse the arguments."""

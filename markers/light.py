@@ -2,7 +2,7 @@
 
 Twelve parameters let the light slope otherwise on a disc than on the ground round it. Where it does, because light is
 scattered onto the image, fewer parameters put the centres wrong by twice the noise; where it does not, they cost 5 % of
-the accuracy, 7 % when blurred. All markers of a frame together tell how much the two slopes differ, beyond what noise
+the accuracy, 7 % when blurred. All markers of a frame together show how much the two slopes differ, beyond what noise
 explains; each marker's slopes are then pulled together as far as that allows, and the centre goes with them:
 
     r = low / high * slope(high) - slope(low)          DN per px, expected 0 +- w; w^2 = mean(r^2 - variance of r)
@@ -20,7 +20,7 @@ from markers.edge_fit import EdgeFit
 from markers.edge_model import B0, F0, PARAMETERS, EdgeState, Float
 
 _LEAST_MARKERS = 20
-"""So many tell w^2 to a quarter of the variance of r."""
+"""So many determine w^2 to a quarter of the variance of r."""
 _BELIEVED_CHI2, _DOUBTED_CHI2 = 2.0, 5.0
 """A marker whose slopes differ by more (chi^2 of two) is pulled less and less, and then stays as it is: faint glare
 that no flag shows would gain weight."""

@@ -34,11 +34,11 @@ BAND_SIGMA = 9.0
 """Half width of the fitted band in blurs."""
 LEAST_BAND_PX = 3.5
 CORE_SIGMA = 5.0
-"""The blurs from the outline within which a pixel tells where it is; the density is 1e-5 of its maximum beyond."""
+"""The blurs from the outline within which a pixel helps to locate it; the density is 1e-5 of its maximum beyond."""
 _BAND_TOLERANCE = 0.05
 _MOVE_TOLERANCE_SIGMA = 0.25
 _SLOPES_FROM_PX = 6.0
-"""Below this radius a plane and the edge cannot be told apart: ground and disc are then constant."""
+"""Below this radius a plane and the edge cannot be separated: ground and disc are then constant."""
 _PIXELS_PER_PARAMETER = 5
 _FAR_PX = 1.0
 _CONVERGED_PX = 2e-3

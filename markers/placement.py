@@ -86,7 +86,7 @@ def _settled(tables: list[Index], points: Float, target: Target) -> list[Index]:
 
 def _beyond(tables: list[Index], points: Float, target: Target) -> list[Index]:
     """The best table moved by up to two cells, where that finds as many markers: the growth may have missed a side of
-    the grid and gone on into clutter at the other.
+    the grid and continued into clutter at the other.
     """
     possible = _placed(_fullest(tables), points, target)
     if not possible:
@@ -127,7 +127,7 @@ def placement(candidate: Index, points: Float, target: Target) -> Placement:
 
 
 def settled(candidate: Index, points: Float, target: Target) -> Index:
-    """Each marker's candidate anew: the one nearest to where all others put it, -1 when none is near enough.
+    """Each marker's candidate chosen again: the one nearest to where all others put it, -1 when none is near enough.
 
     Clutter in line with the grid goes, and a marker that the growth did not reach comes.
     """

@@ -28,7 +28,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class OddMarker(Document):
-    """The one marker printed in another size, which tells which way up the target is."""
+    """The one marker printed in another size, which shows which way up the target is."""
 
     number: Annotated[int, Field(ge=1)]
     diameter_mm: Positive

@@ -46,7 +46,7 @@ class Assembly:
     bus: Bus
     devices: Devices
     stand: Stand
-    notifier: Notifier  # whoever is to be told when nobody is there
+    notifier: Notifier  # notifies people when nobody is at the stand
 
     def pollers(self) -> tuple[Poller, ...]:
         """One per device, in the order in which they are read when several are due at one instant."""

@@ -1,4 +1,4 @@
-"""Beside the pollers in real time: tells when the host's system clock parts from the stand's, and of a suspend."""
+"""Beside the pollers in real time: reports when the host's system clock departs from the stand's, and a suspend."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class ClockWatch:
     """Looks every second. An offset to UTC that is more than 1 s from the one recorded last is an event `clock_step`,
     whether the system clock was stepped or has drifted so far; more than 1 s of suspend is one `host_suspended`.
 
-    `recorded_ns`: the offset that the session has so far, of a run that goes on in it.
+    `recorded_ns`: the offset last recorded in the session, when a run is resumed.
     """
 
     def __init__(self, hub: Hub, clock: WallClock, recorded_ns: int = 0) -> None:

@@ -13,7 +13,7 @@ class Readings(Protocol):
     """What a rule may look at; the hub is one."""
 
     def latest(self, channel: str) -> Reading | None:
-        """The last reading, whatever its quality."""
+        """The last reading, of any quality."""
         ...
 
     def known(self, channel: str) -> Reading | None:

@@ -12,7 +12,7 @@ _CPU_FOLDER = "/sys/devices/system/cpu/cpu{}"
 
 @contextmanager
 def one_cpu() -> Generator[None]:
-    """Inside, this process and whatever it starts (the simulator) run on one of the CPUs they may use.
+    """Inside, this process and its children (the simulator) run on one of the CPUs they may use.
 
     In virtual time daemon and simulator take turns, a dozen in each polled second, and never work at once. On one CPU a
     turn is a switch of context; on two it is waking an idle CPU, which takes longer than the answer. Runs side by side

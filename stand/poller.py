@@ -22,8 +22,8 @@ _AGAIN_S = 1.0  # after a poll that failed on the wire
 class Poller:
     """Polls `sensor` every `period_s` (absolute deadlines) until cancelled; 1 s after a poll that failed on the wire.
 
-    `first()` must succeed before `run()`: what it returns tells which channels to declare BAD when a later read fails.
-    mark: what is published of the readings of a poll at an instant (ns); it may mark some as STALE.
+    `first()` must succeed before `run()`: what it returns defines which channels to declare BAD when a later read
+    fails. mark: what is published of the readings of a poll at an instant (ns); it may mark some as STALE.
     """
 
     sensor: Sensor

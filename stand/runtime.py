@@ -1,6 +1,6 @@
 """The runtime folder: control sockets and locks of the daemons that live now, on a memory file system.
 
-It is not on the sessions' disk, so that a daemon can be reached and told apart also when that disk hangs, and when a
+It is not on the sessions' disk, so that a daemon can be reached and identified also when that disk hangs, and when a
 session's folder was renamed or removed.
 """
 

@@ -60,7 +60,7 @@ class _Maker:
             self._task = asyncio.create_task(self._until_confirmed())
 
     def forgive(self) -> None:
-        """An operator has seen to it: what is not confirmed yet is tried no more."""
+        """An operator has taken over: what is not confirmed yet is tried no more."""
         if self._task is not None and self.confirmed < self.demanded:
             self._task.cancel()
         self.failure, self.begun, self.tried, self.confirmed = "", self.demanded, self.demanded, self.demanded
@@ -92,7 +92,7 @@ class _Maker:
                     await self._actuator.make_safe()
                 except (Unreachable, GarbledReply):
                     await self._actuator.make_safe()
-        except Exception as error:  # noqa: BLE001 - whatever one actuator does, it has to be tried again
+        except Exception as error:  # noqa: BLE001 - an actuator that fails in any way is tried again
             return f"{name} did not confirm its safe state: {str(error) or 'no answer in time'}"
         return ""
 
@@ -110,8 +110,8 @@ class _Maker:
 class Safety:
     """Brings every actuator it has taken to its safe state. `revoke` takes back every permission, at once.
 
-    It goes on until each has confirmed what was demanded last; `close` ends that. An actuator is taken when it has been
-    opened: a device that another run has open is not commanded.
+    It continues until each has confirmed what was demanded last; `close` ends that. An actuator is taken when it has
+    been opened: a device that another run has open is not commanded.
     """
 
     def __init__(self, revoke: Callable[[], None], hub: Hub, clock: Clock) -> None:
@@ -165,7 +165,7 @@ class Safety:
         self._on_change()
 
     async def tried(self) -> None:
-        """Return when every actuator has been tried once since the last demand, whatever came of it."""
+        """Return when every actuator has been tried once since the last demand, with or without success."""
         while any(maker.tried < maker.demanded for maker in self._makers):
             await self._changed.wait()
 

@@ -26,8 +26,8 @@ def report_session(session: Path, folder: Path) -> list[str]:
     """Fit and report a session into `folder`; the lines to show: the table beside the paper's and where the files are.
     Without reference and fit frames there is a report of the drift, and no model.
 
-    The session's own folder will do: whatever reads a session looks only at what a run has left there. NotReported when
-    the frames do not allow it or a file cannot be written; what was recorded is as it was.
+    The session's own folder will do: readers of a session look only at the files that a run has left there. NotReported
+    when the frames do not allow it or a file cannot be written; what was recorded is as it was.
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
     from compensation.drift.evaluation import table

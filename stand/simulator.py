@@ -23,7 +23,7 @@ _FREE_TCP, _FREE_SERIAL = "tcp:127.0.0.1:0", "serial:"
 def laboratory_of(
     config: StandConfig, *, virtual: bool, seed: int | None, start_ns: int | None = None, is_anywhere: bool = False
 ) -> dict[str, object]:
-    """What the simulator is told: which fake answers where, or `is_anywhere`: each at a free address of the same kind.
+    """The simulator's description: which fake answers where, or `is_anywhere`: each at a free address of the same kind.
     ConfigError when the stand is not a simulated one.
 
     start_ns: the first instant in virtual time, else the configured one.

@@ -21,7 +21,7 @@ Form = Literal["tiff", "png"]
 
 def corrected_image(image: Image, model: DriftModel, states: States) -> NDArray[np.float32]:
     """The grey image (height, width) at the reference, float32, for one thermal state; SessionError when it is not of
-    the model's size, or when the state does not tell the drift."""
+    the model's size, or when the state does not determine the drift."""
     height, width = image.shape
     own_width, own_height = model.facts.image_size
     if (width, height) != (own_width, own_height):

@@ -1,6 +1,6 @@
 """The pinhole in the files of other programs. All of them put integer coordinates at pixel centres, as we do.
 
-Kalibr's radtan has no k3: the camera is fitted anew without it, and how far the two differ is told.
+Kalibr's radtan has no k3: the camera is fitted again without it, and the difference is reported.
 """
 
 from __future__ import annotations

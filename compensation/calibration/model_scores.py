@@ -1,4 +1,4 @@
-"""Models told apart by what they were not fitted to: positions held out, and the two halves of a session."""
+"""Models compared on data they were not fitted to: positions held out, and the two halves of a session."""
 
 from __future__ import annotations
 

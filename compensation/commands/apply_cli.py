@@ -125,7 +125,7 @@ def _correct_points(
 
 
 def _without_history(model: DriftModel) -> DriftModel:
-    """The form of the model that needs the camera's temperature only, which is said when it is not the one in use;
+    """The form of the model that needs the camera's temperature only, with a message when it is not the one in use;
     ConfigError when the file has none."""
     if isinstance(model, PaperModel):
         return model

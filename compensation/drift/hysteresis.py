@@ -2,7 +2,7 @@
 
 A visit is a set-point with its frames; its branch is the side from which it was reached. All figures are of the mean
 over the markers seen in both visits, along I and J, px. Lag and hysteresis both open the branches; a set-point with a
-doubled dwell tells them apart: lag shrinks, hysteresis does not.
+doubled dwell separates them: lag shrinks, hysteresis does not.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class _Problem:
 def fit_thermal(observations: Observations) -> ThermalModel:
     """The model of the REFERENCE, FIT and WARM_UP frames; SessionError when the sessions cannot support it.
 
-    Lags of the power are only tried when there is a warm-up: with a camera that is always on nothing tells them.
+    Lags of the power are only tried when there is a warm-up: a camera that is always on does not determine them.
     """
     with_power = bool(observations.of(Role.WARM_UP).any())
     memory = Memory(TAUS_S, PLAYS_K, self_heating_K(observations))

@@ -1,7 +1,7 @@
 """The thermal drift model: a homography whose eight motions follow the camera's thermal state.
 
-A function of the camera's temperature alone cannot tell a lens that is still warming from one that is warm. This form
-knows what the camera has been through: air, supply and own temperature, remembered by first-order lags and plays.
+A function of the camera's temperature alone cannot distinguish a lens that is still warming from a warm one. This form
+uses the history of air, supply and own temperature, kept in first-order lags and plays.
 compensation/drift/thermal_choice.py makes the model.
 """
 

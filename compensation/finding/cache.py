@@ -1,8 +1,8 @@
 """Markers found once are kept, by the content they were found in: a copied or renamed session finds them, too.
 
 The key is the SHA-256 of the segment's bytes, the range of time, the target, the noise, and the program text that
-finds markers: a changed program finds anew. Files lie in $XDG_CACHE_HOME/thermostand/markers, or ~/.cache; they may be
-deleted at any time.
+finds markers: a changed program searches again. Files are in $XDG_CACHE_HOME/thermostand/markers, or ~/.cache; delete
+them at will.
 """
 
 from __future__ import annotations

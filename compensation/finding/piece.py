@@ -1,8 +1,8 @@
 """The unit of work: the markers in the frames of one segment within a range of time.
 
 A piece names its frames and never holds one. It begins with a search and then tracks from frame to frame, so its
-result depends on the file, the range, the target and the noise alone: whoever works on it, wherever, and whatever was
-worked on before, finds the same bits.
+result depends on the file, the range, the target and the noise alone: it is the same to the bit in any process, on any
+machine, and after any other piece.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ _FINE_K, _ROUNDING_K = 0.02, 1e-6
 """A display finer than this needs no refinement; readings closer together than that are the same."""
 _FEWEST_READINGS = 200
 _CHANGE_NS = 30 * NS_PER_S
-"""Two readings further apart do not tell when the display changed."""
+"""Two readings further apart do not show when the display changed."""
 
 _AMBIENT, _POWER, _CAMERA = "thermometers.air", "relays.camera_power", "camera.temperature"
 
@@ -38,7 +38,7 @@ _AMBIENT, _POWER, _CAMERA = "thermometers.air", "relays.camera_power", "camera.t
 class History:
     """One session's record: instants, ns, ascending, and values; without BAD readings.
 
-    ambient_degC: of the air near the camera. powered: 0 or 1, until the next instant. camera_degC: as it tells itself,
+    ambient_degC: of the air near the camera. powered: 0 or 1, until the next instant. camera_degC: its own reading,
     in steps of resolution_K (0: none), refined within them.
     """
 
@@ -67,7 +67,7 @@ def recorded_history(session: Session) -> History:
 def refined(history: History) -> History:
     """With the camera's temperature between the steps of its display.
 
-    Many cameras tell theirs in quarters of a degree, at which the image moves by several mpx. Where the display changes
+    Many cameras show theirs in quarters of a degree, at which the image moves by several mpx. Where the display changes
     the temperature is half way between its steps. In between runs a linear function of lags of ambient and power,
     fitted to all readings of the session, moved so that it goes through the two changes; the display is never
     overruled by more than half a step.
@@ -129,7 +129,7 @@ def _powered(session: Session) -> tuple[TimesNs, Float]:
 
 
 def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: Float) -> States:
-    """The thermal states at instants (F,), ascending, ns, at which the camera told these temperatures (F,)."""
+    """The thermal states at instants (F,), ascending, ns, at which the camera had these temperatures (F,)."""
     unknown = States.at_degC(camera_degC, len(time_ns), memory)
     if not history.has_ambient or len(time_ns) == 0 or time_ns[-1] <= history.ambient_ns[0]:
         return unknown
@@ -154,8 +154,8 @@ def _followed(memory: Memory, inputs: Float) -> Float:
 
 
 def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
-    """The camera's temperature at the marks, NaN where it tells none: at the frames what it told with them, but for the
-    place within the display's step, which only the whole record knows."""
+    """The camera's temperature at the marks, NaN where it is unknown: at the frames the one recorded with them, refined
+    within the display's step by the whole record."""
     camera = interpolated(history.camera_ns, history.camera_degC, marks_ns, GAP_NS)
     at = np.searchsorted(marks_ns, time_ns)
     told = np.isfinite(camera_degC) & (time_ns >= marks_ns[0])
@@ -167,13 +167,13 @@ def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: 
 
 def _means(history: History, marks_ns: TimesNs) -> tuple[Float, Float]:
     """Mean ambient, by the trapezoidal rule, and powered share between the marks (M,), (M - 1,) each; NaN where the
-    record does not tell."""
+    they are not recorded."""
     ambient = interpolated(history.ambient_ns, history.ambient_degC, marks_ns, GAP_NS)
     return (ambient[1:] + ambient[:-1]) / 2, _powered_share(history, marks_ns)
 
 
 def _powered_share(history: History, marks_ns: TimesNs) -> Float:
-    """Exact means of the supply. A camera that tells its temperature is on where nobody recorded the relay."""
+    """Exact means of the supply. A camera that reports its temperature is on where the relay was not recorded."""
     if len(history.powered_ns) == 0:
         return np.ones(len(marks_ns) - 1)
     origin_ns = int(marks_ns[0])

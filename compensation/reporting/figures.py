@@ -1,6 +1,6 @@
 """The look of all figures, and figures as SVG text: the same data give the same bytes.
 
-Blue is I and orange J (Okabe and Ito, told apart by any eye); pale and open is before, full is after compensation.
+Blue is I and orange J (Okabe and Ito, safe for the colour-blind); pale and open is before, full is after compensation.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def _ground(axes: Axes, observations: Observations, start_px: Float) -> None:
         axes.imshow(
             observations.preview // _GREY_STEP * _GREY_STEP,
             cmap="gray",
-            vmin=-200,  # darks become mid-grey: the dots must be told from the discs
+            vmin=-200,  # darks become mid-grey: the dots must stand out from the discs
             vmax=290,  # and lights pale grey
             extent=(-0.5, width - 0.5, height - 0.5, -0.5),
             interpolation="none",
@@ -99,7 +99,7 @@ def _ground(axes: Axes, observations: Observations, start_px: Float) -> None:
 
 
 def _outlines(axes: Axes, observations: Observations, start_px: Float) -> None:
-    """Discs of the size that the distance of their neighbours tells."""
+    """Discs whose size follows from the distance of their neighbours."""
     axes.set_facecolor("#ececec")
     seen = np.isfinite(start_px).all(axis=1)
     apart_px = np.linalg.norm(start_px[seen][:, None] - start_px[seen], axis=2)

@@ -83,7 +83,7 @@ def can_be_scored(observations: Observations) -> bool:
 
 def check_report_writable(path: Path, *inputs: Path | None) -> None:
     """SessionError when page or numbers could not be written, or would take the place of each other or of an input: to
-    be told before the work."""
+    be raised before the work."""
     numbers = numbers_path(path)
     if numbers.resolve() in [one.resolve() for one in (path, *inputs) if one is not None]:
         raise SessionError(f"{path}: the numbers of this page would overwrite {numbers}; give it another name")

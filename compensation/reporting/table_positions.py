@@ -1,4 +1,4 @@
-"""Where the table held the target: the positions of calibration and validation, as the recorded moves tell."""
+"""Where the table held the target: the positions of calibration and validation, from the recorded moves."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TablePositions:
 
 
 def table_positions(sessions: Sequence[Sequence[StepMark]]) -> TablePositions:
-    """Of the steps of all these sessions. SessionError when they do not tell where the table stood."""
+    """Of the steps of all these sessions. SessionError when they do not record where the table stood."""
     return TablePositions(_places(sessions, Role.CALIBRATION), _places(sessions, Role.POSE))
 
 

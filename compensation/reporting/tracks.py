@@ -49,7 +49,7 @@ class Track:
 @dataclass(frozen=True, slots=True, eq=False)
 class WarmUp:
     """A track from the first frame on. since_on_s (F,): since the camera was switched on; since the first frame when
-    the recording does not tell, and `power_on_known` is False."""
+    that is not recorded, and `power_on_known` is False."""
 
     track: Track
     since_on_s: Float

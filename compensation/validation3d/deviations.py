@@ -37,8 +37,8 @@ class Deviations:
 
     translation_um, rotation_mrad (T, P, 3): since the reference, along and about X, Y, Z. noise_um, model_um, stand_um
     (T, P, 3): standard uncertainty of the translation by the markers' noise, the drift model and the stand's
-    correction; table_um (3,): by the table, which repeat_um (T, 3), V0 at the end of each temperature minus V0 at its
-    begin, tells. u_mrad (T, P, 3): of the rotation, by all but the table. chi (T, P): misfit of the pose, 1 when noise
+    correction; table_um (3,): by the table, from repeat_um (T, 3), V0 at the end of each temperature minus V0 at its
+    begin. u_mrad (T, P, 3): of the rotation, by all but the table. chi (T, P): misfit of the pose, 1 when noise
     explains it.
     """
 

@@ -40,7 +40,7 @@ class Camera:
         self._connection: Connection | None = None
         self._lost = ""
         self._heard_ns: int | None = None  # since it was made, or closed
-        self.restarted = ""  # why it has, or may have, started anew between the last open and the one before; "" if not
+        self.restarted = ""  # why it has, or may have, restarted between the last open and the one before; "" if not
         self._frames = FrameCount()
         self._counts: Counter[str] = Counter()
 
@@ -193,7 +193,7 @@ class Camera:
         return Unreachable(self._name, reason)
 
     def _why_restarted(self, clock_began_ns: int | None) -> str:
-        """A camera that has started anew counts its time from then on."""
+        """A camera that has restarted counts its time from then on."""
         if self._heard_ns is None:
             return ""
         if clock_began_ns is None:

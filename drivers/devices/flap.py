@@ -216,7 +216,7 @@ class Flap:
         return self._device
 
     def _chosen(self, candidates: Iterable[_UsbDevice]) -> _UsbDevice:
-        """The one with our serial number; one that does not tell its own (no permission, busy) hides no other."""
+        """The one with our serial number; one that does not report its own (no permission, busy) hides no other."""
         chosen: _UsbDevice | None = None
         present: list[str] = []
         denied: usb.core.USBError | None = None

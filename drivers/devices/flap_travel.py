@@ -1,4 +1,4 @@
-"""Whether a flap that was told to move does: arrived, jammed or too slow, judged from what was read on the way."""
+"""Whether a flap that was commanded to move does: arrived, jammed or too slow, judged from what was read on the way."""
 
 from __future__ import annotations
 

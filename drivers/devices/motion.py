@@ -1,8 +1,8 @@
 """Who may move an actuator: the newest command only, and nobody once it was made safe, until that is taken back.
 
-A verb takes its turn where it is called, in the event loop; the turn is looked at again in the lane's thread right
+A verb takes its turn where it is called, in the event loop; the turn is checked again in the lane's thread right
 before each command is written. What has been overtaken in between, while a status was awaited or a call waited in the
-lane, is never sent: a stop goes through the same lane, comes after whatever was sent before it, and nothing follows.
+lane, is never sent: a stop goes through the same lane, comes after all that was sent before it, and nothing follows.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Motion:
         self._barred = False
 
     def take(self, aim: object = None, *, safe: bool = False) -> Turn:
-        """From now on this command counts; one with the same aim that is under way goes on beside it.
+        """From now on this command counts; one with the same aim that is under way continues beside it.
 
         Superseded, before anything is sent, when the actuator was made safe and not allowed to move since.
         """

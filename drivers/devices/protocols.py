@@ -1,4 +1,4 @@
-"""What every device can do, whatever its make."""
+"""What every device can do, of any make."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Actuator(Device, Protocol):
 
 class Camera(Sensor, Protocol):
     """A camera; channels `<name>.image` and `<name>.temperature`. When it is lost, its calls raise Unreachable until it
-    is opened again. `restarted`: why it has, or may have, started anew between the last open and the one before; "" if
+    is opened again. `restarted`: why it has, or may have, restarted between the last open and the one before; "" if
     it has not."""
 
     restarted: str

@@ -50,12 +50,12 @@ class Regulator:
             await self._start_up()
 
     async def close(self) -> None:
-        """Nothing to let go of: the bus belongs to the stand; control goes on in the unit."""
+        """Nothing to let go of: the bus belongs to the stand; control continues in the unit."""
 
     async def read(self) -> tuple[Reading, ...]:
         """pv, sp (degC), mv_heat, mv_cool (%), running, fault (1 or 0); raises DeviceError.
 
-        The reason of `fault` names the bits that stand, and tells when somebody changed the set point at the unit.
+        The reason of `fault` names the bits that are set, and says when somebody changed the set point at the unit.
         """
         async with self._exclusive():
             await self._ensure_started()

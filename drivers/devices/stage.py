@@ -212,7 +212,7 @@ class Axis:
         """Move to `position` (mm or deg), the last stretch upwards, from where the play has been taken up.
 
         Refused outside the limits or when not homed; DeviceFault in an alarm or when the move fails; Superseded when it
-        was made safe or told to go elsewhere after this was called, or made safe before and not allowed to move since.
+        was made safe or sent elsewhere after this was called, or made safe before and not allowed to move since.
         """
         low, high = self._settings.limits
         unit = self.profile.unit
@@ -338,7 +338,7 @@ class Axis:
     def _send(
         self, letters: str, payload: bytes, carried_out: Callable[[_Status], bool], turn: Turn | None = None
     ) -> None:
-        """Send a command, while it is its turn. When its acknowledgement is lost the controller's state tells whether
+        """Send a command, while it is its turn. When its acknowledgement is lost the controller's state shows whether
         it was carried out; only if it was not is it sent a second and last time."""
         client = self._identified()
         _check(turn)
@@ -350,7 +350,7 @@ class Axis:
                 self._identified().command(letters, payload)
 
     def _begin_homing(self, turn: Turn) -> None:
-        """From here on the scale means nothing until its zero is set, whatever the controller says."""
+        """From here on the scale means nothing until its zero is set, even if the controller reports one."""
         self._identified()
         turn.check()
         self._zero_due = True

@@ -1,7 +1,7 @@
 """`python -m drivers.sim`: one process is one simulated laboratory. Its description comes as JSON on standard input.
 
 Prints the addresses at which it answers (JSON, one line) when every fake does; ends on SIGTERM, SIGINT or the control
-socket's `quit`; exits with 2 and one line when it cannot start. When whoever started it dies, it lives on for a minute,
+socket's `quit`; exits with 2 and one line when it cannot start. When its parent process dies, it lives on for a minute,
 as a real laboratory would: long enough to see the heater's dead-man drop.
 """
 

@@ -143,7 +143,7 @@ class FakeCamera:
         self._stream.close()
 
     def restart(self) -> None:
-        """It starts anew by itself: control and settings are gone."""
+        """It restarts by itself: control and settings are lost."""
         with self._wake:
             self._restart(self._clock.now_ns())
 

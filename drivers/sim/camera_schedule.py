@@ -62,7 +62,7 @@ class Schedule:
         self._set_streaming(False)
 
     def reschedule(self, now_ns: int) -> None:
-        """The rate or the trigger was changed: the free run goes on from here."""
+        """The rate or the trigger was changed: the free run continues from here."""
         self._anchor_ns, self._anchor_index = now_ns, self._next_index
 
     def trigger(self, now_ns: int) -> None:

@@ -162,7 +162,7 @@ class FakeFlap:
         self._ram[INPUT_MODE] = mode
 
     def restart(self, reset_cause: int = 1) -> None:
-        """The controller starts anew: up time 0, settings from EEPROM, motor off, awaiting a command."""
+        """The controller restarts: up time 0, settings from EEPROM, motor off, awaiting a command."""
         with self._plant.lock:
             self._started_ns = self._clock.now_ns()
             self._reset_cause = reset_cause

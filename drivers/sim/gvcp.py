@@ -57,7 +57,7 @@ class Malformed(ValueError):
 
 
 class Nack(Exception):
-    """The command was understood and refused; `status` tells why."""
+    """The command was understood and refused; `status` says why."""
 
     def __init__(self, status: Status, reason: str) -> None:
         super().__init__(f"{reason} ({status.name}, {status:#06x})")

@@ -72,7 +72,7 @@ class ControlChannel:
             self._release()
 
     def forget(self) -> None:
-        """The device lost its power: no controller, nothing remembered, nobody told."""
+        """The device lost its power: no controller, nothing remembered, no client informed."""
         self._controller = None
         self._answered = None
 

@@ -79,7 +79,7 @@ class _Queue:
     refusals: deque[tuple[bytes, Destination]] = field(default_factory=deque[tuple[bytes, Destination]])
 
     def end_block(self) -> None:
-        """The current block is over; who waited for it goes on."""
+        """The current block is over; its waiter is released."""
         self.sent.set()
         self.sent = threading.Event()
         self.jobs = None
@@ -169,7 +169,7 @@ class StreamSender:
             self._wake.notify_all()
 
     def abandon(self) -> None:
-        """Forget what is under way and what was kept; the caller of `begin` goes on."""
+        """Forget what is under way and what was kept; the caller of `begin` is released."""
         with self._wake:
             self._queue.end_block()
             self._queue = _Queue()
@@ -188,7 +188,7 @@ class StreamSender:
             self._queue.resends.setdefault((block.block_id, packet_id), job)
 
     def _refuse(self, resend: Resend) -> None:
-        if not self._kept:  # nobody to tell
+        if not self._kept:  # nobody waits
             return
         _, destination = self._kept[-1]
         kind = gvsp.Kind.PAYLOAD

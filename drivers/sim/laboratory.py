@@ -54,7 +54,7 @@ class EndpointSpec(Document):
 
 
 class LaboratorySpec(Document):
-    """What the simulator process is told on its standard input.
+    """What the simulator process reads on its standard input.
 
     Port 0, "serial:" without a path and a camera without an address stand for free ones. All cameras see the same.
     """
@@ -206,7 +206,7 @@ class Laboratory:
                     raise
 
     def _conduct(self, time_ns: int, dt_s: float) -> None:
-        """A welded solid-state relay conducts whatever the regulator says; a camera without cooling stays hot."""
+        """A welded solid-state relay conducts regardless of the regulator; a camera without cooling stays hot."""
         self.plant.heater_on_fraction = max(self.plant.heater_on_fraction, self.ssr_welded_share)
         if self.camera_sensor_degC is not None:
             self.plant.sensor_degC = self.camera_sensor_degC

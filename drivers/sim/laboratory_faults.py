@@ -230,7 +230,7 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "bus.unplugged": _unplug_bus,  # nobody listens at the gateway's address, and its connections are cut
     "bus.garbled": _garble_bus,  # so many of the coming replies
     "bus.late_s": _late_reply,  # the next reply, by so many real seconds
-    "relays.silent_s": _silent_relays,  # its timed-on relays go on and drop
+    "relays.silent_s": _silent_relays,  # its timed-on relays time out and drop
     "relays.lost_writes": _lose_relay_writes,  # acknowledged, not done
     "relays.brown_out": _brown_out,  # off and on again: every relay is open
     "relays.no_rearm": _stop_rearming,  # a timed-on that runs does not start its time again
@@ -239,7 +239,7 @@ FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
     "camera.sensor_degC": _overheat_camera,  # its sensor chip stays at this
     "camera.restart": _restart_camera,  # by itself, its supply on all the while
     "camera.no_stream_channel": _camera_without_stream,  # it restarts, and does not offer one until this is undone
-    "camera.frozen_temperature": _freeze_temperature,  # it goes on showing the last one
+    "camera.frozen_temperature": _freeze_temperature,  # it keeps showing the last one
     "camera.no_temperature": _hide_temperature,  # it shows 0 degC
     "camera.loss": _camera_loss,  # share of stream packets lost
     "camera.silent": _silent_camera,  # neither answers nor sends

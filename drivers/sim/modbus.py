@@ -179,8 +179,8 @@ def crc16(data: bytes) -> bytes:
 class RtuEngine:
     """Modbus RTU requests in, replies out, for the units of one bus.
 
-    Frames are told apart by their length and CRC, not by the silence between them, which a pseudo-terminal does not
-    keep: whatever does not end in a good frame is dropped as soon as a good frame follows.
+    Frames are separated by their length and CRC, not by the silence between them, which a pseudo-terminal does not
+    keep: data that do not end in a good frame are dropped as soon as a good frame follows.
     """
 
     def __init__(self, units: Iterable[Unit]) -> None:
@@ -211,7 +211,7 @@ class RtuEngine:
 
 
 def _frame_length(data: bytes, begin: int) -> int:
-    """The length of the request that may begin at `begin`, 0 when it cannot be told."""
+    """The length of the request that may begin at `begin`, 0 when it is unknown."""
     function = data[begin + 1]
     if function in FIXED_LENGTHS:
         return FIXED_LENGTHS[function]

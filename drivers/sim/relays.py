@@ -65,8 +65,8 @@ class FakeRelays:
     """The board as unit `unit`; `channels` says which relay, counted from 0, switches which contact of the plant:
     heater_enable, compressor, camera_power. All relays are open at power-up.
 
-    Faults: silent; lost_writes (acknowledged, not done); welded (names of contacts that stay closed whatever the
-    coil does); rearms False (a repeated timed-on does not start its time again); times False (a timed-on stays on).
+    Faults: silent; lost_writes (acknowledged, not done); welded (names of contacts that stay closed regardless of
+    the coil); rearms False (a repeated timed-on does not start its time again); times False (a timed-on stays on).
     """
 
     def __init__(self, plant: Contacts, clock: Now, unit: int, channels: Mapping[str, int]) -> None:
@@ -109,7 +109,7 @@ class FakeRelays:
             self._switch(self._now_ns)
 
     def closed(self, channel: str) -> bool:
-        """Whether the contact of that name conducts now, which a welded one does whatever its coil says."""
+        """Whether the contact of that name conducts now, which a welded one always does."""
         with self._now():
             return self._conducts(channel, self._now_ns)
 

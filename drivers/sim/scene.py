@@ -2,7 +2,7 @@
 
 Each projected disc is a fine polygon whose exact area in every cell of a grid four times finer than the pixels is
 summed; Gaussian and pixel box then act on that grid. The centroid survives to better than 1e-5 px, so the image
-tells a marker finder from its own errors. Signals are in DN.
+adds no errors of its own to those of a marker finder. Signals are in DN.
 """
 
 from __future__ import annotations

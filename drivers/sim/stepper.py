@@ -86,7 +86,7 @@ Leg = GoTo | Shift | Run | Brake
 
 @dataclass(frozen=True, slots=True)
 class Stops:
-    """Counts at which the controller stops the motor whatever the command; None: the limit switch of that side;
+    """Counts at which the controller stops the motor under any command; None: the limit switch of that side;
     infinite: nothing stops it there."""
 
     left: float | None = None

@@ -82,7 +82,7 @@ class Settings:
 
     def homing(self) -> tuple[Leg, ...]:
         """Fast until the first stop, slowly until the second when enabled, then by HomeDelta in the second direction.
-        Only limit switches are wired: motion towards another stop goes on until a border."""
+        Only limit switches are wired: motion towards another stop continues to a border."""
         fast, fast_micro, slow, slow_micro, delta, delta_micro, flags = self._fields("hom")
         fast_pace = self._pace(fast, fast_micro)
         first = RIGHT if flags & table.HOME_FIRST_RIGHT else LEFT

@@ -185,7 +185,7 @@ class Bus:
         try:
             result = function(*args)
         except WireFault as fault:
-            if fault.fault is not FaultKind.LINE_DOWN:  # a line opened anew has nothing late on it
+            if fault.fault is not FaultKind.LINE_DOWN:  # a line that was reopened has nothing late on it
                 self._suspect = True
                 self._free_s = time.monotonic() + self._quarantine_s
             raise

@@ -75,7 +75,7 @@ class FrameCount:
         self._last_id = 0
 
     def restart(self) -> None:
-        """Ids begin anew with the next frame."""
+        """Ids start again with the next frame."""
         self._last_id = 0
 
     def advance(self, frame_id: int) -> int:

@@ -321,7 +321,7 @@ def _offered(device: GigeDevice, place: TemperatureFeature) -> str:
 
 
 def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[float, str, Cause]:
-    """Temperature in degC and ""; or NaN, the reason and who says so. Never raises: a run goes on without it."""
+    """Temperature in degC and ""; or NaN, the reason and its cause. Never raises: a run continues without it."""
     try:
         if place.register_address is not None:
             value_degC = (device.read_register(place.register_address) & place.mask) * place.scale + place.offset

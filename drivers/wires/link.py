@@ -73,7 +73,7 @@ class _SerialLink:
 
     def read(self, timeout_s: float) -> bytes:
         try:
-            if timeout_s > 0:  # waited for here, because pyserial sets the whole port anew for another time-out
+            if timeout_s > 0:  # waited for here, because pyserial reconfigures the whole port for another time-out
                 select.select([self._port], [], [], timeout_s)
             return self._port.read(_READ_SIZE)
         except (OSError, termios.error) as error:

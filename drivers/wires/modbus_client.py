@@ -119,7 +119,7 @@ class _SerialClient(ModbusSerialClient):
                 write_timeout=line.timeout_connect,
                 exclusive=True,
             )
-            self.socket.reset_input_buffer()  # whatever came before was not for us
+            self.socket.reset_input_buffer()  # earlier bytes were not for us
         return True
 
     def recv(self, size: int | None) -> bytes:
@@ -197,7 +197,7 @@ class ModbusClient:
             return 0  # unplugged: the request that follows says so
 
     def discard_input(self) -> None:
-        """Forget whatever has arrived: flush the port, or drop the connection (a late reply dies with it)."""
+        """Forget all that has arrived: flush the port, or drop the connection (a late reply dies with it)."""
         port = self._client.socket if self._client is not None else None
         if not isinstance(port, serial.Serial):
             self.close()

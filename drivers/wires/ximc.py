@@ -1,7 +1,7 @@
 """XIMC frames for both ends of the wire: letters, payload and CRC; what a payload means is not known here.
 
 A frame is four lower-case ASCII letters, followed by payload and CRC when there is a payload (libximc protocol.xi).
-A frame without payload has no CRC. Only the letters tell the size, so a decoder is given the sizes it may meet:
+A frame without payload has no CRC. Only the letters determine the size, so a decoder is given the sizes it may meet:
 
     host:        decode(received, ERROR_SIZES | {"gets": 48})
     controller:  decode(received, every_request_size)

@@ -64,7 +64,7 @@ class XimcClient:
         self._link = None
 
     def _exchange(self, letters: str, payload: bytes, reply_size: int) -> bytes:
-        """One request and its reply; whatever else comes is an error, and the line is clean again when it is raised."""
+        """One request and its reply; anything else is an error, and the line is clean again when it is raised."""
         link = self._link = self._link or self._connect()
         try:
             if link.read(0.0).strip(b"\0"):  # nobody asked for it, and more may follow

@@ -72,7 +72,7 @@ Times    time_ns is the stand's clock, in ns since 1970: it never steps, so take
          the computer had it at that moment.
 Values   An empty cell is what the device does not measure; nan is what it could not measure, and remarks says why.
          Units are in the names of the columns. A number is the shortest text that reads back as the same number.
-Texts    Cells of the CSV tables are safe for spreadsheets, whoever has recorded the session. A text that a spreadsheet
+Texts    Cells of the CSV tables are safe for spreadsheets, also of a stranger's session. A text that a spreadsheet
          would take for a formula (its first character, spaces aside, is one of = + - @) has an apostrophe (') before
          it: take that away to have the text as it was recorded. Control characters and those that turn the direction
          of writing are left out; tabs and line ends are spaces. Numbers are never changed. Parquet tables, session.json
@@ -90,7 +90,7 @@ def export(
 ) -> None:
     """Write `session` as the folder `out`, which must not exist, laid out as above; memory stays flat.
 
-    `report` is told the share of the work that is done (0 to 1) and what is being done. SessionError when the session
+    `report` gets the share of the work that is done (0 to 1) and what is being done. SessionError when the session
     cannot be read, `out` not be written, or the format needs a package that is missing; `out` then does not appear.
     """
     if telemetry is not None:

@@ -1,7 +1,7 @@
 """Publishes a recorded session again: the same items in the same order, at their own instants of a clock.
 
-Subscribers cannot tell a replay from the run, except that there is no stand behind it. As fast as possible is a
-VirtualClock: whoever works in a lane holds it, so nothing is dropped. 1 x and N x is a ReplayClock.
+To subscribers a replay looks like the run, except that there is no stand behind it. As fast as possible is a
+VirtualClock, which work in a lane holds, so nothing is dropped. 1 x and N x is a ReplayClock.
 """
 
 from __future__ import annotations
@@ -109,10 +109,10 @@ async def replay_and_record(
     """Replay `session` and record it again as the session `out`, which must not exist; returns `out`.
 
     speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
-    has the same metadata (the session's id, too), attachments, devices, items and journal: nothing in it tells of
-    the replay, because it is the same session in other segments. What the original lacks, the copy's metadata tell
-    of, and an image or a description that lacks the other goes into the copy as it is. SessionError when it has no
-    items, or cannot be read or written whole, as on a disk that is slower than `speed`; `out` then does not appear.
+    has the same metadata (the session's id, too), attachments, devices, items and journal: nothing in it mentions
+    the replay, because it is the same session in other segments. What the original lacks is listed in its
+    metadata, and an image or a description that lacks the other goes into the copy as it is. SessionError when it has
+    no items, or cannot be read or written whole, as on a disk that is slower than `speed`; `out` then does not appear.
     """
     first = next(session.items(), None)
     if first is None:

@@ -25,7 +25,7 @@ def recorded_topics(session: Session) -> tuple[Topic, ...]:
 
 
 def recorded_devices(session: Session) -> dict[str, str]:
-    """Device name -> its kind, as the recorder was told."""
+    """Device name -> its kind, as it was recorded."""
     kind_of_topic = {kind.topic: name for name, kind in messages.KINDS.items()}
     return {
         device: kind_of_topic[topic.name]

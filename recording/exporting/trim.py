@@ -40,8 +40,8 @@ BLOCK_BYTES = 1 << 20
 def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     """What was recorded in [begin_ns, end_ns) as the new session `out`, which must not exist; returns `out`.
 
-    Attachments, channels, sequence numbers, instants and order stay, and so do the metadata, which tell the extent of
-    the part and what is missing in it as it was in the session. The first messages are an event of kind
+    Attachments, channels, sequence numbers, instants and order stay, and so do the metadata, which state the extent of
+    the part and what was already missing in the session. The first messages are an event of kind
     TRIMMED, when a step had started and not ended before `begin_ns` its mark again, and when UTC was not the stand's
     time an event that says so, all at the instant of the first message kept: a frame's step can be looked up, and
     nothing lies before the part. SessionError when nothing

@@ -30,7 +30,7 @@ class Link:
 
 
 def misplaced(series: str, number: int, place: Mapping[str, str], session: Mapping[str, str]) -> bool:
-    """Whether the record `segment` tells of another place in the session than the file's name does."""
+    """Whether the record `segment` gives another place in the session than the file's name."""
     due = segment_metadata(series, number, session)
     return bool(place.keys() - due.keys()) or any(place.get(key) != due[key] for key in due.keys() - {SESSION_CRC})
 

@@ -19,7 +19,7 @@ class Hole:
     """A stretch of a series that is not there.
 
     first, last: numbers of the segments that are missing; both None when only frames, or their descriptions, are, and
-    last alone when nobody can tell how many there were. begin_ns, end_ns: what there is ends and begins again at these
+    last alone when their number is unknown. begin_ns, end_ns: the recorded data end and begin again at these
     instants, None at the begin and the end of the session. frames: how many lack their image (series `frames`) or
     description (`telemetry`). excused: frames that were never acknowledged, or that the recorder itself said it lost:
     such a stretch makes no session incomplete.

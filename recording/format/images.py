@@ -61,7 +61,7 @@ def encode_raw(frame: Frame) -> bytes:
     pixels copied once: protobuf would copy 5 MB three times, and the fresh memory for it costs more than the disk.
 
     ValueError when the image is not uint8 or uint16 of shape (height, width), or has windows, which the message cannot
-    tell of.
+    describe.
     """
     image = frame.image
     if image.ndim != 2 or image.size == 0 or image.dtype.name not in GREY_TYPES:

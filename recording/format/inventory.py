@@ -1,4 +1,4 @@
-"""The files a recorded session consists of, whatever state they are in; only names, sizes and locks are looked at."""
+"""The files a recorded session consists of, in any state; only names, sizes and locks are looked at."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _is_locked(path: Path) -> bool:
     """A living recorder holds its file locked. Our own lock is shared and gone at once: nobody waits for it."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except PermissionError:  # whoever recorded it was another user; a living one cannot be told from a dead one
+    except PermissionError:  # recorded by another user: whether that process still lives is unknown
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -42,7 +42,7 @@ class Description:
 
 
 class UndescribedFrame(Frame):
-    """A frame whose description is missing: NaN and zeros stand for what only that would tell, and are not recorded
+    """A frame whose description is missing: NaN and zeros stand for what only that would give, and are not recorded
     again."""
 
 
@@ -69,7 +69,7 @@ class ImagesToCome:
 
     def described_by(self, message: Message) -> Iterator[Frame | Description]:
         """The image that the description in `message` stands for, the description alone when it is missing; behind the
-        last description of that time whatever else was recorded then."""
+        last description of that time everything else that was recorded then."""
         places = self._places.get(message.time_ns, [])
         for place in places:
             image = self._read(place)

@@ -212,7 +212,7 @@ class BatchEncoder:
         self._fields = {(f"{device}.{q.name}", q.unit): (q.field, f"{q.field}_quality") for q in kind.quantities}
 
     def encode(self, batch: Batch) -> bytes:
-        """The batch as one message; nothing of a reading is lost, whatever its channel, unit or time."""
+        """The batch as one message; nothing of a reading is lost, for any channel, unit or time."""
         fields = self._blank.copy()
         readings = batch.readings
         time_ns = (readings[0].time_ns if readings else 0) or batch.time_ns  # 0 in the message is the log time
@@ -233,7 +233,7 @@ class BatchEncoder:
 
 
 def _canonical(value: float) -> float:
-    """The same NaN whatever arithmetic made it: equal readings are equal bytes."""
+    """One bit pattern for every NaN: equal readings are equal bytes."""
     return math.nan if value != value else value
 
 

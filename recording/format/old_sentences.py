@@ -1,4 +1,4 @@
-"""Events of sessions recorded before events had data: what their sentences tell, as the data they would have today.
+"""Events of sessions recorded before events had data: what their sentences say, as the data they would have today.
 
 The one place where a sentence is read. Nothing that is recorded now depends on it.
 """
@@ -14,7 +14,7 @@ _HOME = re.compile(r"(?P<axis>\S+): home was at (?P<residual>-?\d+(\.\d+)?(e-?\d
 
 
 def data_of_sentence(kind: str, text: str) -> dict[str, object]:
-    """The data of an event that was recorded without any; empty when its sentence tells nothing that is needed."""
+    """The data of an event that was recorded without any; empty when its sentence says nothing that is needed."""
     read = _READERS.get(kind)
     return {} if read is None else read(text)
 

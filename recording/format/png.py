@@ -59,7 +59,7 @@ class Header(NamedTuple):
 def encode_png(image: ImageArray, windows: Windows | None = None) -> bytes:
     """The image, shape (height, width), as a PNG. windows: x, y, width, height of the parts that are real, px, shape
     (n, 4); they are noted in a text chunk. ValueError when windows are not within the image."""
-    import cv2  # here and below: whoever reads no image need not wait for OpenCV; a recorder imports it at once
+    import cv2  # here and below: a program that reads no image need not wait for OpenCV; a recorder imports it at once
 
     native = image.astype(image.dtype.newbyteorder("="), copy=False)
     parameters = [
@@ -110,7 +110,7 @@ def decode_png(data: bytes) -> tuple[ImageArray, Windows | None]:
 
 
 def pixel_data(data: bytes) -> tuple[Header, bytes]:
-    """Header and compressed pixels, checked as `decode_png` checks them, for whoever decodes them by himself."""
+    """Header and compressed pixels, checked as `decode_png` checks them, for callers that decode them themselves."""
     header, _, _, pixels = _taken_apart(data)
     return header, b"".join(pixels)
 

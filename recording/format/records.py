@@ -1,6 +1,6 @@
 """A segment's bytes back to messages: what recording/writing/segment.py wrote, read strictly.
 
-Nothing is taken from where no CRC covers it, unless the file tells it twice: the index has a CRC and says where each
+Nothing that no CRC covers is used, unless the file has it twice: the index has a CRC and says where each
 chunk is, how long, between which instants and how many messages of each channel there are; each chunk's content has
 one, too. Anything wrong is a SessionError that names the file.
 """
@@ -185,7 +185,7 @@ def _read(file: BinaryIO, offset: int, length: int) -> bytes:
 
 
 def _check_place(data: bytes | memoryview, place: ChunkPlace) -> None:
-    """ValueError when what begins there is not as long a chunk as the index tells."""
+    """ValueError unless a chunk of the indexed length begins there."""
     opcode, length = RECORD.unpack_from(data)
     if opcode != Opcode.CHUNK or length != place.length - RECORD.size:
         raise ValueError("the index does not point to a chunk")

@@ -21,7 +21,7 @@ def restarted(time_ns: int, step_id: str, frames: int, how: str) -> Event:
 
 
 def restarted_step(event: Event) -> str:
-    """The id of the capture that was begun anew; "" when the event says something else."""
+    """The id of the capture that was restarted; "" when the event is of another kind."""
     named = event.data.get("step_id") if event.kind == KIND else None
     return named if isinstance(named, str) else ""
 

@@ -24,7 +24,7 @@ FILL_STEP_px = 4  # the median is taken of every fourth pixel of every fourth ro
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Whole:
-    """What the last whole frame that was searched told; windows: None when none were found. fill_DN: its median, so
+    """Result of the last whole frame that was searched; windows: None when none were found. fill_DN: its median, so
     that the edges of the windows do not look like edges of markers."""
 
     time_ns: int
@@ -44,7 +44,7 @@ class RoiEncoder:
     """
 
     def __init__(self, find_windows: FindWindows, whole_every_s: float = 60.0) -> None:
-        self.tell: Callable[[str], None] = lambda text: None  # of a search that failed; whoever records listens
+        self.tell: Callable[[str], None] = lambda text: None  # of a search that failed; set by the recording
         self._find_windows = find_windows
         self._whole_every_ns = seconds_ns(whole_every_s)
         self._wholes: dict[str, _Whole] = {}  # channel -> its last whole frame

@@ -49,7 +49,7 @@ class Statistics(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a segment's index tells; `begin`: where it begins in the file, behind the data. `content`: its records."""
+    """A segment's index; `begin`: where it begins in the file, behind the data. `content`: its records."""
 
     statistics: Statistics
     begin: int

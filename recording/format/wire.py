@@ -25,7 +25,7 @@ CHUNK = struct.Struct("<qqQII")  # first and last log time, uncompressed size, C
 MESSAGE_INDEX = struct.Struct("<HI")  # channel id, length of the entries
 MESSAGE_INDEX_ENTRY = struct.Struct("<QQ")  # log time, place in the chunk
 
-CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; whoever claims more is damaged
+CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; one that claims more is damaged
 INFLATED_LIMIT_BYTES = 1 << 24  # only telemetry is compressed, and its chunks are 1 MiB and a message
 RECORD_LIMIT_BYTES = CHUNK_LIMIT_BYTES + 1024
 

@@ -96,7 +96,7 @@ class TopicColumns:
         return columns
 
     def _parts(self, device: str, rows: _Rows) -> Iterator[tuple[str, Part]]:
-        """Each channel of a device with what the plain messages tell of it."""
+        """Each channel of a device with its readings in the plain messages."""
         numbers, times_ns = np.array(rows.numbers), np.array(rows.times_ns)
         all_values = np.array(rows.values).reshape(len(numbers), -1)
         all_qualities = np.array(rows.qualities).reshape(len(numbers), -1)

@@ -21,8 +21,8 @@ TORN_NS = 5 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """links: the finished segments that were read, by their names, in order. begins_ns: when the run began or went on.
-    is_ended: whether the end of a run is recorded. holes: those that the session's own record tells of, as a copy of an
+    """links: the finished segments that were read, by their names, in order. begins_ns: when the run began or resumed.
+    is_ended: whether the end of a run is recorded. holes: those that the session's own record lists, as a copy of an
     incomplete session does."""
 
     files: Sequence[SegmentFile]
@@ -55,7 +55,7 @@ class Coverage:
         return False
 
     def unread(self, series: str) -> list[tuple[float, float]]:
-        """Between which instants the series goes on in segments that were not read: from the end of one that was to
+        """Between which instants the series is in segments that were not read: from the end of one that was to
         the begin of the next. A recorder at work may be about to write what comes behind the last one."""
         stretches: list[tuple[float, float]] = []
         begin_ns, is_open, number = -inf, False, -1

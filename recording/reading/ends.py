@@ -1,6 +1,6 @@
-"""The end of a recording held against what its run's journal says, and against the end that a run leaves.
+"""The end of a recording compared with its run's journal, and with the end that a run leaves.
 
-A journal's entries are on the disk after what they speak of. So when it tells of an end, of steps or of a resumption
+A journal's entries are on the disk after what they describe. So when it has an end, steps or a resumption
 that the telemetry does not have, the last segments are missing. Without a journal a run leaves either the event of its
 end or a segment that a salvage has made; a recording with neither has lost its last segments, or was killed in the
 moment between two of them, and counts as incomplete.
@@ -28,7 +28,7 @@ AHEAD_NS = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class LostEnd:
-    """The telemetry behind its last segment is missing; `why` says what tells of it."""
+    """The telemetry behind its last segment is missing; `why` gives the evidence."""
 
     hole: Hole
     why: str
@@ -59,8 +59,8 @@ def lost_end(
 
 
 def frames_of_plan(events: Iterable[Event], frames: int) -> str:
-    """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the recording does not tell of
-    its plan (format 1 does not), or when there are as many."""
+    """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the recording has no number
+    of planned frames (format 1 has none), or when there are as many."""
     planned = [event.data.get("frames") for event in events if event.kind in TELL_PLAN]
     told = planned[-1] if planned else None
     return f"; {frames} of the {told} frames of the plan are there" if isinstance(told, int) and frames < told else ""
@@ -83,7 +83,7 @@ def _why(
     journal: JournalFacts | None,
     utc: UtcOffsets,
 ) -> str:
-    """What tells that more was recorded; "" when nothing does."""
+    """The evidence that more was recorded; "" when there is none."""
     is_ended = last is not None and last.kind == RUN_END
     if journal is None:
         if last is None or is_ended or is_salvaged:

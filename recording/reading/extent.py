@@ -13,8 +13,8 @@ from recording.reading.run_word import Run, known_word
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """What was recorded in [begin_ns, end_ns) of the session of that id. run: how its run ended, as far as the session
-    told when the part was made."""
+    """What was recorded in [begin_ns, end_ns) of the session of that id. run: how its run had ended by the
+    session's record when the part was made."""
 
     session_id: str
     begin_ns: int

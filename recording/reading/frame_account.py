@@ -31,8 +31,8 @@ def frame_account(
     coverage: Coverage,
     is_damaged_at: Callable[[str, int], bool] = lambda series, time_ns: False,
 ) -> FrameAccount:
-    """`told`: blocks that the recorder said it lost. What was not read, is damaged (`is_damaged_at`) or is missing by
-    the session's own record may have what is looked for: such frames are in none of the lists."""
+    """`told`: blocks that the recorder reported as lost. What was not read, is damaged (`is_damaged_at`) or is missing
+    by the session's own record may have what is looked for: such frames are in none of the lists."""
 
     def unexplained(keys: Iterable[FrameKey], series: str) -> list[FrameKey]:
         unread = coverage.unread(series)

@@ -116,7 +116,7 @@ def _number(value: object) -> float:
 
 
 def _axes(session: Recorded) -> list[str]:
-    """The devices that tell a position and whether they move."""
+    """The devices that report a position and whether they move."""
     channels = set(session.channels())
     return [name.removesuffix(".moving") for name in sorted(channels) if name.endswith(".moving")]
 

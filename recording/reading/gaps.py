@@ -94,7 +94,7 @@ def _holes(recorded: Mapping[str, NDArray[np.int64]], begin_ns: int, end_ns: int
 
 
 def _is_same(one: _Hole, other: _Hole) -> bool:
-    """Two devices stopped and came back together, as far as their spacing can tell."""
+    """Two devices stopped and came back together, within their spacing."""
     tolerance_ns = max(one.limit_ns, other.limit_ns)
     return (
         one.device != other.device

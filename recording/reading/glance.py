@@ -1,5 +1,5 @@
-"""What a recorded session is at a glance: what the ends of its files, the events near both ends of the run and its
-journal tell. Damage and unfinished segments are part of the answer, not a reason to give none.
+"""A recorded session at a glance: from the ends of its files, the events near both ends of the run and its
+journal. Damage and unfinished segments are part of the answer, not a reason to give none.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from recording.reading.session import Session
 from recording.reading.walk import survey
 
 _NEAR = (messages.EVENT, messages.STEP)
-_LAST = 2  # segments of the telemetry: a run's end is told before its stand is safe, which may take ten minutes
+_LAST = 2  # segments of the telemetry: a run's end is recorded before its stand is safe, which may take ten minutes
 
 
 @dataclass(frozen=True, slots=True)
 class Glance:
-    """What names, sizes, heads and indexes tell. begin_ns and end_ns: log times of the first and the last message of
+    """What names, sizes, heads and indexes show. begin_ns and end_ns: log times of the first and the last message of
     the finished segments, None when they hold none; `frames` are theirs, too. `troubles`: a sentence for each that is
     damaged, `missing`: for each that is not there. utc: to UTC near both ends; the steps of the system clock between
     them are not looked for. run: how the run ended. has_camera_degC: whether any frame has a good camera temperature,
@@ -76,7 +76,7 @@ class Glance:
 
     @property
     def state(self) -> Files:
-        """Whether the files are sound, by what a glance can tell; `stand session verify` reads all of them."""
+        """Whether the files are sound, as far as a glance shows; `stand session verify` reads all of them."""
         if self.troubles:
             return Files.DAMAGED
         if self.missing:
@@ -256,7 +256,7 @@ def _summary(path: Path) -> Summary:
 
 def _opening(files: Sequence[SegmentFile], seen: Sequence[_Seen]) -> tuple[dict[str, str], dict[str, str]]:
     """Metadata `session` and the attachments: those that most finished segments have, else those of the first other
-    segment that can tell them; empty when none can."""
+    segment that has them; empty when none has."""
     if seen:
         sessions = Counter(tuple(each.head.session.items()) for each in seen)
         most = dict(sessions.most_common(1)[0][0])

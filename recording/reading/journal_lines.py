@@ -58,7 +58,7 @@ def damage_text(lines: Lines) -> str:
 
 @dataclass(frozen=True, slots=True)
 class JournalFacts:
-    """What a journal says of its run, for whoever holds it against the recording.
+    """What a journal says of its run, to be compared with the recording.
 
     last_ns: instant of its last entry. status, ended_ns: how and when the run ended, "" and 0 when the last entry does
     not say. done: ids of the steps that are done, which were on the disk then. damage: what is wrong with the file,

@@ -13,8 +13,8 @@ from recording.format.inventory import SegmentFile
 
 def is_recovered(kept: SegmentFile, salvage: Mapping[str, str], recovered: int) -> bool:
     """Whether the salvaged segment (its record `salvage`, its number of messages) has every message of the original:
-    its salvage lost no byte, and both have as many. The original must go on to the end of its data; of one that was cut
-    short nobody knows how many it had."""
+    its salvage lost no byte, and both have as many. The original must reach the end of its data; of one that was cut
+    short the number of messages is unknown."""
     if salvage.get("lost_bytes") != "0":
         return False
     messages = 0

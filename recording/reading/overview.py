@@ -86,14 +86,14 @@ class Overview:
 
     @property
     def planned_steps(self) -> int | None:
-        """How many steps the plan of the run has, None when the recording does not tell; those of format 1 do not."""
+        """How many steps the plan of the run has, None when that is not recorded, as in format 1."""
         begins = [event.data.get("steps") for event in self.events if event.kind in TELL_PLAN]
         told = begins[-1] if begins else None
         return told if isinstance(told, int) else None
 
     @property
     def ending(self) -> Event | None:
-        """How the run ended, None when the recording does not tell."""
+        """How the run ended, None when that is not recorded."""
         return next((event for event in reversed(self.events) if event.kind == RUN_END), None)
 
     @property
@@ -131,7 +131,7 @@ def overview(path: Path) -> Overview:
         if file.state is State.FINISHED:
             read.read(file)
     contents = read.contents
-    frames = _frames(seen, read)  # before the troubles are told, which it may add to
+    frames = _frames(seen, read)  # before the troubles are listed, which it may add to
     times_ns = {name: channel.sorted_times_ns() for name, channel in contents.channels.items()}
     return Overview(
         seen,

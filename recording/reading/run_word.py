@@ -42,8 +42,8 @@ def last_run_event(events: Iterable[Event]) -> Event | None:
 
 
 def run_word(events: Iterable[Event], journal: JournalFacts | None, *, is_recording: bool = False) -> Run:
-    """By the recording or by its journal, whichever knows of something later. A session of format 1 without its journal
-    tells of a run that did not come to its end no more than that."""
+    """By the recording or by its journal, whichever has the later entry. A session of format 1 without its journal
+    says of an unfinished run no more than that."""
     if is_recording:
         return Run.RUNNING
     last = last_run_event(events)

@@ -83,7 +83,7 @@ class Session:
             raise SessionError(f"{path}: {text}")
         self._salvaged: dict[Path, bool] = {}  # of the segments known to belong here: whether a salvage has made them
         for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others
-            with suppress(_Unreadable):  # it is told when it is read
+            with suppress(_Unreadable):  # it is reported when it is read
                 self._check(segment)
         self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
         self._all_columns_read = False
@@ -147,8 +147,8 @@ class Session:
         return {channel: column for columns in self._columns.values() for channel, column in columns.items()}
 
     def _read_columns(self, device: str | None) -> dict[str, dict[str, Column]]:
-        """Device -> channel -> column of the topics that `device` publishes on (None: of all); whoever shares them is
-        among the devices, but only where it shares them."""
+        """Device -> channel -> column of the topics that `device` publishes on (None: of all), and of devices that
+        share them, but only where they do."""
         topics: dict[str, TopicColumns] = {}
 
         def is_wanted(channel: Channel) -> bool:
@@ -335,7 +335,7 @@ class Session:
 
     @cached_property
     def run(self) -> Run:
-        """How its run ended, as far as the session tells."""
+        """How its run ended, as far as it is recorded."""
         extent = extent_of(self.metadata)
         if extent is not None:
             return extent.run

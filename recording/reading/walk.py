@@ -1,8 +1,8 @@
-"""A segment's bytes, whatever happened to them: what in them proves itself, and where nothing does.
+"""A segment's bytes, also damaged ones: which records are proven sound, and where none are.
 
 Read by place from the front; what counts as a proof is in recording/format/proof.py, what as a block that was being
-written in recording/reading/torn.py. Behind a damaged place the walk goes on where the next record looks like one and
-proves to be one. Inside sound records nothing is searched, so an MCAP file that is attached is an attachment.
+written in recording/reading/torn.py. Behind a damaged place the walk continues at the next bytes that look like a
+record and prove to be one. Inside sound records nothing is searched, so an MCAP file that is attached is an attachment.
 
 Memory is flat: one record at a time. Only OSError is raised, when the disk does not give a byte.
 """

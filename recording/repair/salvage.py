@@ -176,7 +176,7 @@ class _Original:
 
     @property
     def unknown(self) -> int:
-        """Messages that cannot be delivered, because no segment tells of their channels."""
+        """Messages that cannot be delivered, because no segment describes their channels."""
         return self.found.messages.total() - self.delivered
 
     @property
@@ -345,7 +345,7 @@ def _reason(original: _Original) -> str:
 
 def _settle(original: _Original, path: Path | None, copy: Path | None = None) -> Salvaged:
     """Put the copy, if there is one, in its place and the original out of the way. Each step leaves a state from
-    which a salvage goes on."""
+    which a salvage can continue."""
     folder = original.path.parent
     kept = None if original.is_all_there else _keep(original)
     if copy is not None:

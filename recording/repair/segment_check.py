@@ -1,8 +1,8 @@
-"""One finished segment, every byte of it: what a CRC covers is checked by it, the rest by what is told twice.
+"""One finished segment, every byte of it: what a CRC covers is checked by it, the rest against its second copy.
 
 Only the index, the content of chunks and the attachments have CRCs. The rest stands in the file a second time: where
 each record is and how long, a chunk's own fields and each metadata's name in the index, the message indexes in the
-messages, the counts in the walk. Only text has no second telling: the name of the writer's library in the header,
+messages, the counts in the walk. Only text has no second copy: the name of the writer's library in the header,
 which nothing reads, and what metadata says but for the record `session`, which has a CRC in the record `segment`;
 recording/repair/verify.py compares them between segments.
 """
@@ -77,7 +77,7 @@ class SegmentCheck:
 
 def check_segment(path: Path, receive: Callable[[Message], None], report: Callable[[int], None]) -> SegmentCheck:
     """Read the whole segment and hand each sound message to `receive`; `report` gets the number of bytes read so far.
-    Damage is not raised: it is listed, and the walk goes on at the next place the index tells of."""
+    Damage is not raised: it is listed, and the walk continues at the next place in the index."""
     check = SegmentCheck(path)
     try:
         with path.open("rb") as file:
@@ -141,7 +141,7 @@ class _Walk:
         self._channels: dict[int, Channel] = {}
 
     def run(self, report: Callable[[int], None]) -> None:
-        """Read everything; raises one of DAMAGE when the index does not tell of the whole file."""
+        """Read everything; raises one of DAMAGE when the index does not cover the whole file."""
         places = self._places()
         self._part(0, places[0], self._header)
         for place, end in pairwise(places):
@@ -231,7 +231,7 @@ class _Walk:
         for opcode, content in records(data):
             if opcode == Opcode.MESSAGE:
                 channel, sequence, time_ns, _ = MESSAGE.unpack_from(content)
-                topic = self._index.channels[channel].topic  # the first chunk, which tells it too, may be damaged
+                topic = self._index.channels[channel].topic  # the first chunk, which has it too, may be damaged
                 message = Message(topic, sequence, time_ns, bytes(content[MESSAGE.size :]))
                 placed.append(_Placed(channel, offset, time_ns, message))
             elif opcode == Opcode.SCHEMA:
@@ -288,7 +288,7 @@ class _Placed(NamedTuple):
 
 
 def _head_bytes(head: ChunkHead, told: ChunkIndex) -> bytes:
-    """What stands before the data of a chunk, by the index where that tells it."""
+    """What stands before the data of a chunk, by the index where that has it."""
     name = told.compression.encode()
     times_ns = told.message_start_time, told.message_end_time
     return (

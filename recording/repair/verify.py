@@ -1,7 +1,7 @@
 """Is a recorded session whole? Reads every byte of it and says what is damaged or missing, a sentence each.
 
 An error is something that was recorded and cannot be trusted or is not there; a note is a hole in what was measured
-that the recording itself tells of: silence of a device, frames the camera or a slow disk lost, a salvaged segment.
+that the recording itself reports: silence of a device, frames the camera or a slow disk lost, a salvaged segment.
 How the run ended is another matter: a stopped run has sound files.
 """
 
@@ -283,7 +283,7 @@ def _damaged(read: _Read) -> Iterator[Finding]:
 
 
 def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
-    """Every segment tells of the same session, and of its own place in it."""
+    """Every segment names the same session, and its own place in it."""
     told = {file.name: check.metadata for file, check in zip(finished, read.checks.values(), strict=True)}
     sessions = Counter(_entries(metadata.get(SESSION_METADATA)) for metadata in told.values())
     for file in finished:

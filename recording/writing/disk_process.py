@@ -2,8 +2,8 @@
 
 A thread that waits for a disk in the kernel cannot be killed, and keeps its whole process from ending. So a daemon that
 has to leave while the disk hangs leaves this process behind. DAEMON is the daemon's process id, each FD a line to it
-(see helper_process.py): one file that hangs does not stop the others. Until the process has ended its locks are
-held, and tell that somebody still writes.
+(see helper_process.py): one file that hangs does not stop the others. Until the process has ended it holds
+its locks, which show that a process still writes.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from recording.writing.segment import SeriesForm, Topic
 from recording.writing.settings import RecordingSettings
 from recording.writing.writers import TelemetryEncoder
 
-TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it goes on when frames or others fill the disk
+TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it continues when frames or others fill the disk
 
 
 @dataclass(frozen=True, slots=True)

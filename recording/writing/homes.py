@@ -1,4 +1,4 @@
-"""Whether the folders of a session are still where they were, and what is told when they are not."""
+"""Whether the folders of a session are still where they were, and what is reported when they are not."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Homes:
         self._tell = tell
         self._lost: dict[str, str] = {}
         self._kept: dict[str, Kept] = {}  # by what was lost
-        self._anew: list[str] = []  # made anew by a refounding that has not come to its end
+        self._anew: list[str] = []  # made again by a refounding that has not come to its end
         self._reason = ""
         self.beside: list[Beside] = []
         self.refinding = asyncio.Event()
@@ -96,8 +96,8 @@ class Homes:
             self.refinding.set()
 
     async def refound(self, telemetry: Refound, frames: Refound) -> tuple[str, ...]:
-        """Find or make again each part; the names of what had to be made anew. When the disk refuses, that is told and
-        the loss stands."""
+        """Find or make again each part; the names of what had to be made again. When the disk refuses, that is
+        reported and the loss stands."""
         parts = [(TELEMETRY, telemetry), (FRAMES, frames), *((each.name, each.refound) for each in self.beside)]
         try:
             for name, refound in parts:
@@ -117,7 +117,7 @@ class Homes:
         return anew
 
     def loss(self, anew: tuple[str, ...], from_ns: int) -> Notice:
-        """What is not in the session's folder any more: all that this run had recorded in what was made anew."""
+        """What is not in the session's folder any more: all that this run had recorded in what was made again."""
         gone = {name: self._kept[name] for name in anew if name in self._kept}
         self._kept.clear()
         to_ns = max((kept.until_ns for kept in gone.values()), default=from_ns)

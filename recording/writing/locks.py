@@ -1,7 +1,7 @@
 """Who holds the lock of a recording's file: a daemon, or what a daemon that has gone has left behind.
 
 The disk process of a daemon that was killed ends within milliseconds; while the disk hangs it cannot, and its locks
-tell truly that a block may still be written.
+rightly show that a block may still be written.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def lock(fd: int) -> None:
 
 
 def holder(fd: int) -> int:
-    """The process that has locked this file, 0 when it cannot be told: the kernel lists its locks page by page, and
+    """The process that has locked this file, 0 when it is unknown: the kernel lists its locks page by page, and
     leaves some out when others come and go meanwhile."""
     found = os.fstat(fd)
     device = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}"

@@ -39,11 +39,11 @@ class Notice:
 
 
 class SpaceWatch:
-    """Decides whether frames may be written, and tells each change once; `check` is called from several threads.
+    """Decides whether frames may be written, and reports each change once; `check` is called from several threads.
 
-    Below `stop_below_bytes` no frames are written, so that telemetry can go on; below `alert_fraction` of the disk
+    Below `stop_below_bytes` no frames are written, so that telemetry can continue; below `alert_fraction` of the disk
     there is a warning. `reserved_bytes()` is what the frames have reserved and not yet used: it counts as free.
-    `tell` takes what there is to say.
+    `tell` takes each notice.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SpaceWatch:
         self.stop_reason = f"less than {stop_below_bytes / 1e9:.1f} GB free on the disk"
 
     def check(self) -> None:
-        """Look at the disk; when it cannot be asked, nothing changes: whoever writes to it will find out why."""
+        """Look at the disk; when it cannot be asked, nothing changes: the next write will find out why."""
         with self._lock:
             reserved_bytes = self._reserved_bytes()  # first: a reserve given back meanwhile must not look like a loss
             try:
@@ -97,12 +97,12 @@ class Losses:
     def __init__(self) -> None:
         self._told = 0
         self._lost_ns: deque[tuple[str, int]] = deque()  # step, instant
-        self._begins_ns: dict[str, int] = {}  # of captures that were begun anew, by step
+        self._begins_ns: dict[str, int] = {}  # of captures that were restarted, by step
         self._new: deque[tuple[str, str, int]] = deque()  # reason, step, block
 
     @property
     def total(self) -> int:
-        """Frames lost since the beginning, without those of captures that were begun anew after them."""
+        """Frames lost since the beginning, without those of captures that were restarted after them."""
         return sum(time_ns >= self._begins_ns.get(step_id, time_ns) for step_id, time_ns in tuple(self._lost_ns))
 
     def count(self, frame: Frame, reason: str) -> None:
@@ -111,7 +111,7 @@ class Losses:
         self._new.append((reason, frame.step_id, frame.block_id))
 
     def supersede(self, step_id: str, time_ns: int) -> None:
-        """The capture was begun anew: what it lost before that instant is missing nowhere."""
+        """The capture was restarted: frames it lost before that instant are not missing."""
         self._begins_ns[step_id] = time_ns
 
     def take(self) -> list[Notice]:
@@ -132,7 +132,7 @@ class Losses:
 
 
 class DroppedReadings:
-    """Readings that did not fit into memory while the disk took nothing: told when that begins, and when it is over
+    """Readings that did not fit into memory while the disk took nothing: reported when that begins, and when it is over
     with their number and span."""
 
     def __init__(self) -> None:

@@ -114,7 +114,7 @@ class Recorder:
 
     @property
     def folder_lost(self) -> str:
-        """Why the session's folder is not there any more, as a sentence; "" while it is, or is being made anew."""
+        """Why the session's folder is not there any more, as a sentence; "" while it is, or is being made again."""
         return self._homes.lost
 
     @property
@@ -132,8 +132,8 @@ class Recorder:
         self._homes.beside.append(file)
 
     def refound(self) -> None:
-        """An operator has cleared the loss of the folder: go on in it where it is back, else in a new one at its
-        place, with numbers that go on. Returns at once; nothing happens when nothing is lost."""
+        """An operator has cleared the loss of the folder: continue in it where it is back, else in a new one at its
+        place, with continued numbers. Returns at once; nothing happens when nothing is lost."""
         self._homes.refind()
 
     def start(self, earlier: Iterable[Item] = ()) -> None:
@@ -178,7 +178,7 @@ class Recorder:
     async def run(self) -> None:
         """Record until cancelled."""
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._report_on_ticks())  # by itself: it has to tell of a disk that holds up the others
+            tasks.create_task(self._report_on_ticks())  # by itself: it has to report a disk that holds up the others
             tasks.create_task(self._save_telemetry_on_ticks())
             tasks.create_task(self._record_frames())
             tasks.create_task(self._tend_frames_on_ticks())
@@ -194,8 +194,8 @@ class Recorder:
 
     async def finish(self, within_s: float | None = None) -> None:
         """Put what still waits on the disk and complete the segments; SessionError when telemetry was not saved or its
-        segment stays unfinished, or when the disk has not done all that within so many real seconds (None: whatever it
-        takes): it is then left to itself. Items published later are not recorded. It goes on to its end also when the
+        segment stays unfinished, or when the disk has not done all that within so many real seconds (None: no
+        limit): it is then left to itself. Items published later are not recorded. It runs to its end also when the
         caller is cancelled. May be called twice."""
         if self._finishing is None:
             if not self._taking:
@@ -220,7 +220,7 @@ class Recorder:
 
     async def _finish(self) -> None:
         try:
-            async with AsyncExitStack() as stack:  # each of these is done, whatever happens to those before it
+            async with AsyncExitStack() as stack:  # each of these is done, also when one before it fails
                 stack.callback(self._telemetry_lane.close)
                 stack.callback(self._frame_lane.close)
                 stack.push_async_callback(self._telemetry_lane.call, self._telemetry_series.close)

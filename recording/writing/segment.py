@@ -2,7 +2,7 @@
 
 `NNNN.mcap.part` grows by whole blocks of records: one write, one fdatasync, then it is acknowledged. Its share of the
 disk is reserved when it is opened, so that a full disk refuses a new segment and not a frame. A finished segment gets
-its index, is synced and renamed to `NNNN.mcap`; one of many small chunks is written anew with large ones first.
+its index, is synced and renamed to `NNNN.mcap`; one of many small chunks is rewritten with large ones first.
 Metadata (`session`, `segment`) and attachments are the first records of every segment, so each is readable alone.
 Chunks have a CRC; a commit ends the chunk, so the frames series has one frame per chunk and the chunk index is its
 frame index.
@@ -70,7 +70,7 @@ class SeriesForm:
 
     A segment is full at `segment_bytes` or `segment_ns`. `reserve_bytes` of the disk are allocated when it is opened,
     less where that would leave less than `keep_free_bytes`. `merge_chunks`: a finished segment of many small chunks
-    is written anew with large ones.
+    is rewritten with large ones.
     """
 
     name: str

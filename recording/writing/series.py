@@ -107,8 +107,8 @@ class Series:
             path.unlink(missing_ok=True)
 
     def refound(self) -> bool:
-        """After a FolderLost: whether the folder is back, and writing goes on where it was; else one is made at its
-        place, and the numbers go on. OSError when that cannot be done."""
+        """After a FolderLost: whether the folder is back, and writing continues where it was; else one is made at its
+        place, and the numbers continue. OSError when that cannot be done."""
         if self._home.refound():
             return True
         segment, self._segment = self._segment, None

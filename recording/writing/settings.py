@@ -1,4 +1,4 @@
-"""What a recording is told before it begins: who records what, and how."""
+"""The settings of a recording: who records what, and how."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NOT_EMPTY = ("format", "extent", "holes")  # left out of the record when they a
 class SessionInfo:
     """Who recorded what with which; the metadata record `session` of every segment.
 
-    simulated: the devices were fakes, in whatever time. On a virtual clock `host` is not recorded: the same run on
+    simulated: the devices were fakes, in real or virtual time. On a virtual clock `host` is not recorded: that run on
     another machine is the same session.
 
     format: of the files, "" for format 1. extent: of a part that was cut out of a session, the range and how the run
@@ -44,7 +44,7 @@ class SessionInfo:
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> Self:
-        """The inverse: segments that are added to a session have its own record; a field it does not tell is ""."""
+        """The inverse: segments that are added to a session have its own record; a field it lacks is ""."""
         known: dict[str, Any] = {field.name: metadata.get(field.name, "") for field in fields(cls)}
         return cls(**{**known, "simulated": known["simulated"] == "true"})
 
@@ -56,7 +56,7 @@ class RecordingSettings:
     after it has `segment_bytes` or `segment_s`, whichever is first. While the disk takes nothing, `waiting_messages`
     are kept in memory (100 MB or so); beyond that readings are dropped, and nothing else.
 
-    With less than `stop_frames_below_bytes` free on the disk no frames are recorded, so that telemetry can go on;
+    With less than `stop_frames_below_bytes` free on the disk no frames are recorded, so that telemetry can continue;
     with less than `alert_below_fraction` of the disk free there is a warning."""
 
     frame_encoding: ImageEncoding = "png"

@@ -57,7 +57,7 @@ def chunk_writer(block: Block, compression: CompressionType) -> Writer:
 class CommitSink:
     """A new file that grows by whole blocks; a block is on the disk when `append` returns.
 
-    While it is open it is locked (flock), which tells a living recording from a dead one, and `reserve_bytes` of the
+    While it is open it is locked (flock), which marks a living recording, and `reserve_bytes` of the
     disk are its own without being part of its size. After an OSError only `settle` and `close` are left.
     """
 
@@ -66,7 +66,7 @@ class CommitSink:
         self._reserve_bytes = reserve_bytes
         self.committed_bytes = 0
         try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX)  # whoever looks at the new file meanwhile lets go at once
+            fcntl.flock(self._fd, fcntl.LOCK_EX)  # a reader that looks at the new file meanwhile lets go at once
             _reserve(self._fd, reserve_bytes)
         except OSError:
             self.close()

@@ -42,13 +42,13 @@ class Store:
             lambda: frames.reserved_bytes,
             tell,
         )
-        self.telemetry_space = self.space  # the same, for whoever writes telemetry
+        self.telemetry_space = self.space  # the same, for the writer of telemetry
         telemetry.open(time_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class _Done:
-    """What a call of a series came to; `error` beside the rest, for troubles are told also when it failed."""
+    """What a call of a series came to; `error` beside the rest, for troubles are reported also when it failed."""
 
     result: object
     error: OSError | None

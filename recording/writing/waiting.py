@@ -9,7 +9,7 @@ class Waiting:
     """Instants of publication of what is not durable yet; used from the event loop.
 
     A frame that the disk refused, or was too slow for, waits until frames can be written again, although it is lost:
-    a run must not go on as if its next one were safe.
+    a run must not continue as if its next one were safe.
     """
 
     def __init__(self) -> None:

@@ -136,7 +136,7 @@ class TelemetryEncoder:
                 yield Record(messages.LOG, item.time_ns, messages.encode_log(item))
 
     def _pose(self, batch: Batch) -> Iterator[Record]:
-        """The table's pose for viewers, once both axes have told where they are; none while one does not know."""
+        """The table's pose for viewers, once both axes have reported their positions; none while one has none."""
         for reading in batch.readings:
             if reading.channel == f"{batch.device}.position":
                 self._table.pop(reading.unit, None)
@@ -148,7 +148,7 @@ class TelemetryEncoder:
 
 
 class Fate(Enum):
-    """What became of a frame. LOST: for a reason that is not the disk's, or on a nearly full one, which is told by
+    """What became of a frame. LOST: for a reason that is not the disk's, or on a nearly full one, which is reported by
     itself. REFUSED: lost because the disk refuses it. HOMELESS: its folder is gone, and it may be saved later."""
 
     SAVED = "saved"
@@ -207,7 +207,7 @@ class ImageWriter:
             return Fate.HOMELESS, str(error.strerror)
         except OSError as error:
             return Fate.REFUSED, str(error)
-        except Exception as error:  # noqa: BLE001 - whatever an encoder makes of one frame, the night goes on
+        except Exception as error:  # noqa: BLE001 - an encoder that fails on one frame must not end the run
             return Fate.LOST, f"{type(error).__name__}: {error}"
         return Fate.SAVED, ""
 

@@ -48,7 +48,7 @@ class Keeper:
             await self.clock.sleep_until(due_ns)
 
     async def beat(self) -> None:
-        """Once: the relays compared, and armed while that is permitted, else whatever runs stopped; DeviceError."""
+        """Once: the relays compared, and armed while that is permitted, else stopped if running; DeviceError."""
         if self.permits.granted:
             mv_heat, mv_cool = (value_of(self.hub, f"{self.regulator.name}.{name}") for name in ("mv_heat", "mv_cool"))
             coils = await self.permits.arm(mv_heat, mv_cool)

@@ -121,8 +121,8 @@ class Permits:
             return coils
 
     async def supervise(self) -> dict[str, bool]:
-        """While the permission is withdrawn: whatever reads on is switched off, event `switched_off`. Returns what the
-        coils read before that."""
+        """While the permission is withdrawn: a relay that reads on is switched off, event `switched_off`. Returns what
+        the coils read before that."""
         async with self._comparing:
             was_withdrawn = self.permission is Permission.WITHDRAWN
             coils = await self._coils()

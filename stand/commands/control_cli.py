@@ -57,7 +57,7 @@ def status(
 def pause(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
     """Hold the run before its next action; the chamber keeps its set-point, a dwell what it has earned.
 
-    What moves goes on to its place, and the answer says what that is; `stand stop` stops it. The flap is shut within a
+    Moves under way are completed, and the answer lists them; `stand stop` stops it. The flap is shut within a
     minute. After guard.pause_limit_h the stand is made safe and held.
 
     Example: stand pause && stand continue

@@ -131,7 +131,7 @@ def start(
         try:
             asyncio.run(work(directory, run_one, WallClock(), _say))
         except Interrupted as error:
-            raise typer.Exit(INTERRUPTED) from error  # its end has been told
+            raise typer.Exit(INTERRUPTED) from error  # its end has been reported
 
 
 def queue_lines(found: Queue) -> list[str]:

@@ -135,7 +135,7 @@ def resume_run(
 
 
 def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
-    """What follows a complete run: the next plan's durations, its folder told, its report."""
+    """What follows a complete run: the next plan's durations, its folder printed, its report."""
     try:
         learn(session.parent, config)
     except (SessionError, OSError) as error:  # what cannot be kept is no reason for a run to fail
@@ -177,7 +177,7 @@ def small_disk(free_bytes: int, steps: Iterable[PricedStep], config: StandConfig
 
 
 def _check_writable(directory: Path) -> None:
-    """ConfigError when no session could be made below `directory`: to be told before anything is opened."""
+    """ConfigError when no session could be made below `directory`: to be raised before anything is opened."""
     try:
         Path(tempfile.mkdtemp(prefix=".writable-", dir=_existing(directory))).rmdir()
     except OSError as error:

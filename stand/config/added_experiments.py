@@ -63,7 +63,7 @@ def _loaded(point: EntryPoint) -> tuple[Callable[[BaseModel], object], type[Base
         make = point.load()
         (parameter,) = inspect.signature(make).parameters
         model = get_type_hints(make)[parameter]
-    except Exception as error:  # whatever importing a stranger's module raises
+    except Exception as error:  # importing a stranger's module may raise anything
         text = f"{point.name}: {_package(point)} cannot be loaded ({_told(error)}); reinstall it, or leave this out"
         raise ValueError(text) from error
     if not (inspect.isclass(model) and issubclass(model, BaseModel)):

@@ -1,4 +1,4 @@
-"""The configuration's guard section: when the stand is made safe. The upper bounds hold whatever a file says."""
+"""The configuration's guard section: when the stand is made safe. A file cannot exceed the upper bounds."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ class CoolingConfig(Document):
 
 
 class SensorsConfig(Document):
-    """Regulator and air thermometer, and values that do not change. A difference above warn_K for warn_after_s is told,
-    one above trip_K for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A thermometer
-    that is exactly constant for stuck_after_s is told; the regulator's value constant for pv_stuck_after_s while the
-    air goes air_moves_K is a fault.
+    """Regulator and air thermometer, and values that do not change. A difference above warn_K for warn_after_s is a
+    warning, one above trip_K for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A
+    thermometer that is exactly constant for stuck_after_s is a warning; the regulator's value constant for
+    pv_stuck_after_s while the air goes air_moves_K is a fault.
     """
 
     warn_K: float = Field(default=3.0, gt=0, le=20)

@@ -1,6 +1,6 @@
 """Values of a configuration that would disarm a rule: a file may have them only if `guard.accept` names their paths.
 
-The ranges of the fields themselves are wider and hold whatever a file says.
+The ranges of the fields themselves are wider, and no file can exceed them.
 """
 
 from __future__ import annotations

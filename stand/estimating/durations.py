@@ -1,6 +1,6 @@
 """How long each step takes: what the recipe and physics state, and what that kind of work usually takes beyond it.
 
-A step's duration depends on what came before (a stage that is there already, a flap that is closed), so whoever asks
+A step's duration depends on what came before (a stage that is there already, a flap that is closed), so the caller
 walks the plan with the Situation that each step finds.
 """
 

@@ -22,11 +22,11 @@ class Eta:
     """Follows a run by its step marks and says how long it will still take on the stand's clock.
 
     What work of a kind takes beyond what is stated is the lower median of the estimate and what the run has measured:
-    a single delay, such as a pause that nobody told of, changes nothing. Steps before the running one are never waited
-    for.
+    a single delay, such as a pause that was not announced, changes nothing. Steps before the running one are never
+    waited for.
 
-    Of a run that goes on after an interruption, `done` are the ids of steps that are done, `earned_s` what others have
-    earned of what is stated, by their ids.
+    Of a run that is resumed after an interruption, `done` are the ids of steps that are done, `earned_s` what others
+    have earned of what is stated, by their ids.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Eta:
         return waiting is not None
 
     def _begin(self, step: PricedStep, time_ns: int) -> None:
-        for index in range(step.planned.index + 1, self._first):  # of a warm-up that begins anew
+        for index in range(step.planned.index + 1, self._first):  # of a warm-up that is restarted
             self._wait_for(index)
         self._first = min(self._first, step.planned.index)
         for index in range(self._first, step.planned.index + 1):

@@ -50,7 +50,7 @@ class Learned(Document):
 
 def load_learned(directory: Path) -> Learned:
     """What is kept in `directory`; defaults when there is nothing or nothing that can be read: an estimate is no
-    reason not to run, and the file is written anew at the end of each."""
+    reason not to run, and the file is rewritten at the end of each."""
     try:
         return Learned.model_validate_json((directory / LEARNED_FILE).read_bytes())
     except (OSError, ValueError):
@@ -123,7 +123,7 @@ def _nights(directory: Path, config: StandConfig) -> Iterator[_Night]:
 
 
 def _night(path: Path, stand: str) -> _Night | None:
-    """What the session teaches; None when it is another stand's, or cannot be read for whatever reason: a neighbour
+    """What the session teaches; None when it is another stand's, or cannot be read for any reason: a neighbour
     in the folder never ends a run."""
     try:
         session = Session.open(path)

@@ -83,7 +83,7 @@ class Ramp:
     """One recorded answer to a new set-point.
 
     arrivals: (level in K, s after the step from when on the air stayed within it). camera_time_constant_s: of the
-    camera meanwhile, NaN when it did not move enough to tell.
+    camera meanwhile, NaN when it did not move enough to fit it.
     """
 
     from_degC: float
@@ -157,7 +157,7 @@ def _fit_response(ramps: Sequence[Ramp], default: Response) -> Response:
         )
         left_s = at_s - _approach_s(gap_K, level_K, rate, time_constant)
         dead_s = np.maximum(np.median(left_s, axis=1, keepdims=True), 0.0)
-        # Ramps that never ran at full rate do not tell the rate: then the default stays.
+        # Ramps that never ran at full rate do not determine the rate: then the default stays.
         strange = np.abs(np.log(rate / default.rate_K_per_s)) + np.abs(np.log(time_constant / default.time_constant_s))
         cost_s = np.mean(np.abs(left_s - dead_s), axis=1) + _PRIOR_S * strange[:, 0]
         at = int(np.argmin(cost_s))

@@ -1,7 +1,7 @@
 """What a body in the chamber feels of the air: a look that believes neither of the two probes.
 
-A body of lag L follows the air T by dB/dt = (T - B) / L, so that T = B + L dB/dt: whatever the probes say, a body that
-warms shows how warm the air around it is. Both are taken over the same window, the body's rate by least squares.
+A body of lag L follows the air T by dB/dt = (T - B) / L, so that T = B + L dB/dt: independently of the probes, a body
+that warms shows how warm the air around it is. Both are taken over the same window, the body's rate by least squares.
 L is known roughly only; the error that makes grows with how far the body is from the air, and so does what is allowed.
 """
 

@@ -80,8 +80,8 @@ class Guard:
 
     def clear(self) -> Fault | None:
         """An operator has looked: the hold, which is returned, is forgotten, and every grace time begins again.
-        What is wrong still trips again, what has no grace time before anything moves. Letting the run go on is the
-        caller's."""
+        What is wrong still trips again, what has no grace time before anything moves. Continuing the run is the
+        caller's task."""
         fault, self.held = self.held, None
         for watch in self.watches:
             watch.since_ns = None
@@ -146,7 +146,7 @@ class Guard:
         self.release()
 
     def _note_time(self) -> None:
-        """Lateness counts from the last look: whatever kept the guard from it counts, a stopped process as well."""
+        """Lateness counts from the last look: any cause of a delay counts, also a stopped process."""
         now_ns = self.clock.now_ns()
         looked_ns, self._looked_ns = self._looked_ns, now_ns
         if looked_ns is None or now_ns - looked_ns <= _LATE_PERIODS * seconds_ns(self.period_s):

@@ -33,7 +33,7 @@ class Given:
 
 
 def too_much_heat(max_Wh_per_h: float, heater_W: float, regulator: str, permit: str) -> Rule:
-    """More heat within an hour than the chamber ever needs, whatever any sensor says."""
+    """More heat within an hour than the chamber ever needs, regardless of the sensors."""
 
     def step(last: Given | None, readings: Readings, now_ns: int) -> tuple[Given | None, Fault | None]:
         if last is None:

@@ -20,7 +20,7 @@ class Notifier:
     """Runs `command` with the sentence as its last argument, without a shell, in a session of its own, for at most
     `limit_s` real seconds. An empty command notifies nobody.
 
-    A small process runs it, so that people are notified whatever state the daemon and its disk are in. It is there from
+    A small process runs it, so that people are notified also when the daemon or its disk hangs. It is there from
     `start` on, else from the first sentence on; one that has died, or does not answer, is replaced with the next.
     """
 

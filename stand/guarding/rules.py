@@ -53,7 +53,7 @@ VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these there is 
 
 
 class Announcements:
-    """What is said on the hub besides readings and matters to a rule: subscribe `receive`.
+    """What rules need from the hub besides readings: subscribe `receive`.
 
     is_capturing: a Capture has begun and not ended. frames_stopped: why the recorder takes no frames, "" while it does.
     is_paused: an operator has paused the run, or has not answered a prompt.

@@ -27,7 +27,7 @@ class Cameras:
 
     @property
     def restarted(self) -> str:
-        """Why one has, or may have, started anew by itself; "" when none has."""
+        """Why one has, or may have, restarted by itself; "" when none has."""
         return "; ".join(camera.restarted for camera in self._cameras if camera.restarted)
 
     async def open(self) -> None:

@@ -113,7 +113,7 @@ class Imaging:
             )
         finally:
             self._gate.clear(CAMERA_LOST)
-            # One that opens at once and never gives a frame does not go on for ever either.
+            # One that opens at once and never gives a frame is given up in the end, too.
             self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
         if is_open:
             self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))

@@ -62,7 +62,7 @@ def move(directory: Path, number: int, position: int) -> None:
 
 
 def remove(directory: Path, number: int) -> Entry:
-    """Take a run out of the queue, whatever became of it; its session stays. SessionError when it is running."""
+    """Take a run out of the queue, in any state but running; its session stays. SessionError when it is running."""
     with changing(directory) as draft:
         entry = draft.entry(number)
         if entry.state is State.RUNNING:
@@ -74,7 +74,7 @@ def remove(directory: Path, number: int) -> Entry:
 def take(directory: Path, now_ns: int) -> Entry | None:
     """The next run, marked as running, as it was before: an interrupted one has its session. None when all are done.
 
-    StandTripped when the queue was halted and no operator has said that it may go on.
+    StandTripped when the queue was halted and no operator has cleared it.
     """
     with changing(directory) as draft:
         queue = draft.queue
@@ -120,6 +120,6 @@ def finish(directory: Path, number: int, state: State, now_ns: int, reason: str 
 
 
 def clear(directory: Path) -> None:
-    """An operator says that a halted queue may go on."""
+    """An operator clears a halted queue."""
     with changing(directory) as draft:
         draft.set(halted="")

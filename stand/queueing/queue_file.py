@@ -38,7 +38,7 @@ class State(StrEnum):
 
 
 def _folder_name(name: str) -> str:
-    """A session's folder lies in the recording directory, whatever the file says."""
+    """A session's folder must be in the recording directory."""
     if name in (".", "..") or "/" in name or "\\" in name or not name.isprintable() or len(name.encode()) > 255:
         raise ValueError("expected the name of a folder in the recording directory")
     return name
@@ -49,7 +49,7 @@ class Entry(Document):
 
     config: the file its text is from, for messages. Instants are ns since the epoch on the host's clock. session: the
     name of its folder in the recording directory, "" before it has one. reason: why it failed or was interrupted.
-    fruitless_starts: how often in a row it was begun or gone on with and has not finished one more step.
+    fruitless_starts: how often in a row it was begun or resumed without finishing one more step.
     """
 
     id: int = Field(ge=1)
@@ -130,7 +130,7 @@ def working(directory: Path) -> Generator[None]:
     """Be the one who works this queue; SessionError when somebody else is. What the one before had under way is
     interrupted from now on."""
     with _opened(directory / _WORKER_NAME) as worker:
-        with _locked(directory):  # whoever only looks if the queue is worked does so inside the same lock
+        with _locked(directory):  # a check whether the queue is being run takes the same lock
             if not _try_lock(worker):
                 raise SessionError(f"{directory}: another process is running its queue already")
             found = _load(directory)

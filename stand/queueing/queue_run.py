@@ -31,7 +31,7 @@ from stand.session_report import NotReported, check_reportable, report_session
 async def run_entry(
     directory: Path, entry: Entry, notes: Notes, tell: Callable[[str], None], *, virtual_time: bool
 ) -> Path:
-    """Run `entry` into a session below `directory`, or go on in the one it has; progress is shown, `tell` gets
+    """Run `entry` into a session below `directory`, or resume the one it has; progress is shown, `tell` gets
     warnings.
 
     Returns the session's folder. Halt when an interrupted run cannot be resumed, or one that failed has left the stand
@@ -95,7 +95,7 @@ def conclude(entry: Entry, session: Path, tell: Callable[[str], None], *, report
             tell(line)
     except (ConfigError, NotReported) as error:
         tell(f"{session.name}: {error}")
-    except Exception as error:  # noqa: BLE001 - the night goes on, whatever a fit makes of one session
+    except Exception as error:  # noqa: BLE001 - a fit that fails must not end the queue
         tell(f"{session.name}: is recorded, but not reported: {type(error).__name__}: {error}")
 
 
@@ -120,7 +120,7 @@ def _interruption(session: Path, own: StandConfig) -> Interruption:
 
 
 def _is_complete(session: Path) -> bool:
-    """Whether the run recorded in `session` came to its end; Halt when its journal cannot tell."""
+    """Whether the run recorded in `session` came to its end; Halt when its journal does not say."""
     try:
         journal, entries = Journal.open(session)
     except SessionError as error:

@@ -1,4 +1,4 @@
-"""Works a queue of runs: one at a time, until it is empty or must not go on without an operator."""
+"""Runs a queue of runs: one at a time, until it is empty or needs an operator."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_FRUITLESS_STARTS = 3
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """What a run tells while it goes.
+    """What a run reports while it is under way.
 
     begun: its session's folder, as soon as a run that is killed could be resumed in it. step_done: it has finished a
     step that it had not finished before.
@@ -29,7 +29,7 @@ class Notes:
     step_done: Callable[[], None]
 
 
-# Runs the entry, or goes on with it when it has a session, and returns the session's folder.
+# Runs the entry, or resumes it when it has a session, and returns the session's folder.
 RunOne = Callable[[Entry, Notes], Awaitable[Path]]
 
 
@@ -52,7 +52,7 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
 
 
 class Halt(StandError):
-    """The queue must not go on before an operator has looked; the text says why."""
+    """The queue must not continue before an operator has looked; the text says why."""
 
 
 class _Run:
@@ -71,7 +71,7 @@ class _Run:
         self._end(State.FAILED, f"its daemon was killed {times} before one more step was done{left}")
 
     async def perform(self, run_one: RunOne) -> None:
-        """Run it, or go on with it; raises what ends the work."""
+        """Run or resume it; raises what ends the work."""
         entry = self._entry
         self._tell(f"{self._name} " + (f"is resumed in {entry.session}" if entry.session else "begins"))
         try:

@@ -33,8 +33,8 @@ from stand.running.state import Plan, RunState, SetUp
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
 # chamber left alone for a minute has gone further. The camera, which is slower than the air, has then hardly moved.
 CREDITED_WITHIN_K = 1.0
-# A capture that did not go on for longer than this is taken again: its flap was shut meanwhile, and the air is not the
-# same any more.
+# A capture that was interrupted for longer than this is taken again: its flap was shut meanwhile, and the air is not
+# the same any more.
 AGAIN_AFTER_S = 60.0
 
 
@@ -118,7 +118,7 @@ class Aim:
 
 @dataclass(frozen=True, slots=True)
 class TakeAgain:
-    """The capture begins anew, after such an outage."""
+    """The capture is restarted, after such an outage."""
 
     planned: PlannedStep
     outage_ns: int
@@ -217,7 +217,7 @@ def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capt
 
 def next_due_ns(due_ns: int | None, capture: Capture, around: Surroundings, *, is_lost: bool) -> int:
     """When the next frame is due after the capture was made ready, on a grid of absolute deadlines: those missed while
-    the run was held or a lost camera opened anew are skipped, not made up for by a burst."""
+    the run was held or a lost camera reopened are skipped, not made up for by a burst."""
     if due_ns is None:
         return around.now_ns + around.lead_ns
     interval_ns = seconds_ns(capture.interval_s)
@@ -257,7 +257,7 @@ def _last_switch(steps: Plan, *, on: bool) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """What the soaks that were begun are worth after a disturbance; `lost` are soaked anew. kind: of the event that
+    """What the soaks that were begun are worth after a disturbance; `lost` are soaked again. kind: of the event that
     says so, "" when there was nothing to lose; text: of it."""
 
     kind: str = ""

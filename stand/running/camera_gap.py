@@ -122,8 +122,8 @@ _SAME_K = 1.0  # a camera that is as warm as it was last has been on
 
 @dataclass(frozen=True, slots=True)
 class CameraBefore:
-    """What a session tells of the camera. last: its last temperature, None when it never gave one. boot_id: of the
-    host, "" when it is not known. lost: why it was not in equilibrium at the end, "" when nothing speaks against it.
+    """What a session records of the camera. last: its last temperature, None when it never gave one. boot_id: of the
+    host, "" when it is not known. lost: why it was not in equilibrium at the end, "" when it was.
     offsets_K: camera minus air by set-point (degC)."""
 
     last: CameraTemperature | None = None

@@ -13,7 +13,7 @@ _TRIES, _PAUSE_S = 3, 1.0
 
 
 async def check_temperature(camera: Camera, hub: Hub, clock: Clock) -> None:
-    """The camera, which is open, shows its temperature, or is configured to have none, which is told.
+    """The camera, which is open, shows its temperature, or is configured to have none, which is reported.
 
     Refused, with the feature and what the camera offers, when three readings in a row are BAD.
     """

@@ -145,7 +145,7 @@ def _file_name(place: str) -> str:
 
 
 def _holder(file_name: str) -> str:
-    """Who says to have the lock, in the words of the sentence; whoever takes it just now says so in a moment."""
+    """Who has the lock, as words of the sentence; a process that is just taking it writes its name a moment later."""
     for _ in range(_HOLDER_TRIES):
         for folder in runtime_folders():
             with suppress(OSError, ValueError, LookupError, TypeError):

@@ -59,7 +59,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Dwell:
-    """A soak has earned `earned_s` of its duration; also after its end, when it has to be earned anew."""
+    """A soak has earned `earned_s` of its duration; also after its end, when it has to be earned again."""
 
     time_ns: int
     step_id: str
@@ -93,7 +93,7 @@ class Again:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """The step is not done, or not to its end, and the run goes on behind it; its frames so far count."""
+    """The step is not done, or not to its end, and the run continues behind it; its frames so far count."""
 
     time_ns: int
     step_id: str
@@ -119,7 +119,7 @@ class Edited:
 
 @dataclass(frozen=True, slots=True)
 class Tripped:
-    """The guard has made the stand safe; nothing goes on before an operator has cleared it."""
+    """The guard has made the stand safe; nothing is done before an operator has cleared it."""
 
     time_ns: int
     rule: str
@@ -152,8 +152,8 @@ class Taken:
 
 @dataclass(frozen=True, slots=True)
 class Due:
-    """The next frame of the capture under way is due then, None when its deadlines begin anew. lost: the camera did not
-    give the last one."""
+    """The next frame of the capture under way is due then, None when its deadlines start again. lost: the camera did
+    not give the last one."""
 
     time_ns: int
     due_ns: int | None

@@ -1,6 +1,6 @@
-"""Performs what the table of a run says (stand/running/actions.py), and enters what came of it.
+"""Performs what the table of a run says (stand/running/actions.py), and enters the results.
 
-One loop for a run that goes on, was held, tripped, killed or resumed: what it remembers is the logbook's state and
+One loop for a run that continues, was held, tripped, killed or resumed: what it remembers is the logbook's state and
 nothing else. What an action raises ends the run, unless something has undone the set-up meanwhile: then the table says
 what is next.
 """
@@ -90,8 +90,8 @@ _JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
 class Executor:
     """Performs the plan of the logbook's state.
 
-    `flushed` returns when all that was published is on the disk. `settling` tells when a soak may end early, `offsets`
-    is told what has settled. `allowed` raises ConfigError when this stand may not do a plan.
+    `flushed` returns when all that was published is on the disk. `settling` decides when a soak may end early,
+    `offsets` gets what has settled. `allowed` raises ConfigError when this stand may not do a plan.
     """
 
     def __init__(
@@ -250,8 +250,8 @@ class Executor:
                 pass
 
     async def _begin_anew(self, again: Plan, how: str) -> None:
-        """These steps count as neither begun nor done, and no frame of theirs so far: told before it is journaled, so
-        that no frame is ever left out that nobody was told of."""
+        """These steps count as neither begun nor done, and no frame of theirs so far: reported before it is journaled,
+        so that no frame is ever left out unreported."""
         now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]
         self._hub.publish(restarted(now_ns, step_ids[-1], self._state.frames.get(step_ids[-1], 0), how))
         await self._flushed()
@@ -297,7 +297,7 @@ class Executor:
         if frame.is_settled:
             self._offsets.settled(capture.chamber_degC)
         if self._state.was_held and capture.role is Role.WARM_UP:
-            # A camera goes on warming up while the run is held: what was not seen of it is told.
+            # A camera continues to warm up while the run is held: what was not seen of it is reported.
             missing_s = (self._clock.now_ns() - self._state.seen_ns) / NS_PER_S
             text = f"the run was held: the camera has warmed up for {missing_s:.1f} s without a frame"
             self._log.tell("warning", "warm_up_gap", text)

@@ -1,6 +1,6 @@
 """The state of a run, folded from its entries.
 
-    state = fold(plan, entries)         the same for a run that goes on and for one that is resumed
+    state = fold(plan, entries)         the same for a run under way and for one that is resumed
     state = after(state, entry)
 
 Pure: no clock, no disk, no device.
@@ -253,7 +253,7 @@ def _counted(state: RunState, time_ns: int, reasons: frozenset[str], *, readying
 
 
 def _gap(state: RunState, entry: Gap) -> RunState:
-    """Another daemon goes on: nothing holds it yet, nothing is under way, and nobody knows how the stand is."""
+    """Another daemon resumes the run: nothing holds it yet, nothing is under way, and the stand's state is unknown."""
     return replace(
         state,
         under_way="",
@@ -269,7 +269,7 @@ def _gap(state: RunState, entry: Gap) -> RunState:
 
 
 def _again(state: RunState, entry: Again) -> RunState:
-    """A capture under way begins anew where it is; for other steps what those before them set up is needed again."""
+    """A capture under way is restarted where it is; for other steps what those before them set up is needed again."""
     ids = frozenset(entry.step_ids)
     frames = MappingProxyType({each: count for each, count in state.frames.items() if each not in ids})
     kept = replace(

@@ -40,7 +40,7 @@ from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.serving.control import handlers, serve
 
-# The recorder's events that hold a run, and those that let it go on.
+# The recorder's events that hold a run, and those that let it continue.
 _HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
 # A run in virtual time that is held for so many times the longest pause ends.
 _VIRTUAL_PAUSES = 2
@@ -49,8 +49,8 @@ _RELEASING = {"frames_resumed": DISK_LOW, "telemetry_saved_again": NOT_RECORDED}
 
 @dataclass(frozen=True, slots=True)
 class GuardedRun:
-    """What is run, by what, and what it goes on from. `begun` is told the folder when its journal is on the disk,
-    `background` are tasks without which nothing goes on."""
+    """What is run, by what, and what it is resumed from. `begun` gets the folder when its journal is on the disk,
+    `background` are tasks whose end ends the run."""
 
     order: Order
     seed: int | None
@@ -108,7 +108,7 @@ async def _taken_down(
     assembly: Assembly, guard: Guard, watchers: Sequence[asyncio.Task[None]], pollers: Iterable[Poller]
 ) -> None:
     """The actuators safe, tried until they confirm it, and nobody left who could move them; then one more look at every
-    device, so that the recording ends with the safe state as the wire tells it."""
+    device, so that the recording ends with the safe state as read from the wire."""
     safety = assembly.stand.safety
     try:
         safety.demand()
@@ -173,15 +173,15 @@ def _judge_camera(before: Interruption, assembly: Assembly) -> None:
 
 
 def _begin_data(work: GuardedRun, state: RunState) -> dict[str, object]:
-    """For whoever resumes the run: whether the host has run on since, and which plan it is, should the journal have
-    lost that. For whoever counts what is done: how many steps and frames the plan has."""
+    """For a resume: whether the host has run on since, and which plan it is, should the journal have
+    lost that. For counts of what is done: how many steps and frames the plan has."""
     plan, boot = plan_hash(work.order.recipe.plan()), boot_of(work.assembly.clock)
     data: dict[str, object] = {**state.size, "plan": plan, "seed": work.seed}
     return data if boot is None else {**data, "boot_id": boot.id}
 
 
 async def _board(work: GuardedRun, guard: Guard, state: RunState) -> StatusBoard:
-    """What tells the state of the run, from before its first step on."""
+    """The published state of the run, from before its first step on."""
     assembly = work.assembly
     kept = state if work.before is None else work.before.kept
     with assembly.clock.hold():  # nothing moves yet: the disk may take its time
@@ -195,7 +195,7 @@ async def _board(work: GuardedRun, guard: Guard, state: RunState) -> StatusBoard
 
 
 async def _answer(work: GuardedRun, board: StatusBoard, log: Logbook) -> None:
-    """Answer at the control socket until cancelled; a run goes on without one."""
+    """Answer at the control socket until cancelled; a run can do without one."""
     stand = work.assembly.stand
     table = handlers(stand.gate, work.stop, board.status, lambda: stand.motions.texts)
     try:
@@ -215,7 +215,7 @@ def _first_entries(work: GuardedRun) -> tuple[Written, ...]:
 
 
 def _tell_interruption(work: GuardedRun, before: Interruption, log: Logbook) -> None:
-    """The end of the run that was interrupted, the gap since, and that it goes on."""
+    """The end of the run that was interrupted, the gap since, and that it is resumed."""
     clock = work.assembly.clock
     now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
     if before.state.ended is None:

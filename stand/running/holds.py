@@ -22,7 +22,7 @@ _AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be wo
 
 
 async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
-    """Until cancelled. The events `flap_shut_in_hold` and, when it does not close, `flap_not_shut` (an error) tell."""
+    """Until cancelled. Events: `flap_shut_in_hold` and, when it does not close, `flap_not_shut` (an error)."""
     while True:
         await stand.gate.closed()
         if await _opens_within(stand.gate, clock, SHUT_AFTER_S):

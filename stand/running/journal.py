@@ -1,5 +1,5 @@
-"""What happens to a run: told to the hub, folded into its state, and kept in `journal.jsonl`, from which a killed run
-goes on.
+"""What happens to a run: published on the hub, folded into its state, and kept in `journal.jsonl`, from which a
+killed run is resumed.
 
 Append-only, one entry a line (stand/running/entries.py). A line is on the disk (fdatasync) when `write` returns. What
 follows the last sound line is cut off before anything is appended. A damaged line before it stays where it is, and the
@@ -42,8 +42,8 @@ _KEPT = "journal"  # its name in the disk process
 class Journal:
     """The journal of one session, locked (flock) while it is open: one daemon per session.
 
-    Lines that the disk refuses are kept and written with the next one; `trouble` is told when that begins. All lines
-    are kept in memory: a journal that was removed under its run is written anew when an operator has cleared that.
+    Lines that the disk refuses are kept and written with the next one; `trouble` is called when that begins. All lines
+    are kept in memory: a journal that was removed under its run is rewritten when an operator has cleared that.
     """
 
     def __init__(self, path: Path, fd: int, data: bytes, damage: str = "") -> None:
@@ -137,7 +137,7 @@ class Journal:
         self._failing = failure is not None
 
     async def refound(self) -> bool:
-        """Whether the file is at its place; else it is written there anew, whole. OSError when the disk refuses."""
+        """Whether the file is at its place; else the whole file is rewritten there. OSError when the disk refuses."""
         if self._lane is None:
             return True
         is_back = await self._lane.call(self._refound)
@@ -231,7 +231,7 @@ def _kept(path: Path, data: bytes, last_damaged: int) -> Path:
 
 
 def _ignored(text: str) -> None:
-    """Before `start` there is nothing to tell."""
+    """Before `start` there is nothing to report."""
 
 
 class JournalFile:
@@ -349,11 +349,11 @@ class Logbook:
         self._hub.publish(Event(self._clock.now_ns(), level, kind, text, data or {}))
 
     def tripped(self, fault: Fault) -> None:
-        """The guard makes the stand safe; it tells the hub by itself."""
+        """The guard makes the stand safe; it publishes that itself."""
         self._note(Tripped(self._clock.now_ns(), fault.rule, fault.text))
 
     def held(self, reason: str, held: bool) -> None:
-        """A listener of the gate; the end of a run is told by itself."""
+        """A listener of the gate; the end of a run is published separately."""
         if reason == STOPPING:
             return
         level, kind = ("warning", "held") if held else ("info", "released")

@@ -1,7 +1,7 @@
 """A session that is resumed brings its experiment, never its stand: it may be somebody else's, and what it names would
 be run and opened here.
 
-The programs that are run, the files and folders, the addresses, and whatever protects the stand are those of this
+The programs that are run, the files and folders, the addresses, and all that protects the stand are those of this
 stand's own configuration. Of the session's remain recipe, seed and target, and what its frames depend on.
 """
 
@@ -49,7 +49,7 @@ class Difference:
 
 
 def default_stand() -> StandConfig:
-    """Of whoever names no configuration: the installed simulated one, as for a new run."""
+    """When no configuration is named: the installed simulated one, as for a new run."""
     return load_config(packaged("", "simulated"))
 
 

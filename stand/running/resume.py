@@ -1,9 +1,9 @@
-"""What a session says of a run that did not come to its end, and whether it may go on.
+"""What a session says of a run that did not come to its end, and whether it may be resumed.
 
-The journal tells what was done, the recording what that has left: a step whose end is recorded is done, and a frame
+The journal says what was done, the recording what it produced: a step whose end is recorded is done, and a frame
 counts when its image and its description are both on the disk. What only the recording proves is put between the
-journal's entries, and all of them are folded into the state from which the run goes on. Recipe, seed and target are
-those of the session, whatever today's files are; the stand is this one (stand.running.own_stand).
+journal's entries, and all of them are folded into the state from which the run is resumed. Recipe, seed and target are
+those of the session, not today's files; the stand is this one (stand.running.own_stand).
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ def _text_hashes(texts: Mapping[str, str]) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Interruption:
-    """A run that may go on. Its journal is open, and so locked, until it is run or `release`d.
+    """A run that may be resumed. Its journal is open, and so locked, until it is run or `release`d.
 
-    state: as journal and recording tell. last_ns: the last instant on the disk. seed: of the simulated laboratory.
-    tripped: what an operator has cleared. salvaged: what had to be finished first. camera: what the session tells of
+    state: by journal and recording. last_ns: the last instant on the disk. seed: of the simulated laboratory.
+    tripped: what an operator has cleared. salvaged: what had to be finished first. camera: what the session records of
     it. utc_offset_ns: UTC minus the stand's clock at last_ns, as it is recorded. differences: between the configuration
-    of the session and that of this stand, with which it goes on.
+    of the session and that of this stand, with which it is resumed.
     """
 
     directory: Path
@@ -74,7 +74,7 @@ class Interruption:
 
     @property
     def kept(self) -> RunState:
-        """What counts of it: without the steps of a warm-up that begins anew."""
+        """What counts of it: without the steps of a warm-up that is restarted."""
         again = [planned.step_id for planned in cold_start(self.state)]
         return after(self.state, Again(self.last_ns, again)) if again else self.state
 
@@ -84,7 +84,7 @@ class Interruption:
 
 
 def interruption(directory: Path, own: StandConfig | None = None, *, clear: bool = False) -> Interruption:
-    """What is needed to go on with the run recorded in `directory` on this stand, the installed simulated one when no
+    """What is needed to resume the run recorded in `directory` on this stand, the installed simulated one when no
     `own` is given; its unfinished segments are salvaged.
 
     ConfigError when only one of the two stands is simulated. SessionError when a daemon is running it, it is complete,
@@ -149,7 +149,7 @@ def _check_may_go_on(directory: Path, state: RunState, clear: bool) -> None:
 
 def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Iterable[tuple[int, str]]) -> list[Entry]:
     """The entries of a journal, and between them what only the recording proves: by `items` steps that are done,
-    captures that were begun anew and changes of the plan, by `frames` (instant and step of each) what was captured."""
+    captures that were restarted and changes of the plan, by `frames` (instant and step of each) what was captured."""
     done: list[Entry] = []
     others: list[Entry] = [Taken(time_ns, step_id) for time_ns, step_id in frames]
     known = {(entry.time_ns, step_id) for entry in entries if isinstance(entry, Again) for step_id in entry.step_ids}

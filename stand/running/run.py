@@ -1,4 +1,4 @@
-"""One run from beginning to end: open everything, record, perform the plan, leave the stand safe whatever happens."""
+"""One run from beginning to end: open everything, record, perform the plan, leave the stand safe in every case."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """What to run and who watches: anew, in a folder below `out`, or on from where a run was interrupted (`before`)."""
+    """What to run and who watches: from the start, in a folder below `out`, or resuming an interruption (`before`)."""
 
     order: Order
     out: Path
@@ -70,7 +70,7 @@ class _Job:
 
 
 def _nobody(_: Path) -> None:
-    """Is told of the session and does nothing."""
+    """Gets the session and does nothing."""
 
 
 async def run_virtual(
@@ -82,9 +82,9 @@ async def run_virtual(
 ) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
-    The laboratory takes free addresses, whatever the configured ones are: any number of virtual runs go side by side.
+    The laboratory takes free addresses, not the configured ones: any number of virtual runs go side by side.
     The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start;
-    `begun` is told the folder as soon as a run that is killed could be resumed in it.
+    `begun` gets the folder as soon as a run that is killed could be resumed in it.
     Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
     """
     simulation = order.config.simulation
@@ -96,17 +96,17 @@ async def run_virtual(
 async def run_real(
     order: Order, out: Path, watch: Callable[[Hub], None], begun: Callable[[Path], None] = _nobody
 ) -> Path:
-    """Run on the host's clock, against whatever answers at the configured addresses; else as run_virtual."""
+    """Run on the host's clock, against the devices at the configured addresses; else as run_virtual."""
     async with Stop() as stop:
         return await _run(_Job(order, out, None, watch, begun), WallClock(), None, stop)
 
 
 async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0) -> Path:
-    """Go on with an interrupted run, in the time it was run in, and add to its session; raises as run_virtual.
+    """Resume an interrupted run, in the time it was run in, and add to its session; raises as run_virtual.
 
     What is done is not done again. In virtual time the laboratory is a new one with a chamber at room temperature,
     `downtime_s` after the last recorded instant. When the host's clock is before that instant (it was set back since),
-    the session goes on at that instant, and the offset to UTC is recorded.
+    the session continues at that instant, and the offset to UTC is recorded.
     """
     try:
         job = _Job(before.order, before.directory.parent, before.seed, watch, _nobody, before)
@@ -158,7 +158,7 @@ async def _run(job: _Job, clock: Clock, time: _Time | None, stop: Stop) -> Path:
 
 
 async def _told(job: _Job, directory: Path, clock: Clock, time: _Time | None, stop: Stop) -> Path:
-    """Whoever is told of trips is told, too, of a run that ends by itself before its plan is complete."""
+    """Those notified of trips are also notified of a run that ends by itself before its plan is complete."""
     hub, early = Hub(), _Early()
     job.watch(hub)
     hub.subscribe(early)
@@ -179,7 +179,7 @@ async def _told(job: _Job, directory: Path, clock: Clock, time: _Time | None, st
         _check_outcome(directory, recorder, assembly)
     except Exception as raised:
         error = cause_of(raised)
-        if stop.fault is None:  # else the guard has told, or the operator knows
+        if stop.fault is None:  # else the guard has notified, or the operator knows
             await _tell_failure(assembly, directory.name, error)
         if isinstance(error, MemoryError):
             raise StandError(f"{directory}: {failure_text(error)}{_unsafe(assembly)}") from raised
@@ -254,7 +254,7 @@ class _Early:
 
 
 async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop: Stop, *, camera_on: bool) -> None:
-    """Open everything; when that fails or is stopped half-way, whatever already answers is made safe."""
+    """Open everything; when that fails or is stopped half-way, all that already answers is made safe."""
     try:
         await watched(_open(assembly, camera_on=camera_on), background)
     except BaseException:
@@ -263,7 +263,7 @@ async def _opened(assembly: Assembly, background: list[asyncio.Task[None]], stop
 
 
 async def _made_safe(assembly: Assembly, stop: Stop) -> None:
-    """Before anything was permitted: whatever answers already is made safe."""
+    """Before anything was permitted: all that answers already is made safe."""
     stop.taking_down()
     safety = assembly.stand.safety
     safety.demand()
@@ -288,8 +288,8 @@ async def _recording(
 
 async def _open(assembly: Assembly, *, camera_on: bool) -> None:
     """Connect everything; heat and cold lose what permission somebody left them, the flap is closed, the relay board's
-    timer tested, and the camera switched on before anything else may happen, but for a run that goes on with the camera
-    off."""
+    timer tested, and the camera switched on before anything else may happen, but for a run that is resumed with the
+    camera off."""
     devices, stand = assembly.devices, assembly.stand
     await assembly.bus.open()
     await devices.relays.open()

@@ -32,7 +32,7 @@ def session_directory(out: Path, order: Order, clock: Clock) -> Path:
 
 
 def info_of(order: Order, directory: Path, assembly: Assembly) -> SessionInfo:
-    """Who records what with which; the camera has told its serial number already."""
+    """Who records what with which; the camera's serial number is known already."""
     config = order.config
     return SessionInfo(
         session_id=directory.name,

@@ -90,7 +90,7 @@ class RunState:
     earned all of it. frames: by the id of a capture that is not done. changes: of the plan, as they came.
 
     disturbances: how often something may have undone the set-up (an interlock, a camera that was off, a daemon's death,
-    a warm-up that begins anew), of which so many are `restored`. is_cold: the camera was or may have been off, and the
+    a warm-up that is restarted), of which so many are `restored`. is_cold: the camera was or may have been off, and the
     soaks have not been taken back yet.
 
     reasons: what holds the run. readying: the stand is being made ready. out_ns: for how long either was so since the
@@ -98,7 +98,7 @@ class RunState:
     seen_ns: that instant. was_held: since then. due_ns: of the next frame; is_lost: the camera did not give the last.
 
     tripped: why an operator has to look first, "" when nothing tripped. ended: how the run last ended, None while it
-    goes on.
+    runs.
     """
 
     plan: Plan
@@ -161,7 +161,7 @@ class RunState:
         return max(0, duration_ns - earned_ns)
 
     def outage_ns(self, now_ns: int) -> int:
-        """For how long the run did not go on since the camera was last seen."""
+        """For how long the run stood still since the camera was last seen."""
         return self.out_ns + (0 if self.out_since_ns is None else now_ns - self.out_since_ns)
 
 

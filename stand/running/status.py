@@ -1,4 +1,4 @@
-"""What a run tells of itself while it goes."""
+"""The status of a run while it is under way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a run ends early, whoever wants it: the actuators are made safe first, then the run is cancelled."""
+"""How a run ends early, for any cause: the actuators are made safe first, then the run is cancelled."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A running stand asked and told from another terminal."""
+"""A running stand queried and controlled from another terminal."""

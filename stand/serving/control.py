@@ -34,13 +34,13 @@ from stand.serving.presence import Entry, Presence
 
 
 class RunStatus(BaseModel):
-    """What a run tells of itself. Instants are ns since the epoch on the stand's clock, which may be virtual;
+    """The status of a run. Instants are ns since the epoch on the stand's clock, which may be virtual;
     utc_offset_ns makes now and later UTC as the host has it, since_utc_offset_ns and warning_utc_offset_ns the others.
 
     step: number of the step under way, 1 is the first. since_ns: when the present state began. end_ns: when the run is
     expected to end, None when unknown. temperatures_degC: by channel, None for a BAD reading. warning: the text of the
-    last warning or error, told at warning_ns. fault_rule, fault: the rule that has tripped and holds or ends the run,
-    and what was found, "" when all is well.
+    last warning or error, published at warning_ns. fault_rule, fault: the rule that has tripped and holds or ends the
+    run, and what was found, "" when all is well.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)

@@ -60,7 +60,7 @@ def ask_status(session: Path, timeout_s: float = 5.0) -> RunStatus:
 
 def running_sessions(root: Path | None = None) -> list[Path]:
     """The sessions that a daemon of this user is running now: `root` itself when it is one, else those directly below
-    it, by today's names as far as the disk tells them; all of this machine without `root`."""
+    it, by their present names as far as the disk gives them; all of this machine without `root`."""
     daemons = living()
     if root is None:
         return sorted(Path(daemon.entry.session) for daemon in daemons)

@@ -201,7 +201,7 @@ class Door:
         self._newcomers.append(client)
 
     def _make_room(self) -> None:
-        """A descriptor for whoever knocks."""
+        """Free a descriptor for a new client."""
         if self._spares:
             os.close(self._spares.pop())
         elif self._clients:
@@ -270,12 +270,12 @@ class Door:
             return refusal(f'"do" is one of {", ".join(self._handlers)}')
         try:
             answer = handler(request)
-        except Exception as error:  # noqa: BLE001 - whatever one request does, the next must be answered
+        except Exception as error:  # noqa: BLE001 - after a request that fails, the next must be answered
             return _failure(error)
         return answer if inspect.isawaitable(answer) else {"ok": True, **answer}
 
     def _send(self, client: _Client, answer: Answer) -> None:
-        """Give the answer, and then go on with the client."""
+        """Send the answer, then read on from the client."""
         if client in self._clients:
             client.outgoing += json.dumps(answer).encode() + b"\n"
             self._flush(client)
@@ -336,7 +336,7 @@ def _is_readable(listening: socket.socket) -> bool:
 async def _completed(answer: Awaitable[Answer]) -> Answer:
     try:
         return {"ok": True, **await answer}
-    except Exception as error:  # noqa: BLE001 - whatever one request does, the next must be answered
+    except Exception as error:  # noqa: BLE001 - after a request that fails, the next must be answered
         return _failure(error)
 
 

@@ -1,7 +1,7 @@
 """The daemons that live now: for each an entry and its control socket in the runtime folder.
 
 `ID.json` says which session is run, by which process, on which stand; the daemon keeps it locked (flock), so an entry
-that can be locked was left by a dead one and is removed by whoever sees it. `ID.sock` is the control socket, mode 0600.
+that can be locked was left by a dead one and is removed when it is seen. `ID.sock` is the control socket, mode 0600.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _BACKLOG = 128
 @dataclass(frozen=True, slots=True)
 class Entry:
     """session: its folder's path when the run began. real_path: the same without symbolic links, and identity: its
-    device and inode, once the disk has told them."""
+    device and inode, once the disk has given them."""
 
     session: str
     pid: int

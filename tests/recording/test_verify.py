@@ -184,7 +184,7 @@ async def test_what_a_recorder_or_a_salvage_left_is_told(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.mcap.damaged")
     found = errors(session)
     assert "error: frames/0007.mcap.part: is not finished; `stand session salvage` recovers what is in it" in found
-    assert any(text.startswith("error: frames/0000.mcap.damaged: is what a salvage kept") for text in found)
+    assert any(text.startswith("error: frames/0000.mcap.damaged: is an original that a salvage kept") for text in found)
 
 
 def with_a_damaged_index(path):
@@ -215,7 +215,7 @@ async def test_an_original_from_which_something_is_lost_stays_an_error(session):
     with_a_damaged_index(path)
     salvage_session(session)  # it recovers all that the first one did
     kept, frame_lost = errors(session)
-    assert kept.startswith("error: frames/0001.mcap.damaged: is what a salvage kept")
+    assert kept.startswith("error: frames/0001.mcap.damaged: is an original that a salvage kept")
     assert frame_lost.startswith("error: 1 frame is missing")
     assert notes(session)[0].startswith("note: frames/0001.2.mcap.damaged: a salvage recovered every message")
 
@@ -226,7 +226,7 @@ async def test_an_original_that_was_cut_short_stays_an_error(session):
         chunk = SeekingReader(file).get_summary().chunk_indexes[-1]
     path.write_bytes(path.read_bytes()[: chunk.chunk_start_offset])  # what is left of it is sound
     salvage_session(session)
-    assert any(error.startswith("error: telemetry/0001.mcap.damaged: is what") for error in errors(session))
+    assert any(error.startswith("error: telemetry/0001.mcap.damaged: is an original") for error in errors(session))
 
 
 async def test_a_segment_that_is_being_recorded_is_no_error(session):
