@@ -61,7 +61,7 @@ def recipe_file(tmp_path: Path, **parameters: object) -> str:
         ({"set_points_degC": [65]}, "outside limits.chamber_degC -10.0..60.0"),
         ({"table_position": {"vertical": 1}}, "this stand has no axis 'vertical'"),
         ({"table_position": {"linear": 290}}, "outside the limits (0.0, 280.0) of linear"),
-        ({"interval_s": 0.2, "frames_per_point": 2}, "faster than camera.frame_rate_hz"),
+        ({"interval_s": 0.2, "frames_per_point": 2}, "faster than cameras.camera.frame_rate_hz"),
         ({"dwell_s": 604800, "cycles": 60}, "the plan takes 420 days"),
         ({"dwel_s": 3}, "experiments.0.thermal_cycle.dwel_s: unknown key"),
     ],
