@@ -56,4 +56,9 @@ elif len(PROTOCOLS) == 1:
     AnyCameraSettings = PROTOCOLS[_USUAL].Settings
 else:
     _tagged = tuple(Annotated[driver.Settings, Tag(name)] for name, driver in PROTOCOLS.items())
-    AnyCameraSettings = Annotated[Union[_tagged], Discriminator(_protocol_of)]  # noqa: UP007 - of a tuple
+    _of_protocol = Discriminator(
+        _protocol_of,
+        custom_error_type="camera_protocol",
+        custom_error_message=f"protocol has to be one of {', '.join(PROTOCOLS)}",
+    )
+    AnyCameraSettings = Annotated[Union[_tagged], _of_protocol]  # noqa: UP007 - of a tuple
