@@ -57,7 +57,7 @@ class CameraSettings(Polled):
 
     serial_number: refused when another camera answers; none takes any. width_px, height_px: from the sensor's first
     pixel; none the whole sensor. trigger: one frame per software trigger, or frames at frame_rate_hz all the time
-    (constant self-heating). has_temperature: whether it measures its own temperature; false has to be said, a run needs
+    (constant self-heating). has_temperature: whether it measures its own temperature; false must be stated, a run needs
     no GOOD one then. boot_s: from its supply being switched on until it answers.
     """
 

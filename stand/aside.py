@@ -1,4 +1,4 @@
-"""What is shown to people, shown by a thread of its own: a terminal or a log that takes nothing holds up nobody."""
+"""Output for people, written by a thread of its own: a terminal or a log that blocks delays nothing else."""
 
 from __future__ import annotations
 

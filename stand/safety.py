@@ -1,7 +1,7 @@
 """The one owner of making safe: every actuator, until it has confirmed.
 
 A rule, the operator or a run that ends demands it, without waiting for it. Permissions are
-gone at once. Each actuator has a task of its own, so that one that does not answer keeps none of the others.
+gone at once. Each actuator has a task of its own, so that one that does not answer delays none of the others.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a recorded session is worth: the drift fitted, validated at the held-out temperatures, and reported."""
+"""The report of a recorded session: the drift fitted, validated at the held-out temperatures, and reported."""
 
 from __future__ import annotations
 

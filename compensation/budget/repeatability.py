@@ -38,7 +38,7 @@ def home_residuals(events: Sequence[Event], unit: str) -> Repeatability:
 def v0_repeats(session: Session, target: Target) -> Repeatability:
     """How far the image of V0 is from where it was, when the table returns to it at the end of a temperature, px.
 
-    Per coordinate, over all markers and temperatures; frames of a capture are averaged. Whatever the camera drifted in
+    Per coordinate, over all markers and temperatures; frames of a capture are averaged. The camera's drift in
     these minutes is included: an upper limit.
     """
     pairs = _first_and_last_of_v0(capture_states(session))

@@ -1,7 +1,7 @@
 """Publishes a recorded session again: the same items in the same order, at their own instants of a clock.
 
 To subscribers a replay looks like the run, except that there is no stand behind it. As fast as possible is a
-VirtualClock, which work in a lane holds, so nothing is dropped. 1 x and N x is a ReplayClock.
+VirtualClock, held while a lane works, so nothing is dropped. 1 x and N x is a ReplayClock.
 """
 
 from __future__ import annotations

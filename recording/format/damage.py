@@ -32,8 +32,8 @@ class FileDamaged(SessionError):
 
 @contextmanager
 def reading(path: Path) -> Generator[None]:
-    """Whatever damage raises inside becomes a FileDamaged that names the file; one at once for a pipe or a device,
-    which nobody may ever write to."""
+    """Errors that damage raises inside become a FileDamaged that names the file; one at once for a pipe or a device,
+    which might never give a byte."""
     if path.exists() and not path.is_file():
         raise SessionError(f"{path}: is no file; no session has a folder, a pipe or a device of that name")
     try:

@@ -1,4 +1,4 @@
-"""Images and their descriptions held against each other: which lack the other, and for what reason."""
+"""Images and their descriptions compared: which lack the other, and for what reason."""
 
 from __future__ import annotations
 

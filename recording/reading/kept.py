@@ -1,4 +1,4 @@
-"""The originals of damaged segments that a salvage has kept, held against what it recovered of them."""
+"""The originals of damaged segments that a salvage has kept, compared with what it recovered of them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Reads a recorded session: metadata, readings, frames, steps, events. It needs no device and changes nothing.
 
-A topic of the telemetry is read only when asked for, and then kept; frames are decoded one at a time. Whatever is
+A topic of the telemetry is read only when asked for, and then kept; frames are decoded one at a time. Anything
 wrong with a session is a SessionError with a sentence.
 """
 

@@ -1,4 +1,4 @@
-"""Opening a session to use all of it: one that is not whole is refused, or used with what is missing said."""
+"""Opening a session to use all of it: an incomplete one is refused, or used with a message of what is missing."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Beside(Protocol):
         ...
 
     async def refound(self) -> bool:
-        """Whether it is back; else it has been written anew. OSError when that cannot be done."""
+        """Whether it is back; else it has been rewritten. OSError when that cannot be done."""
         ...
 
 

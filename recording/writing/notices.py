@@ -1,4 +1,4 @@
-"""What a recording has to say of itself: frames and readings that are lost, and a disk that is nearly full."""
+"""What a recording reports of itself: frames and readings that are lost, and a disk that is nearly full."""
 
 from __future__ import annotations
 

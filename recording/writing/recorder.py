@@ -1,4 +1,4 @@
-"""Everything the hub publishes, on the disk: two series of segments, and what is lost is counted and said.
+"""Everything the hub publishes, on the disk: two series of segments; losses are counted and reported.
 
 Telemetry is committed on ticks of the stand's clock, each frame by itself; encoding and disk work run in a lane per
 series, off the loop and with virtual time held. A slow disk fills the bounded queue of frames and then drops frames;

@@ -12,7 +12,7 @@ from foundation.items import Event
 from foundation.lane import Lane
 from stand.chamber.compressor import CompressorState, keep
 
-_CLOSE_LIMIT_S = 1.0  # real seconds for the last state; a disk that hangs keeps no daemon
+_CLOSE_LIMIT_S = 1.0  # real seconds for the last state; a disk that hangs does not keep a daemon alive
 
 
 class CompressorFile:

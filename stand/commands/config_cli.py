@@ -32,7 +32,7 @@ def migrate(
 ) -> None:
     """A stand's file in today's form, with its comments. In its place the older one is kept beside it, as FILE.before.
 
-    Older files open as they are: this is for whoever edits them next.
+    Older files open as they are: this is for editing them.
 
     Example: stand config migrate my-stand.yaml
     """

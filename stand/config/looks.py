@@ -1,4 +1,4 @@
-"""The configuration's chamber section, and the guard's looks at the chamber that do not believe its two probes."""
+"""The configuration's chamber section, and the guard's checks of the chamber that do not rely on its two probes."""
 
 from __future__ import annotations
 

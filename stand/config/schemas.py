@@ -1,4 +1,4 @@
-"""JSON Schemas of what a user edits, for editors: generated from the models, so that they are never another truth."""
+"""JSON Schemas of what a user edits, for editors: generated from the models, so that they always agree."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def schema_text(name: str) -> str:
 
 def write_schemas(directory: Path) -> tuple[Path, ...]:
     """Write the schema of each kind of document; SessionError when the place refuses."""
-    with suppress(OSError):  # what cannot be made cannot be written into either, which is told
+    with suppress(OSError):  # what cannot be made cannot be written into either, which is reported
         directory.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name in DOCUMENTS:

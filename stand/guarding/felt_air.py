@@ -1,4 +1,4 @@
-"""What a body in the chamber feels of the air: a look that believes neither of the two probes.
+"""The air temperature by a body in the chamber: a check that relies on neither of the two probes.
 
 A body of lag L follows the air T by dB/dt = (T - B) / L, so that T = B + L dB/dt: independently of the probes, a body
 that warms shows how warm the air around it is. Both are taken over the same window, the body's rate by least squares.

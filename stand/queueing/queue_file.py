@@ -1,8 +1,8 @@
 """The file of a queue of runs, `queue.json` in the recording directory, and its locks.
 
 The file is replaced as a whole, and what it was before stays beside it as `queue.json.last`. `.queue.lock` is locked
-(flock) while it is read or changed, `.queue.worker` as long as somebody works the queue: a run that is marked as
-running when nobody does was interrupted.
+(flock) while it is read or changed, `.queue.worker` as long as a process runs the queue: a run that is marked as
+running when none does was interrupted.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ async def run_entry(
 
 
 class _Watch:
-    """Tells of steps that were not done before, and keeps which actuators have not confirmed their safe state."""
+    """Reports steps that were not done before, and keeps which actuators have not confirmed their safe state."""
 
     def __init__(self, done: Collection[str], step_done: Callable[[], None]) -> None:
         self.unsafe: list[str] = []

@@ -1,4 +1,4 @@
-"""The camera's own temperature, without which no frame is of use, is there before the first step."""
+"""Checked before the first step: the camera's own temperature, without which no frame is of use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One run on one stand: a lock per resolved address, taken before any device is opened, let go at the end or by death.
+"""One run on one stand: a lock per resolved address, taken before any device is opened, held until it ends or dies.
 
 Each lock is two: a locked file in the runtime folder, which says who has it, and a name in the kernel's abstract socket
 namespace. The name holds among all users of this machine, and when a logout has removed the runtime folder. Another

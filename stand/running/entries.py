@@ -11,7 +11,7 @@ journal (recording/reading/journal_lines.py).
     Extended  a soak is made longer by an operator
     Edited    the steps from a place on are replaced by an operator
     Tripped   the guard has made the stand safe, and why
-    Cleared   an operator has seen to what had tripped
+    Cleared   an operator has removed the cause of a trip
     Ended     complete, stopped by the operator, tripped, or failed
 
 Not written: what the recording proves (Taken, Cooled), and what a Gap makes void (Due, Readying, Restored).
@@ -128,7 +128,7 @@ class Tripped:
 
 @dataclass(frozen=True, slots=True)
 class Cleared:
-    """An operator has seen to what had tripped."""
+    """An operator has removed the cause of a trip."""
 
     time_ns: int
 

@@ -141,7 +141,7 @@ class Executor:
         await self._change(Edited(self._clock.now_ns(), from_index, data))
 
     async def _change(self, change: Change) -> None:
-        """Told before it is journaled, as everything that the recording has to know."""
+        """Published before it is journaled, as everything that the recording needs."""
         if reason := refusal(self._state, change):
             raise ConfigError(reason)
         changed = after(self._state, change)

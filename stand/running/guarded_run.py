@@ -132,7 +132,7 @@ async def _begun(
     else:
         _tell_interruption(work, work.before, log)
     if not guard.look():
-        raise StandTripped("the rules do not hold")
+        raise StandTripped("a rule of the guard is violated")
     await work.recorder.flushed()  # a session with a journal can be opened and resumed
     before = work.before
     journal = Journal.create(work.recorder.directory) if before is None else before.journal

@@ -1,4 +1,4 @@
-"""What is seen to while something holds a run, wherever it waits.
+"""What is done while something holds a run, wherever it waits.
 
 The flap is shut in every hold that lasts: through an open one the chamber breathes the laboratory's air (frost in the
 cold, and no equilibrium). And in virtual time, where no operator is there, a hold that lasts for ever ends the run.

@@ -5,7 +5,7 @@
     {"do": "pause"}     -> {"ok": true, "reasons": ["operator"],   held before the next action; a dwell keeps its time
                             "moving": ["linear to 250 mm"]}        what still moves: that is not stopped
     {"do": "continue"}  -> {"ok": true, "reasons": [...]}          ends a pause; what still holds the run, if anything
-    {"do": "clear"}     -> {"ok": true, "reasons": [...]}          an operator has seen to what tripped an interlock
+    {"do": "clear"}     -> {"ok": true, "reasons": [...]}          an operator has removed what tripped an interlock
     {"do": "stop"}      -> {"ok": true}                            the stand is made safe, then the run ends
 
 Anything wrong is answered with {"ok": false, "error": sentence}. A connection may carry many requests; one that is
@@ -129,7 +129,7 @@ async def serve(session: Path, stand: str, handlers: Handlers) -> AsyncGenerator
 
 
 def _identified(entry: Entry, tell: Callable[[Entry], None]) -> None:
-    """Tell what the disk says of the session's folder, when it does: nobody waits for a disk that hangs."""
+    """Note what the disk says of the session's folder, when it does: nothing waits for a disk that hangs."""
     loop = asyncio.get_running_loop()
 
     def look() -> None:

@@ -1,10 +1,10 @@
-"""Everybody who is connected to a control socket, served from the event loop without keeping it from its other work.
+"""Serves all clients of a control socket from the event loop without delaying its other work.
 
 It accepts by itself and not with asyncio's server, which stops accepting for 1 s when no descriptor is left and has no
 word in how much is done in one turn of the loop. All work (accepting, reading, answering) waits in one queue and takes
 at most _TURN_S of a turn and a fifth of the time, so that a flood of clients cannot make the guard late. There is
 always room for one more: with _MOST_CLIENTS connected, or no descriptor left, the client that was silent longest is
-hung up on; a few spare descriptors are kept for that case.
+disconnected; a few spare descriptors are kept for that case.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ class Door:
             self._loop.call_later(_NO_DESCRIPTOR_PAUSE_S, self._knocked)
 
     def _most_silent(self) -> _Client:
-        """Whoever has an answer on its way only when there is nobody else."""
+        """One that waits for an answer only when there is no other."""
         return min(self._clients, key=lambda client: (client.answering is not None, client.heard_s))
 
     def _serve(self, client: _Client) -> None:
@@ -295,7 +295,7 @@ class Door:
             self._enqueue(client)
 
     def _send_away(self, client: _Client, sentence: str) -> None:
-        """Tell why, as far as the client takes it, and hang up."""
+        """Send the reason, as far as the client takes it, and disconnect."""
         if sentence:
             client.outgoing += json.dumps(refusal(sentence)).encode() + b"\n"
             with suppress(OSError):
