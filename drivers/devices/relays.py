@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -43,37 +43,18 @@ class RelaysSettings(OnBus):
 
 
 class Relays:
-    """Named relays of one board. `channels`: name -> relay number, 0 being the first (point relay_0 of the map).
+    """Named relays of one board. `channels`: name -> relay number, 0 being the first (point relay_0 of the map)."""
 
-    safe_off: the relays that make_safe turns off; by default all but camera_power.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        bus: Bus,
-        register_map: RegisterMap,
-        channels: Mapping[str, int],
-        safe_off: Collection[str] | None = None,
-    ) -> None:
+    def __init__(self, name: str, bus: Bus, register_map: RegisterMap, channels: Mapping[str, int]) -> None:
         self.name = name
         self._unit = ModbusUnit(name, bus, register_map)
         self._points = {channel: f"relay_{number}" for channel, number in channels.items()}
-        self._safe_off = tuple(channels if safe_off is None else safe_off)
-        if safe_off is None:
-            self._safe_off = tuple(channel for channel in channels if channel != CAMERA_POWER)
+        self._safe_off = tuple(channel for channel in channels if channel != CAMERA_POWER)
         self._clock = bus.clock
         self._lock = asyncio.Lock()  # a write and its read-back stay together
-        self._check()
-
-    def _check(self) -> None:
         for channel, point in self._points.items():
-            if point not in self._unit.map.points:
-                raise ConfigError(f"{self.name}.{channel}: register map {self._unit.map.model} has no {point}")
-        if len(set(self._points.values())) < len(self._points):
-            raise ConfigError(f"{self.name}: two channels on one relay")
-        if unknown := [channel for channel in self._safe_off if channel not in self._points]:
-            raise ConfigError(f"{self.name}: safe_off names {', '.join(unknown)}, which is no channel")
+            if point not in register_map.points:
+                raise ConfigError(f"{name}.{channel}: register map {register_map.model} has no {point}")
 
     async def open(self) -> None:
         """See that the board answers; no relay changes."""
@@ -103,8 +84,8 @@ class Relays:
         await self._write(channel, pulse.address, counts, True)
 
     async def make_safe(self) -> None:
-        """Turn off every relay of safe_off, confirmed; all are tried, those not confirmed once more, then DeviceFault
-        names those that still are not."""
+        """Turn off every relay but the cameras', confirmed. All are tried, those not confirmed once more, then
+        DeviceFault names those that still are not."""
         failures = await self._turn_off(self._safe_off)
         if failures:
             failures = await self._turn_off(failures)

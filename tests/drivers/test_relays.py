@@ -134,14 +134,6 @@ async def test_make_safe_turns_off_all_but_the_camera(relays: Relays) -> None:
     assert await states(relays) == {"relays.heater_enable": 0, "relays.compressor": 0, "relays.camera_power": 1}
 
 
-async def test_make_safe_turns_off_exactly_what_it_was_told(bus: Bus) -> None:
-    relays = Relays("relays", bus, MAP, CHANNELS, safe_off=["camera_power"])
-    for channel in CHANNELS:
-        await relays.switch(channel, True)
-    await relays.make_safe()
-    assert await states(relays) == {"relays.heater_enable": 1, "relays.compressor": 1, "relays.camera_power": 0}
-
-
 async def test_make_safe_tries_every_relay_and_names_the_one_still_on(relays: Relays, board: type[BoardWrite]) -> None:
     await relays.switch("heater_enable", True)
     await relays.switch("compressor", True)
@@ -163,17 +155,7 @@ async def test_a_board_that_is_not_there_fails_to_open(bus: Bus) -> None:
         await Relays("relays", bus, MAP.at_unit(9), CHANNELS).open()
 
 
-@pytest.mark.parametrize(
-    ("channels", "safe_off", "complaint"),
-    [
-        ({"a": 8}, None, "has no relay_8"),
-        ({"a": 0, "b": 0}, None, "two channels on one relay"),
-        ({"a": 0}, ["b"], "safe_off names b"),
-    ],
-)
-def test_channels_that_cannot_be_are_config_errors(
-    channels: dict[str, int], safe_off: list[str] | None, complaint: str
-) -> None:
+def test_a_relay_that_the_map_has_not_is_a_config_error() -> None:
     bus = Bus("rs485", BusSettings(address="tcp:localhost:502"), WallClock())
-    with pytest.raises(ConfigError, match=complaint):
-        Relays("relays", bus, MAP, channels, safe_off)
+    with pytest.raises(ConfigError, match=r"relays.a: register map .* has no relay_8"):
+        Relays("relays", bus, MAP, {"a": 8})

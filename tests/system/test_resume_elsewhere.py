@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,29 @@ def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_sai
     assert recorded[0]["stand"] == []
     assert session.frame_count == 2
     assert not trace.exists()
+
+
+def older(text: str) -> str:
+    """The configuration as files were before 2026-11-22."""
+    data = yaml.safe_load(text)
+    data["camera"] = data.pop("cameras")["camera"]
+    data["thermometers"] = {**data.pop("thermometer_module"), "channels": data.pop("thermometers")}
+    return yaml.safe_dump(data)
+
+
+@pytest.mark.usefixtures("_aravis")
+def test_a_session_with_a_configuration_of_an_older_form_is_resumed(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order(CAPTURES)
+    ordered = replace(ordered, config_text=older(ordered.config_text))
+    with pytest.raises(Interrupted):
+        asyncio.run(run_virtual(ordered, tmp_path / "out", None, stopped()))
+    (directory,) = (tmp_path / "out").glob("*-captures")
+    resumed = CliRunner().invoke(app, ["resume", str(directory)])
+    assert resumed.exit_code == 0, resumed.output
+    assert not [line for line in resumed.stderr.splitlines() if "as on this stand" in line]
+    session = Session.open(directory)
+    assert session.frame_count == 2
+    assert "channels:" in (session.attachment("config.yaml") or "")
 
 
 @pytest.mark.usefixtures("_aravis")
