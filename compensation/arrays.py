@@ -1,4 +1,4 @@
-"""Observations from plain arrays: a fit of centres that somebody else has measured needs no session and no stand."""
+"""Observations from plain arrays: a fit of centres measured elsewhere needs no session and no stand."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ _PREVIEW_WIDTH_PX = 816
 @dataclass(frozen=True, slots=True)
 class SessionFacts:
     """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
-    segments that a killed recorder left behind and nobody has read. utc: from its instants to UTC."""
+    segments that a killed recorder left behind and that were not read. utc: from its instants to UTC."""
 
     session_id: str
     recipe: str

@@ -36,7 +36,7 @@ def check_one_equilibrium(session: Session) -> None:
 
 
 def check_sessions(sessions: Iterable[Session], *, across_gap: bool) -> None:
-    """Each of them, unless somebody wants them together."""
+    """Each of them, unless they are wanted together."""
     if not across_gap:
         for session in sessions:
             check_one_equilibrium(session)

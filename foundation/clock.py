@@ -177,7 +177,7 @@ class FollowedClock:
 
 
 class VirtualClock:
-    """Time that jumps to the earliest sleeper as soon as nobody holds it and the event loop has nothing else to run.
+    """Time that jumps to the earliest sleeper as soon as nothing holds it and the event loop has nothing else to run.
 
     Sleepers are woken one at a time, in order of (deadline, order of going to sleep), each only after all that the
     one before set in motion has come to rest. So a run is repeatable to the byte, however the host schedules threads.
@@ -234,7 +234,7 @@ class VirtualClock:
                 future.set_result(None)
 
     async def _rest(self) -> None:
-        """Return when someone sleeps, nobody holds, and the loop has nothing else to run."""
+        """Return when a task sleeps, nothing holds time, and the loop has nothing else to run."""
         about_to_run = _about_to_run(asyncio.get_running_loop())
         while True:
             if self._holds or not self._sleepers:

@@ -8,8 +8,8 @@
     │   ├── Refused            the device says no: exception code, errv, access denied
     │   ├── InUse              another run of this machine has it; nothing was touched
     │   ├── DeviceFault        the device works and reports trouble: sensor break, jam, alarm
-    │   ├── Occupied           somebody has it do something else at the unit; it takes no orders until that ends
-    │   └── Superseded         a newer command, or making safe, has overtaken this one: nobody is to blame
+    │   ├── Occupied           operated at the unit by hand; it takes no orders until that ends
+    │   └── Superseded         a newer command, or making safe, has overtaken this one: not a fault
     ├── StandTripped           the guard has made the stand safe; an operator must clear it
     └── SessionError           a recorded session cannot be read
 
@@ -64,7 +64,7 @@ class DeviceFault(DeviceError):
 
 
 class Occupied(DeviceError):
-    """Somebody at the unit has it do something of its own, such as autotuning: it takes no orders until that ends."""
+    """A person at the unit has started something there, such as autotuning: it takes no orders until that ends."""
 
 
 class Superseded(DeviceError):

@@ -115,7 +115,7 @@ def _temporary(path: Path) -> Path:
 
 
 def _beside(path: Path) -> Path:
-    """A new file in the same folder, under a name nobody else has."""
+    """A new file in the same folder, under a unique name."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
     return Path(name)

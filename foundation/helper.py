@@ -113,7 +113,7 @@ class Helper:
         try:
             self._process.wait(_END_WITHIN_S)
         except subprocess.TimeoutExpired:
-            self._process.returncode = 0  # nobody waits for it any more, and Python need not warn of that
+            self._process.returncode = 0  # it is not waited for any more, and Python need not warn of that
             return False
         return True
 

@@ -89,7 +89,7 @@ def _serve(connection: socket.socket, kept: dict[str, object]) -> None:
         try:
             send(connection, found)
         except OSError:
-            return  # nobody is there any more
+            return  # the daemon has gone
 
 
 def serve(descriptors: Sequence[int], left_name: str) -> None:

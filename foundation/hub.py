@@ -44,7 +44,7 @@ class Hub:
 
     def known(self, channel: str) -> Reading | None:
         """The last reading but for those that are BAD by the wire, which say nothing of what is measured: a single lost
-        reply makes nobody forget. How old it may be is for the guard (trustworthy) to judge."""
+        reply does not erase it. How old it may be is for the guard (trustworthy) to judge."""
         return self._known.get(channel)
 
     def last_good_ns(self, channel: str) -> int | None:

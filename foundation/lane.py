@@ -86,7 +86,7 @@ class Lane:
                 settle = partial(_settled, future, function(*args))
             except BaseException as error:  # noqa: BLE001 - the caller waits for any error
                 settle = partial(_failed, future, error)
-            with suppress(RuntimeError):  # the loop has ended, and nobody waits any more
+            with suppress(RuntimeError):  # the loop has ended, and no caller waits any more
                 loop.call_soon_threadsafe(settle)
 
         self._queue().put(work)
@@ -121,6 +121,6 @@ def _failed(future: asyncio.Future[Any], error: BaseException) -> None:
 
 
 def _seen(future: asyncio.Future[Any]) -> None:
-    """Nobody asks any more; asyncio need not report the exception as never retrieved."""
+    """The caller has gone; asyncio need not report the exception as never retrieved."""
     if not future.cancelled():
         future.exception()

@@ -24,11 +24,11 @@ def take(path: Path, content: bytes) -> int | None:
         except BaseException:
             os.close(file)
             raise
-        os.close(file)  # somebody removed it between opening and locking
+        os.close(file)  # it was removed between opening and locking
 
 
 def remove(path: Path, file: int) -> None:
-    """Remove and unlock what `take` has given, unless somebody else has the name by now."""
+    """Remove and unlock what `take` has given, unless another process has the name by now."""
     with suppress(OSError):
         if is_at(file, path):
             path.unlink()
@@ -36,7 +36,7 @@ def remove(path: Path, file: int) -> None:
 
 
 def try_lock(file: int, *, shared: bool = False) -> bool:
-    """Whether the lock was to be had; nobody is waited for. Raises OSError."""
+    """Whether the lock was free; does not wait. Raises OSError."""
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:

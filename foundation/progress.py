@@ -45,7 +45,7 @@ def unwatched(title: str, total: float) -> Generator[Report]:
 
 @contextmanager
 def late_progress(title: str, total: float) -> Generator[Report]:
-    """As `progress`, from the moment on when the work has taken long enough for somebody to wait."""
+    """As `progress`, but shown only once the work has taken a while."""
     with ExitStack() as stack:
         yield _Late(title, total, stack)
 

@@ -76,7 +76,7 @@ class Detection:
 
 
 def _unwatched(part: float) -> None:
-    """Nobody watches."""
+    """No progress is shown."""
 
 
 def detect(

@@ -20,7 +20,7 @@ def runtime_folder() -> Path:
     """`$XDG_RUNTIME_DIR/thermostand`, else `/run/lock/thermostand`; made with mode 0700 when it is absent.
 
     An XDG_RUNTIME_DIR that is not there, or belongs to another user (as after `sudo -E`), does not count. SessionError
-    when the folder cannot be made or is somebody else's.
+    when the folder cannot be made or is another user's.
     """
     folder = _user_folder() or SYSTEM_FOLDER
     try:

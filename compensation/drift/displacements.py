@@ -63,7 +63,7 @@ def reference_centres(observations: Observations, frames: Mask | None = None) ->
     """Mean centres (S, N, 2) and their variance (S, N, 2) over each session's own `frames` (F,), by default its
     REFERENCE frames; NaN without any.
 
-    Each session has a reference of its own: between sessions somebody may have moved the target.
+    Each session has a reference of its own: between sessions the target may have been moved.
     """
     shape = (len(observations.sessions), observations.target.count, 2)
     centres, variance = np.full(shape, np.nan), np.full(shape, np.nan)

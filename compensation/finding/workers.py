@@ -88,7 +88,7 @@ def _one_thread() -> None:
 
 def on_cluster(address: str, wait_s: float = 10.0) -> Work:
     """The Dask cluster whose scheduler is at `address` (host:port); its workers must see the sessions' files under the
-    same paths. ConfigError when Dask is missing or nobody answers there."""
+    same paths. ConfigError when Dask is missing or does not answer there."""
 
     def work(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
         with _client(address, wait_s) as client:

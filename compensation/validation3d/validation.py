@@ -24,7 +24,7 @@ from compensation.validation3d.stand_part import StandPart
 from foundation.errors import SessionError
 
 StandAt = Callable[[Float], StandPart | None]
-"""(distances of the positions (P,), mm) -> the stand's part in their frames, None when nobody asked for it."""
+"""(distances of the positions (P,), mm) -> the stand's part in their frames, None when it was not asked for."""
 
 
 class LensModel(StrEnum):

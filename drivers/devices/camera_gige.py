@@ -73,7 +73,7 @@ class Camera:
     async def open(self) -> None:
         """Connect, check the serial number, write and compare all settings; forgets any earlier connection.
 
-        Unreachable: nobody answers. Refused: a setting is not taken, another camera, or another client is in control
+        Unreachable: no answer. Refused: a setting is not taken, another camera, or another client is in control
         (tried for the heartbeat and 2 s more, since it may be our own that died).
         """
         if self._lane is None:
@@ -155,7 +155,7 @@ class Camera:
         raise self._lose(f"{ATTEMPTS} software triggers brought no complete frame")
 
     async def _grab_free_running(self, connection: Connection, exposure_s: float) -> Shot:
-        """Sleep until the frame is due, then take it: virtual time moves only while nobody waits on a wire."""
+        """Sleep until the frame is due, then take it: virtual time moves only while no thread waits on a wire."""
         called_ns = self._clock.now_ns()
         await self._call(connection.prepare, exposure_s)
         for _ in range(ATTEMPTS):

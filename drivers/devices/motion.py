@@ -1,4 +1,4 @@
-"""Who may move an actuator: the newest command only, and nobody once it was made safe, until that is taken back.
+"""Who may move an actuator: the newest command only, and none once it was made safe, until that is taken back.
 
 A verb takes its turn where it is called, in the event loop; the turn is checked again in the lane's thread right
 before each command is written. What has been overtaken in between, while a status was awaited or a call waited in the

@@ -18,7 +18,7 @@ from foundation.readings import Reading
 COIL_ON = 0xFF00
 COIL_OFF = 0x0000
 MAX_PULSE_COUNTS = 0x7FFF
-CAMERA_POWER = "camera_power"  # stays on by default: a warm camera is hours of work, and harms nobody
+CAMERA_POWER = "camera_power"  # stays on by default: a warm camera is hours of work, and harmless
 
 
 RelayName = Literal["heater_enable", "compressor", "camera_power"]

@@ -227,7 +227,7 @@ class FakeCamera:
         self._sender.resend(resend)
 
     def control_ended(self) -> None:
-        """Stop streaming: nobody is there to receive."""
+        """Stop streaming: there is no receiver."""
         self._schedule.stop()
         self._sender.abandon()
 

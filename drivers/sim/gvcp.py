@@ -184,7 +184,7 @@ class Resend:
     extended: bool = False
 
     def request(self, req_id: int) -> Request:
-        """The command; nobody acknowledges it."""
+        """The command; it is not acknowledged."""
         if self.extended:
             payload = _RESEND_EXTENDED.pack(0, 0, self.first, self.last, self.block_id)
             return Request(Command.PACKETRESEND, req_id, payload, flags=EXTENDED_IDS)

@@ -34,7 +34,7 @@ class Device(Protocol):
         ...
 
     def control_ended(self) -> None:
-        """Nobody is in control any more."""
+        """No client is in control any more."""
         ...
 
 

@@ -1,7 +1,7 @@
 """The slave's side of Modbus: RTU and TCP engines over the same units, and the standard functions over a unit's store.
 
 A unit answers a PDU (function code and data; no unit id, no CRC) with a PDU, or with None when it stays silent. A unit
-id nobody has stays silent too, on RTU as behind the gateway; unit 0 is a broadcast: everyone obeys, nobody answers.
+id without a unit stays silent, on RTU as behind the gateway; unit 0 is a broadcast: everyone obeys, nobody answers.
 Sources: Modbus Application Protocol 1.1b3 (chapters 6 and 7), Modbus over Serial Line 1.02 (2.5.1, appendix B).
 """
 
@@ -247,7 +247,7 @@ class TcpEngine:
 
 
 def _dispatch(units: Sequence[Unit], address: int, pdu: bytes) -> bytes | None:
-    """The reply of the unit with that address; None when nobody answers."""
+    """The reply of the unit with that address; None when there is none."""
     if address == BROADCAST:
         for unit in units:
             unit.handle(pdu)

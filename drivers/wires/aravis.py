@@ -54,7 +54,7 @@ class _GValue(ctypes.Structure):
 
 
 class GigeDevice:
-    """One camera, opened by IP address; StandError without libaravis, AravisError when nobody answers.
+    """One camera, opened by IP address; StandError without libaravis, AravisError when there is no answer.
 
     Opening succeeds while another client controls the camera, read-only: ask `is_controller`.
     """

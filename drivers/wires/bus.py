@@ -193,7 +193,7 @@ class Bus:
         return result
 
     def _settle(self) -> None:
-        """Keep the gap, or the quarantine and its flush; bytes that nobody asked for are an error too."""
+        """Keep the gap, or the quarantine and its flush; unrequested bytes are an error too."""
         _wait_until(self._free_s)
         if not self._suspect and self._client.unread_bytes():
             self.counters.stray += 1

@@ -67,7 +67,7 @@ class XimcClient:
         """One request and its reply; anything else is an error, and the line is clean again when it is raised."""
         link = self._link = self._link or self._connect()
         try:
-            if link.read(0.0).strip(b"\0"):  # nobody asked for it, and more may follow
+            if link.read(0.0).strip(b"\0"):  # unrequested, and more may follow
                 self.errors += 1
                 self._resync(link)
             link.write(encode(letters, payload))

@@ -72,7 +72,7 @@ def _segment_file(path: Path) -> SegmentFile | None:
 
 
 def _is_locked(path: Path) -> bool:
-    """A living recorder holds its file locked. Our own lock is shared and gone at once: nobody waits for it."""
+    """A living recorder holds its file locked. Our own lock is shared and released at once: nothing waits for it."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except PermissionError:  # recorded by another user: whether that process still lives is unknown

@@ -270,7 +270,7 @@ def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Batch:
 
 
 def _remarked(remark: Any) -> Reading:
-    cause = CAUSES.get(remark.cause, "")  # none in sessions of before 2026-11-22
+    cause = CAUSES.get(remark.cause, "")  # none in sessions from before 2026-11-22
     return _reading(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason, cause)
 
 

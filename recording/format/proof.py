@@ -77,7 +77,7 @@ def proven(opcode: int, content: bytes) -> Contents | Metadata | Attachment | Da
 
 
 def _is_text(record: Header | Metadata | DataEnd) -> bool:
-    """Nobody writes NUL into a text; a lost block of the disk reads as zeros."""
+    """No text has a NUL; a lost block of the disk reads as zeros."""
     if isinstance(record, Metadata):
         texts = [record.name, *record.metadata.keys(), *record.metadata.values()]
         return not any("\0" in text for text in texts)

@@ -49,7 +49,7 @@ class Blocks:
             return self._end
         claim = claim_of(head)
         claimed_bytes = 0 if claim is None else self._claimed_bytes(claim)
-        if written_end < begin + RECORD.size:  # nobody knows whether the zeros are the length's own
+        if written_end < begin + RECORD.size:  # the zeros may be the length's own
             return begin + max(claimed_bytes, self._largest_bytes)
         return begin + claimed_bytes
 

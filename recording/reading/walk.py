@@ -96,7 +96,7 @@ class Survey:
 
 
 def _no_report(read_bytes: int) -> None:
-    """Nobody watches."""
+    """No progress is shown."""
 
 
 def survey(source: Source, to_first_chunk: bool = False, report: Callable[[int], None] = _no_report) -> Survey:

@@ -104,7 +104,7 @@ def _agree(one: Survey, other: Survey) -> bool:
 
 
 def _session(own: Survey, siblings: list[_Sibling]) -> Mapping[str, str] | None:
-    """The session's metadata by vote; None when nobody knows it, or the siblings are of several sessions."""
+    """The session's metadata by vote; None when no segment has it, or the siblings are of several sessions."""
     finished = [sibling.found.session for sibling in siblings if sibling.path.name.endswith(FINISHED)]
     unfinished = [sibling.found.session for sibling in siblings if not sibling.path.name.endswith(FINISHED)]
     votes = [session for session in (*finished, own.session, *unfinished) if session]

@@ -132,7 +132,7 @@ def _refusing(path: Path) -> Generator[None]:
 
 @contextmanager
 def _locked(path: Path) -> Generator[int | None]:
-    """The file, opened and locked; None when somebody else has it, or has just given it another name."""
+    """The file, opened and locked; None when another process has it, or has just renamed it."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe of that name is never waited for
     except FileNotFoundError:
@@ -181,7 +181,7 @@ class _Original:
 
     @property
     def is_all_there(self) -> bool:
-        """Whether a copy holds all that was ever acknowledged; of what was finished and is damaged nobody knows."""
+        """Whether a copy holds all that was ever acknowledged; of a finished, damaged segment that is unknown."""
         return self.path != self.finished and not self.found.damages and not self.unknown
 
 
@@ -263,7 +263,7 @@ def _copy_of(original: _Original) -> Generator[Path]:
 
 def _new_file(path: Path) -> BinaryIO:
     """A file that was not there, locked. Another salvage may take it for left over until it is: then there is another
-    one; FileExistsError when that is somebody else's."""
+    one; FileExistsError when that is another's."""
     while True:
         file = path.open("xb")
         fcntl.flock(file, fcntl.LOCK_EX)

@@ -11,7 +11,7 @@ ReportShare = Callable[[float, str], None]
 
 
 def no_report(share: float, text: str) -> None:
-    """Nobody watches."""
+    """No progress is shown."""
 
 
 class ShareDone:

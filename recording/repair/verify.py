@@ -146,7 +146,7 @@ def _extent(extent: Extent | None, utc: UtcOffsets) -> Iterator[Finding]:
 
 
 def _no_report(done_bytes: float, text: str) -> None:
-    """Nobody watches."""
+    """No progress is shown."""
 
 
 def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Verification:

@@ -26,7 +26,7 @@ _UNITS = {TELEMETRY: "messages", FRAMES: "frames"}
 
 
 class Beside(Protocol):
-    """A file of the session that somebody else writes, such as the journal."""
+    """A file of the session with another writer, such as the journal."""
 
     name: str
 

@@ -18,7 +18,7 @@ _AGAIN_S = 0.02
 
 
 def lock(fd: int) -> None:
-    """Lock the file (flock); BlockingIOError, which says who, when somebody else has it. A disk process whose daemon
+    """Lock the file (flock); BlockingIOError, which names the holder, when another has it. A disk process whose daemon
     has gone is waited for for 2 s: it may just have been killed."""
     deadline_s = time.monotonic() + _LEFT_WITHIN_S
     pid = 0

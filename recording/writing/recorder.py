@@ -124,7 +124,7 @@ class Recorder:
 
     @property
     def disk_free_bytes(self) -> int:
-        """As it was found at the last commit; nobody waits for the disk."""
+        """As it was found at the last commit; does not wait for the disk."""
         return self._space.free_bytes
 
     def beside(self, file: Beside) -> None:
@@ -323,7 +323,7 @@ class Recorder:
         while True:
             due_ns = await self._next_tick(due_ns)
             await self._save_telemetry()
-            self._report()  # a disk that is nearly full: each frame until somebody knows of it is lost
+            self._report()  # a disk that is nearly full: frames are lost until this is reported
 
     async def _tend_frames_on_ticks(self) -> None:
         """A soak is long: its last frames are not left unfinished, nor their reserve taken, until the next ones. Nor

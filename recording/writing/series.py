@@ -152,6 +152,6 @@ class Series:
 
 def next_number(folder: Path) -> int:
     """The number after the highest segment in `folder`, finished or not, damaged or half copied; 0 in an empty one. A
-    file that somebody has put there under a number far outside does not count."""
+    file that was put there under a number far outside does not count."""
     numbers = [int(match[1]) for path in folder.iterdir() if (match := re.match(r"(\d{4,})\.mcap", path.name))]
     return max(set(numbers) - foreign_numbers(numbers), default=-1) + 1

@@ -23,7 +23,7 @@ _libc.fallocate64.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes
 
 
 class Block:
-    """The stream of an MCAP Writer: what it has written since somebody last took it, whole chunks with nothing copied.
+    """The stream of an MCAP Writer: what it has written since it was last taken, whole chunks with nothing copied.
     `tell` is the place in the file."""
 
     def __init__(self) -> None:

@@ -62,7 +62,7 @@ def decide(
 
 class _Kept(BaseModel):
     """The file's content. boot_id: since_ns and starts_ns are boot time of that start of the host; without it (virtual
-    time, and files of before 2026-11-22) they are instants of the stand's clock."""
+    time, and files from before 2026-11-22) they are instants of the stand's clock."""
 
     model_config = ConfigDict(strict=True)
 

@@ -8,7 +8,7 @@ from foundation.documents import Document
 
 
 class ChamberConfig(Document):
-    """What somebody who commissioned the chamber knows of it; a third more or less does no harm.
+    """What is known of the chamber from commissioning; a third more or less does no harm.
 
     heater_W: the heater's power at full output. heat_capacity_Wh_K: of what it warms at once, air and liner: heater_W
     times the hours of a ramp at full output over the kelvins it made. granite_lag_s, camera_lag_s: how long the granite

@@ -1,4 +1,4 @@
-"""A stand's file of before as one of today: the same content, with its comments, as text."""
+"""A stand's file of an older form in the present one: the same content, with its comments, as text."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _below(name: str, section: str) -> str:
 
 
 def _split(section: str) -> str:
-    """`thermometers` of before as module and thermometers; "" when its entries do not stand on lines of their own."""
+    """Older `thermometers` as module and thermometers; "" when its entries do not stand on lines of their own."""
     first, *others = section.splitlines(keepends=True)
     behind: list[str] = []  # what belongs to the next section
     while others and (not others[-1].strip() or others[-1].startswith("#")):

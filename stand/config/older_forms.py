@@ -1,5 +1,5 @@
-"""Stands' files of before 2026-11-22: one `camera`, and thermometers below the module that reads them. They still open,
-and so do the sessions that have them attached.
+"""Stands' files from before 2026-11-22: one `camera`, and thermometers below the module that reads them. They still
+open, and so do the sessions that have them attached.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ _CHANNELS = "channels"
 
 
 def is_older(data: Mapping[str, object]) -> bool:
-    """Whether the file has a form of before."""
+    """Whether the file has an older form."""
     return CAMERA in data or _module_of(data) is not None
 
 

@@ -65,7 +65,7 @@ _PACES = {"8MT160-300": Pace(1000.0, 2000.0, 4000.0, 500.0), "8MR151": Pace(2000
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a step finds: the flap, whether the plan has had the camera on (before that nobody knows how warm it is),
+    """What a step finds: the flap, whether the plan has had the camera on (before that its temperature is unknown),
     where each axis stands (mm or deg; one that is missing is not homed), and the last two set-points: a soak is taken
     to begin when the chamber sets off from the one to the other."""
 
@@ -128,7 +128,7 @@ def axis_of(config: StandConfig, name: str) -> AxisSettings:
 
 def settling_s(soak: SoakUntilSettled, found: Situation, chamber: ChamberModel) -> float:
     """How long the soak is expected to take, s: the chamber arrives, the camera follows with its time constant until it
-    is slow enough, and then it has to stay so. What the image does meanwhile nobody knows before it was seen once."""
+    is slow enough, and then it has to stay so. How the image drifts is unknown until it was seen once."""
     gap_K = abs(found.to_degC - found.from_degC)
     first_K_per_min = 60.0 * gap_K / chamber.camera_time_constant_s
     slowing_s = chamber.camera_time_constant_s * math.log(max(1.0, first_K_per_min / soak.camera_K_per_min))

@@ -128,7 +128,7 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
 
 def _independent(config: StandConfig) -> tuple[Watch, ...]:
     """Looks that hold when both probes are wrong alike: heat that was given, and what else stands in that air. Abort,
-    for how warm it is nobody knows; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
+    for its temperature is unknown; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
     found before anything is warm. The camera's own temperature is not required: one that is stale is a warning."""
     limits, chamber = config.guard, config.chamber
     granite, frost = limits.granite_feels, limits.frozen

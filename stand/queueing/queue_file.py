@@ -116,7 +116,7 @@ def read_queue(directory: Path) -> Queue:
 
 @contextmanager
 def changing(directory: Path) -> Generator[Draft]:
-    """Change the queue: nobody else does meanwhile, and all of it is on the disk at the end, or nothing."""
+    """Change the queue, under its lock: all of the change is on the disk at the end, or nothing."""
     with _locked(directory):
         before = _load(directory)
         draft = Draft(_settled(directory, before))
@@ -127,7 +127,7 @@ def changing(directory: Path) -> Generator[Draft]:
 
 @contextmanager
 def working(directory: Path) -> Generator[None]:
-    """Be the one who works this queue; SessionError when somebody else is. What the one before had under way is
+    """Run this queue alone; SessionError when another process does. What the last one had under way is
     interrupted from now on."""
     with _opened(directory / _WORKER_NAME) as worker:
         with _locked(directory):  # a check whether the queue is being run takes the same lock
@@ -140,7 +140,7 @@ def working(directory: Path) -> Generator[None]:
 
 
 def _settled(directory: Path, queue: Queue) -> Queue:
-    """What is marked as running while nobody works the queue was interrupted."""
+    """A run marked as running while no process runs the queue was interrupted."""
     if not _running(queue):
         return queue
     with _opened(directory / _WORKER_NAME) as worker:

@@ -69,7 +69,7 @@ def _places(address: str) -> Iterator[str]:
 
 
 def _resolved(host: str) -> set[str]:
-    """The IP addresses of a host; its name when nobody knows it."""
+    """The IP addresses of a host; its name when they are unknown."""
     try:
         return {str(found[4][0]) for found in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)}
     except (OSError, UnicodeError):
@@ -104,7 +104,7 @@ async def claimed(config: StandConfig, session: Path) -> AsyncGenerator[None]:
 
 
 def _claimed(wanted: Iterable[Address], session: Path, stand: str) -> AbstractContextManager[object]:
-    """All of them, or none and what `claimed` raises. In one order for everybody: of two that want the same ones,
+    """All of them, or none and what `claimed` raises. In one order for all processes: of two that want the same ones,
     one gets them."""
     folder = runtime_folder()
     content = {"session": os.path.abspath(session), "pid": os.getpid(), "stand": stand}
@@ -155,7 +155,7 @@ def _holder(file_name: str) -> str:
 
 
 def _told(path: Path) -> str:
-    """What the locked file says; LookupError when nobody has it locked, else what reading raises."""
+    """What the locked file says; LookupError when no process has it locked, else what reading raises."""
     with path.open("rb") as file:
         if try_lock(file.fileno(), shared=True):
             raise LookupError(path)

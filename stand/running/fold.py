@@ -58,7 +58,7 @@ def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
 
 
 class _Growing(set[str]):
-    """Ids within a fold, where nobody keeps the states between: a plan has up to 100,000 steps."""
+    """Ids within a fold, where the states between are not kept: a plan has up to 100,000 steps."""
 
 
 def _plus(ids: Set[str], step_id: str) -> Set[str]:

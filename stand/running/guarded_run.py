@@ -97,7 +97,7 @@ async def run_guarded(work: GuardedRun) -> None:
         try:
             level = "info" if ended.status == "complete" else "error"
             log.tell(level, RUN_END, ended.text, {"status": ended.status})
-        finally:  # also when somebody who listens fails
+        finally:  # also when a subscriber fails
             await _taken_down(assembly, guard, watchers, pollers)
             settling.close()
             stop.ended()
@@ -107,8 +107,8 @@ async def run_guarded(work: GuardedRun) -> None:
 async def _taken_down(
     assembly: Assembly, guard: Guard, watchers: Sequence[asyncio.Task[None]], pollers: Iterable[Poller]
 ) -> None:
-    """The actuators safe, tried until they confirm it, and nobody left who could move them; then one more look at every
-    device, so that the recording ends with the safe state as read from the wire."""
+    """The actuators safe, tried until they confirm it, and no task left that could move them; then one more look at
+    every device, so that the recording ends with the safe state as read from the wire."""
     safety = assembly.stand.safety
     try:
         safety.demand()

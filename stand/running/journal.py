@@ -86,7 +86,7 @@ class Journal:
         except OSError as error:
             raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
         try:
-            if not path.is_file():  # nobody may ever write to a pipe of that name
+            if not path.is_file():  # a pipe of that name might never give a byte
                 raise SessionError(f"{path}: is no file, so no journal; begin a new run")
             if path.stat().st_size > LIMIT_BYTES:
                 raise SessionError(

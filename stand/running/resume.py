@@ -109,7 +109,7 @@ def _interruption(
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
     begun = first if isinstance(first, Begun) else _recorded_begun(session)
-    lost = _recorded_end(session, entries) if journal.damage else ()  # nobody knows what else is lost
+    lost = _recorded_end(session, entries) if journal.damage else ()  # what else is lost is unknown
     told = (*with_recorded(entries, _recorded_items(session), _recorded_frames(session)), *lost)
     _check_may_go_on(directory, folded((), told), clear)
     order = _order(session, begun)
@@ -140,7 +140,7 @@ def folded(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
 
 
 def _check_may_go_on(directory: Path, state: RunState, clear: bool) -> None:
-    """SessionError when the run is complete, or has tripped and nobody has cleared it."""
+    """SessionError when the run is complete, or has tripped and was not cleared."""
     if state.ended is not None and state.ended.status == Run.COMPLETE:
         raise SessionError(f"{directory}: its run is complete; there is nothing to resume")
     if state.tripped and not clear:

@@ -176,7 +176,7 @@ class Door:
 
     def _accept(self) -> None:
         """Let one more in. The kernel is asked first whether there is one: without a descriptor to give it refuses to
-        accept also when nobody is there."""
+        accept also when no client waits."""
         if self._listening is None:
             self._somebody_knocks = False
             return

@@ -92,7 +92,7 @@ class Presence:
         part = path.with_name(f".{path.name}")
         file = take(part, json.dumps(asdict(self._entry)).encode())
         if file is None:
-            raise BlockingIOError(0, "somebody else has locked it")
+            raise BlockingIOError(0, "another process has locked it")
         try:
             part.replace(path)
         except OSError:
