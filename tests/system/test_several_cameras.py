@@ -1,6 +1,8 @@
 """Stands with two cameras, and with none: recorded, verified, and read again."""
 
 import asyncio
+import os
+import signal
 from collections import Counter
 from pathlib import Path
 
@@ -12,11 +14,14 @@ from foundation.documents import parse_document
 from recording.reading.session import Session
 from recording.repair.verify import Files, verify
 from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
+from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import Order
-from stand.running.run import run_virtual
+from stand.running.resume import interruption
+from stand.running.run import resume, run_virtual
+from stand.running.stop import Interrupted
 
 from .conftest import require_aravis
+from .test_run import at_step
 
 CAPTURES = """
 name: captures
@@ -30,11 +35,15 @@ experiments:
 """
 
 
-def recorded(data: dict[str, object], recipe: str, out: Path) -> Path:
-    text = yaml.safe_dump(data)
-    target = packaged("targets", "paper-9x6").read_text()
-    config, plan = parse_document(text, StandConfig, "config"), parse_document(recipe, Recipe, "recipe")
-    return asyncio.run(run_virtual(Order(config, plan, text, recipe, target), out, 1, lambda _: None))
+def order(data: dict[str, dict[str, object]], recipe: str) -> Order:
+    text, target = yaml.safe_dump(data), packaged("targets", "paper-9x6").read_text()
+    return Order(
+        parse_document(text, StandConfig, "config"), parse_document(recipe, Recipe, "recipe"), text, recipe, target
+    )
+
+
+def recorded(data: dict[str, dict[str, object]], recipe: str, out: Path) -> Path:
+    return asyncio.run(run_virtual(order(data, recipe), out, 1, lambda _: None))
 
 
 def simulated() -> dict[str, dict[str, object]]:
@@ -60,6 +69,24 @@ def test_each_camera_exposes_at_each_capture_and_a_model_takes_the_leading_ones_
     assert {"camera.temperature", "side.temperature"} <= set(session.channels())
     own_ns = [time_ns for time_ns, meta in metas if meta.channel == "camera.image"]
     assert observe(session.path).time_ns.tolist() == own_ns
+
+
+def test_an_interrupted_run_of_two_cameras_is_resumed(tmp_path: Path):
+    require_aravis()
+    data = simulated()
+    for number, name in ((2, "side"), (1, "camera")):
+        camera = {"address": f"127.0.0.2{number}", "serial_number": f"TS-000{number}", "width_px": 64, "height_px": 64}
+        data["cameras"][name] = {**camera, "boot_s": 4.0, "poll_s": 5.0}
+    stopped = at_step("CloseFlap", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):
+        asyncio.run(run_virtual(order(data, CAPTURES), tmp_path, 1, stopped))
+    (directory,) = tmp_path.glob("*-captures")
+    before = interruption(directory, load_config(packaged("", "simulated")))
+    asyncio.run(resume(before, lambda _: None))
+    session = Session.open(directory)
+    assert verify(directory).files is Files.SOUND
+    steps = Counter((meta.channel, meta.step_id) for _, meta in session.frame_metas)
+    assert sorted(steps.values()) == [2, 2, 2, 2]
 
 
 def test_a_stand_without_cameras_axes_and_spare_thermometers_runs(tmp_path: Path):

@@ -1,0 +1,82 @@
+"""Several cameras as one: frames of all or of none, and whichever was lost."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from foundation.clock import VirtualClock
+from foundation.errors import ConfigError, Unreachable
+from foundation.readings import Frame
+from stand.imaging.cameras import Cameras
+
+
+@dataclass
+class Camera:
+    name: str
+    clock: VirtualClock
+    is_usable: bool = True
+    restarted: str = ""
+    opened: int = 0
+
+    async def open(self) -> None:
+        self.opened += 1
+        self.is_usable = True
+
+    async def close(self) -> None:
+        self.is_usable = False
+
+    async def grab(self, exposure_s: float | None = None, due_ns: int = 0) -> Frame:
+        if not self.is_usable:
+            raise Unreachable(self.name, "lost")
+        image = np.zeros((2, 3), np.uint8)
+        return Frame(f"{self.name}.image", image, self.clock.now_ns() + due_ns, exposure_s or 0.1, 0.0, 40.0, 1, 0)
+
+
+@pytest.fixture
+async def pair() -> AsyncIterator[tuple[Camera, Camera, Cameras]]:
+    clock = VirtualClock(0)
+    one, other = Camera("camera", clock), Camera("side", clock)
+    time = asyncio.create_task(clock.run())
+    yield one, other, Cameras(cast("Any", {"camera": one, "side": other}), clock)
+    time.cancel()
+
+
+async def test_each_gives_a_frame_at_an_instant_of_its_own_and_the_first_is_due(
+    pair: tuple[Camera, Camera, Cameras],
+):
+    frames = await pair[2].grab(0.2, due_ns=500)
+    assert [(frame.channel, frame.time_ns, frame.exposure_s) for frame in frames] == [
+        ("camera.image", 500, 0.2),
+        ("side.image", 1_000_000, 0.2),
+    ]
+
+
+async def test_when_one_is_lost_there_is_a_frame_of_none_until_all_are_open_again(
+    pair: tuple[Camera, Camera, Cameras],
+):
+    one, other, cameras = pair
+    other.is_usable = False
+    assert not cameras.is_usable
+    with pytest.raises(Unreachable, match="side"):
+        await cameras.grab(0.2)
+    await cameras.open()
+    assert (cameras.is_usable, len(await cameras.grab(0.2))) == (True, 2)
+    assert (one.opened, other.opened) == (1, 1)
+
+
+async def test_whichever_has_started_anew_is_told(pair: tuple[Camera, Camera, Cameras]):
+    one, other, cameras = pair
+    assert cameras.restarted == ""
+    one.restarted, other.restarted = "one", "other"
+    assert cameras.restarted == "one; other"
+
+
+async def test_without_any_opening_is_refused_with_a_sentence():
+    none = Cameras({}, VirtualClock(0))
+    await none.close()
+    with pytest.raises(ConfigError, match="this stand has none; name it under cameras"):
+        await none.open()
