@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation import cli
+from compensation.cli import app
+from compensation.commands import detect_cli
 from markers.detection import Detection, detect
 from markers.grid import project
 from markers.image_file import read_image
@@ -44,9 +45,9 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
 
     out = tmp_path_factory.mktemp("photographs") / "markers.csv"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "detect", kept)
+        patch.setattr(detect_cli, "detect", kept)
         arguments = ["detect", *map(str, paths), "--target", "robot-cal-tools-10x10", "-o", str(out)]
-        result = CliRunner().invoke(cli.app, arguments)
+        result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "not found" not in result.stderr
     return out, detections
