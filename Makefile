@@ -23,7 +23,7 @@ test: setup
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	@$(BIN)/pyright --project tests & tests=$$!; $(BIN)/pyright && wait $$tests
-	$(BIN)/pytest -n $(WORKERS)
+	$(BIN)/pytest -n $(WORKERS) --no-loadscope-reorder
 
 nightly: setup
 	@sh .ci/system-packages $(PEER_PACKAGES)

@@ -48,6 +48,11 @@ def _unit(nodeid: str) -> str:
     return nodeid if PurePath(file).parent == _DEALT_OUT and file not in _TOGETHER else file
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The long ones first: what waits in real time leaves the processors to the others, and no worker ends with them."""
+    items.sort(key=lambda item: PurePath(item.nodeid.partition("::")[0]).parent != _DEALT_OUT)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     """Workers of `-n` take units of tests in their order, one after the other."""
