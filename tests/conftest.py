@@ -49,7 +49,7 @@ def _unit(nodeid: str) -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The long ones first: what waits in real time leaves the processors to the others, and no worker ends with them."""
+    """The long ones first: those that wait in real time leave the processors to others, and no worker ends with one."""
     items.sort(key=lambda item: PurePath(item.nodeid.partition("::")[0]).parent != _DEALT_OUT)
 
 
