@@ -68,7 +68,7 @@ class CameraSettings(Polled):
     exposure_s: float = Field(default=0.1, gt=0, le=10)
     gain_dB: float = Field(default=0.0, ge=0, le=60)
     trigger: Literal["software", "free_run"] = "software"
-    frame_rate_hz: float = Field(default=2.0, gt=0, le=10_000)
+    frame_rate_hz: float = Field(default=2.0, gt=0, le=1000)
     has_temperature: bool = True
     boot_s: float = Field(default=8.0, ge=0, le=600)
     equilibrium: EquilibriumSettings = EquilibriumSettings()
