@@ -160,10 +160,10 @@ def test_a_file_that_is_no_runtime_model_is_refused():
         Drift({"format": "thermostand drift model"})
 
 
-def run(*arguments: object, status: int | None = 0) -> str:
-    """What it says. status: None when it must refuse, as bad input or as a session that cannot be used."""
+def run(*arguments: object, status: int = 0) -> str:
+    """What it says."""
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == status if status is not None else result.exit_code in (1, 2), result.output
+    assert result.exit_code == status, result.output
     return result.output
 
 
@@ -250,20 +250,30 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
 ):
     out, numbers = tmp_path / "out", itertools.count()
 
-    def refused(*arguments: object, text: str = "x_px,y_px,camera_degC\n100,200,40\n", says: str) -> None:
+    def refused(
+        *arguments: object, text: str = "x_px,y_px,camera_degC\n100,200,40\n", status: int = 2, says: str
+    ) -> None:
         points = tmp_path / f"points-{next(numbers)}.csv"
         points.write_text(text)
         given = [points if argument == "POINTS" else argument for argument in arguments]
-        printed = run("apply", *given, "-o", out, status=None)
+        printed = run("apply", *given, "-o", out, status=status)
         assert says in printed
         assert printed.count("\n") == 1
         assert not out.exists()
 
-    refused(files["paper"], "POINTS", text="x,y\n1,2\n", says="has no column x_px")
+    refused(files["paper"], "POINTS", text="x,y\n1,2\n", status=1, says="has no column x_px")
     refused(files["paper"], "POINTS", text="x_px,y_px\n1,2\n", says="has no column camera_degC; give --session")
-    refused(files["paper"], "POINTS", text="x_px,y_px,camera_degC\n1,2,warm\n", says="line 2: camera_degC is 'warm'")
-    refused(files["paper"], "POINTS", text="x_px,y_px,camera_degC\n1,2\n", says="line 2 has not as many cells")
-    refused(files["paper"], "POINTS", text="x_px,y_px,outside\n1,2,3\n", says="have been corrected")
+    refused(
+        files["paper"],
+        "POINTS",
+        text="x_px,y_px,camera_degC\n1,2,warm\n",
+        status=1,
+        says="line 2: camera_degC is 'warm'",
+    )
+    refused(
+        files["paper"], "POINTS", text="x_px,y_px,camera_degC\n1,2\n", status=1, says="line 2 has not as many cells"
+    )
+    refused(files["paper"], "POINTS", text="x_px,y_px,outside\n1,2,3\n", status=1, says="have been corrected")
     refused(files["paper"], "POINTS", "--session", recorded.path, says="needs the instant of every point")
     refused(files["thermal"], "POINTS", says="a model of the form thermal needs the thermal state")
     refused(files["paper"], "POINTS", "--frames", "0:1", says="--frames does not belong here")
@@ -271,9 +281,16 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
     refused(files["paper"], recorded.path, "--frames", "3", says="give FIRST:END")
     refused(files["paper"], recorded.path, "--camera-degC", "3", says="a session has temperatures of its own")
     refused(files["paper"], tmp_path / "photo.png", says="give the camera's temperature with --camera-degC")
-    refused(tmp_path / "none.json", "POINTS", says="none.json: cannot be read")
+    refused(tmp_path / "none.json", "POINTS", status=1, says="none.json: cannot be read")
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((40, 50), np.uint8))
-    refused(files["paper"], tmp_path / "small.png", "--camera-degC", "40", says="50 x 40 pixels, the model is of 640")
+    refused(
+        files["paper"],
+        tmp_path / "small.png",
+        "--camera-degC",
+        "40",
+        status=1,
+        says="50 x 40 pixels, the model is of 640",
+    )
 
 
 def test_a_folder_that_is_there_is_not_written_into(recorded: Recorded, files: dict[str, Path], tmp_path: Path):

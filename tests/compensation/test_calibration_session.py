@@ -189,19 +189,20 @@ def test_a_file_that_is_not_a_camera_is_refused(
 def test_bad_input_is_refused_with_a_sentence_and_leaves_nothing(recorded: Recorded, tmp_path: Path):
     out = tmp_path / "camera.json"
     cases = [
-        ([tmp_path, "-o", out], "not a session"),
-        ([recorded.path, "-o", tmp_path / "none" / "camera.json"], "cannot be written"),
+        ([tmp_path, "-o", out], "not a session", 1),
+        ([recorded.path, "-o", tmp_path / "none" / "camera.json"], "cannot be written", 1),
         (
             [recorded.path, "-o", out, "--export", next((recorded.path / "telemetry").iterdir()) / "exports"],
             "cannot be made",
+            1,
         ),
-        ([recorded.path, "-o", out, "--target", "dots"], "installed targets"),
-        ([recorded.path, "-o", out, "--model", "fisheye"], "fisheye"),
-        ([recorded.path, "-o", out, "--linear-um", "0"], "--linear-um"),
+        ([recorded.path, "-o", out, "--target", "dots"], "installed targets", 2),
+        ([recorded.path, "-o", out, "--model", "fisheye"], "fisheye", 2),
+        ([recorded.path, "-o", out, "--linear-um", "0"], "--linear-um", 2),
     ]
-    for arguments, sentence in cases:
+    for arguments, sentence, status in cases:
         result = run(*arguments)
-        assert result.exit_code in (1, 2), sentence
+        assert result.exit_code == status, sentence
         assert sentence in result.stderr.splitlines()[-1]
         assert not list(tmp_path.iterdir())
 
