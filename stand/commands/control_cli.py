@@ -17,8 +17,8 @@ from recording.format.inventory import inventory
 from stand.commands.session_text import size
 from stand.config.stand_config import load_config, packaged
 from stand.gate import INTERLOCK, OPERATOR
-from stand.serving.control import RunStatus
 from stand.serving.control_client import ask, ask_status, running_sessions
+from stand.serving.desk import RunStatus
 from stand.serving.door import Answer
 
 app = typer.Typer(add_completion=False)
@@ -47,7 +47,8 @@ def status(
         session = _running(directory, config, anywhere=True)
         found = ask_status(session)
         if as_json:
-            typer.echo(json.dumps({"session": str(session), **found.model_dump(mode="json")}, indent=2))
+            fields = found.model_dump(mode="json", exclude={"session"})
+            typer.echo(json.dumps({"session": str(session), **fields}, indent=2))
             return
         for line in status_lines(session, found):
             typer.echo(line)

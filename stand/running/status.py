@@ -16,7 +16,7 @@ from stand.fault import Fault
 from stand.gate import Gate, Phase
 from stand.running.state import RunState
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
-from stand.serving.control import RunStatus
+from stand.serving.desk import RunStatus
 
 State = Literal["running", "held", "stopping"]
 _STATES: dict[Phase, State] = {

@@ -23,49 +23,12 @@ from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
-
-from pydantic import BaseModel, ConfigDict
 
 from foundation.errors import SessionError
 from stand.gate import INTERLOCK, OPERATOR, Gate
+from stand.serving.desk import RunStatus
 from stand.serving.door import Answer, Door, Handlers
 from stand.serving.presence import Entry, Presence
-
-
-class RunStatus(BaseModel):
-    """The status of a run. Instants are ns since the epoch on the stand's clock, which may be virtual;
-    utc_offset_ns makes now and later UTC as the host has it, since_utc_offset_ns and warning_utc_offset_ns the others.
-
-    step: number of the step under way, 1 is the first. since_ns: when the present state began. end_ns: when the run is
-    expected to end, None when unknown. temperatures_degC: by channel, None for a BAD reading. warning: the text of the
-    last warning or error, published at warning_ns. fault_rule, fault: the rule that has tripped and holds or ends the
-    run, and what was found, "" when all is well.
-    """
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-    recipe: str
-    step: int
-    steps: int
-    doing: str
-    state: Literal["running", "held", "stopping"]
-    reasons: tuple[str, ...]
-    now_ns: int
-    since_ns: int
-    end_ns: int | None
-    temperatures_degC: dict[str, float | None]
-    frames_saved: int
-    frames_lost: int
-    disk_free_bytes: int
-    warning: str = ""
-    warning_level: Literal["", "warning", "error"] = ""
-    warning_ns: int | None = None
-    utc_offset_ns: int = 0
-    since_utc_offset_ns: int = 0
-    warning_utc_offset_ns: int = 0
-    fault_rule: str = ""
-    fault: str = ""
 
 
 def handlers(

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
-from stand.serving.control import RunStatus
+from stand.serving.desk import RunStatus
 from stand.serving.door import Answer, object_of
 from stand.serving.presence import Daemon, address_in, living, opened_folder
 

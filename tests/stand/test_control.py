@@ -17,8 +17,9 @@ import pytest
 from foundation.errors import SessionError
 from stand import runtime
 from stand.gate import Gate
-from stand.serving.control import RunStatus, handlers, serve
+from stand.serving.control import handlers, serve
 from stand.serving.control_client import ask, ask_status, running_sessions
+from stand.serving.desk import RunStatus
 from stand.serving.door import LINE_LIMIT_BYTES, MOST_CLIENTS
 from stand.serving.presence import Entry, Presence, address_in, living, opened_folder
 

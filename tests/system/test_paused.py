@@ -6,8 +6,9 @@ from pathlib import Path
 
 from recording.reading.session import Session
 from stand.running.order import Order
-from stand.serving.control import RunStatus, handlers
+from stand.serving.control import handlers
 from stand.serving.control_client import ask
+from stand.serving.desk import RunStatus
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of

@@ -1,0 +1,346 @@
+"""What can be asked of a stand, and the values in which it answers: where daemon, HTTP interface, page and command line
+meet.
+
+`Desk` is on the side of the control loop. Everything else sees the values below: they are immutable, they are what the
+published OpenAPI document describes, and an instant in them is ns since the epoch on the stand's clock, to which
+`utc_offset_ns` is added for UTC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from foundation.errors import StandError
+from foundation.items import Event
+from foundation.readings import Cause, Quality
+
+COMMAND = "command"  # the kind of the event that each command is
+
+# Verbs of a command's event, in the words of the interface.
+Verb = Literal[
+    "pause",
+    "continue",
+    "clear",
+    "stop",
+    "skip",
+    "extend",
+    "edit",
+    "submit",
+    "cancel",
+    "move",
+    "resume",
+    "device",
+    "note",
+]
+# socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. terminal: a signal or key.
+How = Literal["socket", "loopback", "token", "terminal"]
+When = Literal["now", "step"]
+StepStanding = Literal["waiting", "under_way", "done", "skipped"]
+
+
+class Conflict(StandError):
+    """The state of the stand or of its run forbids what was asked for; the text says why, and what would help."""
+
+
+class Missing(StandError):
+    """What was asked for does not exist: a step, a queued run, a session, a device."""
+
+
+class Value(BaseModel):
+    """What all values here are: immutable, without infinities or NaN, which JSON does not have."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+
+class Who(Value):
+    """Who asks. name: the user of the socket, else the name of the token; "" when it is not known."""
+
+    name: str
+    how: How
+
+
+class RunStatus(Value):
+    """The status of a run. Instants are ns since the epoch on the stand's clock, which may be virtual;
+    utc_offset_ns makes now and later UTC as the host has it, since_utc_offset_ns and warning_utc_offset_ns the others.
+
+    session: its folder as it was when the run began. run_id: the session's name, which no other run of the stand has.
+    step: number of the step under way, 1 is the first. since_ns: when the present state began. end_ns: when the run is
+    expected to end, None when unknown. temperatures_degC: by channel, None for a BAD reading. warning: the text of the
+    last warning or error, published at warning_ns. fault_rule, fault: the rule that has tripped and holds or ends the
+    run, and what was found, "" when all is well.
+    """
+
+    recipe: str
+    step: int
+    steps: int
+    doing: str
+    state: Literal["running", "held", "stopping"]
+    reasons: tuple[str, ...]
+    now_ns: int
+    since_ns: int
+    end_ns: int | None
+    temperatures_degC: dict[str, float | None]
+    frames_saved: int
+    frames_lost: int
+    disk_free_bytes: int
+    warning: str = ""
+    warning_level: Literal["", "warning", "error"] = ""
+    warning_ns: int | None = None
+    utc_offset_ns: int = 0
+    since_utc_offset_ns: int = 0
+    warning_utc_offset_ns: int = 0
+    fault_rule: str = ""
+    fault: str = ""
+    session: str = ""
+    run_id: str = ""
+
+
+class ReadingState(Value):
+    """The last reading of a channel. value: None exactly when it is BAD; reason, cause: why it is not GOOD."""
+
+    value: float | None
+    unit: str
+    quality: Quality
+    time_ns: int
+    reason: str = ""
+    cause: Cause = ""
+
+
+class FaultState(Value):
+    """What has tripped. rule: its name; data: what a program needs of it; since_ns: when it was found."""
+
+    rule: str
+    text: str
+    since_ns: int
+    data: dict[str, JsonValue] = Field(default_factory=dict)
+
+
+class PromptState(Value):
+    """What an operator is asked to do; the pause that goes with it is ended by `continue`."""
+
+    step_id: str
+    text: str
+
+
+class PlanStep(Value):
+    """A step of the plan in force. kind, parameters: as in a recipe's `steps`; text: the same in words.
+
+    duration_s: expected in all. earned_s: of a soak so far. frames, frames_saved: of a capture. began_ns, ended_ns:
+    when it was begun and done by this daemon, None for what is not known. expected_ns: when a step to come, or under
+    way, is expected to end, None when that is not known.
+    """
+
+    step_id: str
+    index: int
+    kind: str
+    parameters: dict[str, JsonValue]
+    text: str
+    standing: StepStanding
+    duration_s: float
+    earned_s: float = 0.0
+    frames: int = 0
+    frames_saved: int = 0
+    began_ns: int | None = None
+    ended_ns: int | None = None
+    expected_ns: int | None = None
+
+
+class QueuedRun(Value):
+    """A run of the queue. waiting and interrupted ones are still to be done. expected_s: how long it will take, None
+    when unknown. session: the name of its folder, "" before it has one. reason: why it failed or was interrupted."""
+
+    id: int
+    recipe: str
+    state: Literal["waiting", "running", "done", "failed", "interrupted"]
+    added_ns: int
+    began_ns: int | None = None
+    ended_ns: int | None = None
+    session: str = ""
+    reason: str = ""
+    expected_s: float | None = None
+    key: str = ""
+    added_by: str = ""
+
+
+class StandState(Value):
+    """The whole stand at one instant, as the control loop published it.
+
+    seq: the sequence number of the stream that this state is after. version: of the program. phase: idle between runs.
+    reasons: what holds the run. readings: the last of every channel. setpoint_degC: of the chamber, None when it is
+    stopped or unknown. output_percent: of the regulator. flap: "open", "closed", "moving", or "" when it is not known.
+    axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles, ...). drops: items that
+    the interface was too slow for.
+    """
+
+    seq: int = 0
+    stand: str
+    version: str
+    simulated: bool
+    now_ns: int
+    utc_offset_ns: int
+    phase: Literal["idle", "running", "held", "stopping"]
+    run: RunStatus | None = None
+    reasons: tuple[str, ...] = ()
+    fault: FaultState | None = None
+    prompt: PromptState | None = None
+    readings: dict[str, ReadingState] = Field(default_factory=dict)
+    setpoint_degC: float | None = None
+    output_percent: float | None = None
+    heater_permitted: bool = False
+    compressor_on: bool = False
+    camera_on: bool = False
+    flap: str = ""
+    axes: dict[str, float | None] = Field(default_factory=dict)
+    queue: tuple[QueuedRun, ...] = ()
+    queue_halted: str = ""
+    counters: dict[str, float] = Field(default_factory=dict)
+    disk_free_bytes: int = 0
+    moving: tuple[str, ...] = ()
+    drops: int = 0
+
+
+class Done(Value):
+    """The answer to a command. reasons: what holds the run now; moving: what is still under way, as in
+    `linear to 250 mm`; text: what came of it, in a sentence; seq: of the command's event in the stream."""
+
+    verb: Verb
+    text: str = ""
+    reasons: tuple[str, ...] = ()
+    moving: tuple[str, ...] = ()
+    seq: int = 0
+
+
+class WrittenStep(Value):
+    """A step as it is written in a recipe's `steps`: its kind and parameters."""
+
+    kind: str = Field(max_length=100)
+    parameters: dict[str, JsonValue] = Field(default_factory=dict)
+
+
+class RunRequest(Value):
+    """A run that is asked for: the name of an installed recipe, or the text of one. Names of files are not taken: the
+    interface must not be a way to read any.
+
+    attended: somebody is there to do what the plan prompts for. tags, note: for the catalogue of sessions.
+    """
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="forbid")
+
+    recipe: str = Field(default="", max_length=200)
+    recipe_text: str = Field(default="", max_length=1 << 18)
+    attended: bool = False
+    tags: tuple[str, ...] = Field(default=(), max_length=32)
+    note: str = Field(default="", max_length=10_000)
+
+
+class Argument(Value):
+    """What a verb of a device is given: its name, unit, and the range in which the stand takes it, or its choices."""
+
+    name: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+class DeviceVerb(Value):
+    """Something a device can be told by hand between runs."""
+
+    verb: str
+    text: str
+    arguments: tuple[Argument, ...] = ()
+
+
+class DeviceState(Value):
+    """A device. channels: of its readings. refused: why it takes no order now, "" when it does."""
+
+    name: str
+    kind: str
+    channels: tuple[str, ...] = ()
+    verbs: tuple[DeviceVerb, ...] = ()
+    refused: str = ""
+
+
+class Desk(Protocol):
+    """What can be asked of a stand. All of it is called on the control loop and returns quickly: no method waits for a
+    wire, and what waits for a disk is `async` and stands in nobody's way.
+
+    Each command publishes an event of kind COMMAND (`command_event`) and then does what it says, or raises Conflict
+    when the state forbids it, Missing, or ConfigError when the request itself is wrong. `stop` never raises.
+    """
+
+    def state(self) -> StandState:
+        """As it is now."""
+        ...
+
+    def plan(self) -> tuple[PlanStep, ...]:
+        """The plan in force; empty when nothing is run."""
+        ...
+
+    def devices(self) -> tuple[DeviceState, ...]:
+        """What may be told by hand."""
+        ...
+
+    def pause(self, who: Who, when: When = "now") -> Done:
+        """Hold the run before its next action, or when the step under way is done."""
+        ...
+
+    def continue_(self, who: Who) -> Done:
+        """End a pause."""
+        ...
+
+    def clear(self, who: Who) -> Done:
+        """An operator has removed the cause of a trip."""
+        ...
+
+    def stop(self, who: Who) -> Done:
+        """Make the stand safe and end the run, if there is one; in every state, as often as it is asked for."""
+        ...
+
+    async def skip(self, who: Who, step_id: str) -> Done:
+        """Leave a step out, or break it off; durable when this returns."""
+        ...
+
+    async def extend(self, who: Who, step_id: str, by_s: float) -> Done:
+        """Soak for so much longer; durable when this returns."""
+        ...
+
+    async def edit(self, who: Who, from_index: int, steps: Sequence[WrittenStep]) -> Done:
+        """Replace the steps from a place on, none of which was begun; durable when this returns."""
+        ...
+
+    async def submit(self, who: Who, order: RunRequest, key: str = "") -> QueuedRun:
+        """Check a run and queue it; with a key of an earlier one, that one. Conflict when its request was another."""
+        ...
+
+    async def cancel(self, who: Who, run: int) -> Done:
+        """Take a run out of the queue."""
+        ...
+
+    async def move(self, who: Who, run: int, to: int) -> Done:
+        """Make a run the `to`-th of those to be done; 1 is the next."""
+        ...
+
+    async def resume(self, who: Who, session: str) -> Done:
+        """Resume the interrupted run of a session."""
+        ...
+
+    async def device(self, who: Who, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> Done:
+        """Tell a device something by hand, through the same gate as a run; Conflict while a run owns the stand."""
+        ...
+
+    async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
+        """Add an operator's note and tags to a session, running or finished."""
+        ...
+
+
+def command_event(
+    time_ns: int, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], result: str = "done"
+) -> Event:
+    """What the recording keeps of a command: who, how, what, and what came of it."""
+    by = who.name or "somebody"
+    data = {"who": who.name, "how": who.how, "verb": verb, "arguments": dict(arguments), "result": result}
+    return Event(time_ns, "info", COMMAND, f"{by} ({who.how}): {verb}", data)
