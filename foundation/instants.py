@@ -1,4 +1,4 @@
-"""Instants and durations as people write them, and back: UTC, never the host's own zone."""
+"""Instants and durations as people read and write them, in the host's own zone; what is recorded or exported is UTC."""
 
 from __future__ import annotations
 
@@ -16,8 +16,13 @@ _OFFSET = re.compile(r"\+(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
 
 
 def date_time(time_ns: int) -> str:
-    """`2026-01-01 18:00:04`, to the second below."""
-    return f"{_datetime(time_ns):%Y-%m-%d %H:%M:%S}"
+    """`2026-01-01 19:00:04`, local time to the second below; for columns whose head says so."""
+    return f"{_local(time_ns):%Y-%m-%d %H:%M:%S}"
+
+
+def local_text(time_ns: int) -> str:
+    """`2026-01-01 19:00:04 CET`: local time with its zone."""
+    return f"{_local(time_ns):%Y-%m-%d %H:%M:%S %Z}"
 
 
 def utc_text(time_ns: int) -> str:
@@ -29,6 +34,15 @@ def _datetime(time_ns: int) -> datetime:
     return _EPOCH + timedelta(microseconds=time_ns // _NS_PER_US)
 
 
+def _local(time_ns: int) -> datetime:
+    """In the host's zone; UTC where that zone has no such instant."""
+    instant = _datetime(time_ns)
+    try:
+        return instant.astimezone()
+    except (OverflowError, ValueError, OSError):
+        return instant
+
+
 def duration(length_ns: int) -> str:
     """`16:12:33`, with the days before it when there are any; below a minute in seconds, `4.2 s`."""
     if length_ns < 60 * NS_PER_S:
@@ -37,9 +51,9 @@ def duration(length_ns: int) -> str:
 
 
 def parse_instant(text: str, begin_ns: int, stand_ns: Callable[[int], int] = int) -> int:
-    """ns since the epoch on the stand's clock, from an ISO time (UTC when it names no zone), which `stand_ns` converts,
-    or from `+90`, `+1h30m`, `+2m5.5s` after `begin_ns`; ConfigError when it is neither, or no year has it that an
-    instant can be written in."""
+    """ns since the epoch on the stand's clock, from an ISO time (local when it names no zone), which `stand_ns`
+    converts, or from `+90`, `+1h30m`, `+2m5.5s` after `begin_ns`; ConfigError when it is neither, or no year has it
+    that an instant can be written in."""
     time_ns = _parsed(text, begin_ns, stand_ns)
     if not 0 <= time_ns <= _LAST_NS:
         raise ConfigError(f"{text}: is not between the years 1970 and 9999")
@@ -55,5 +69,8 @@ def _parsed(text: str, begin_ns: int, stand_ns: Callable[[int], int]) -> int:
         instant = datetime.fromisoformat(text)
     except ValueError as error:
         raise ConfigError(f"{text}: expected a time such as 2026-01-01T18:30:00, +1h30m or step:12") from error
-    instant = instant if instant.tzinfo is not None else instant.replace(tzinfo=UTC)
+    try:
+        instant = instant.astimezone(UTC)  # one without a zone is local
+    except (OverflowError, ValueError, OSError):
+        instant = instant.replace(tzinfo=UTC)
     return stand_ns((instant - _EPOCH) // timedelta(microseconds=1) * _NS_PER_US)

@@ -47,10 +47,11 @@ class Hole:
         return replace(self, begin_ns=first_ns, end_ns=last_ns, frames=self.frames if is_whole else 0)
 
     def when(self, utc: UtcOffsets) -> str:
-        """`from 2026-01-01 18:00:00 to 2026-01-01 18:10:00 UTC`, "" when nothing is known of it."""
-        begin = "" if self.begin_ns is None else f"from {utc.date_time(self.begin_ns)}"
-        end = "" if self.end_ns is None else f"to {utc.date_time(self.end_ns)}"
-        return f"{begin} {end}".strip() + (" UTC" if begin or end else "")
+        """`from 2026-01-01 18:00:00 to 2026-01-01 18:10:00 CET`, "" when nothing is known of it."""
+        if self.end_ns is None:
+            return "" if self.begin_ns is None else f"from {utc.local_text(self.begin_ns)}"
+        begin = "" if self.begin_ns is None else f"from {utc.date_time(self.begin_ns)} "
+        return f"{begin}to {utc.local_text(self.end_ns)}"
 
     def text(self, utc: UtcOffsets) -> str:
         """Which segments, when, and how many frames, as a part of a sentence."""

@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from foundation.clock import NS_PER_S
-from foundation.instants import date_time, utc_text
+from foundation.instants import date_time, local_text, utc_text
 from foundation.items import Event
 
 CLOCK_STEP = "clock_step"
@@ -55,8 +55,12 @@ class UtcOffsets:
         return max(utc_ns - offset_ns, begin_ns)
 
     def date_time(self, stand_ns: int) -> str:
-        """`2026-01-01 18:00:04`, UTC to the second below."""
+        """`2026-01-01 19:00:04`, local time to the second below."""
         return date_time(self.utc_ns(stand_ns))
+
+    def local_text(self, stand_ns: int) -> str:
+        """The same with its zone: `2026-01-01 19:00:04 CET`."""
+        return local_text(self.utc_ns(stand_ns))
 
     def utc_text(self, stand_ns: int) -> str:
         """UTC in ISO 8601 to the ns."""

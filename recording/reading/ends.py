@@ -88,14 +88,14 @@ def _why(
     if journal is None:
         if last is None or is_ended or is_salvaged:
             return ""
-        return f"the recording stops at {utc.date_time(end_ns)} UTC without an end of its run"
-    stops = f"the telemetry stops at {utc.date_time(end_ns)} UTC"
+        return f"the recording stops at {utc.local_text(end_ns)} without an end of its run"
+    stops = f"the telemetry stops at {utc.local_text(end_ns)}"
     if journal.status and not is_ended:
-        return f"{JOURNAL_NAME} says that the run ended at {utc.date_time(journal.ended_ns)} UTC, {stops}"
+        return f"{JOURNAL_NAME} says that the run ended at {utc.local_text(journal.ended_ns)}, {stops}"
     if journal.resumed_ns > (last.time_ns if is_ended and last is not None else end_ns + AHEAD_NS):
-        return f"{JOURNAL_NAME} says that the run was resumed at {utc.date_time(journal.resumed_ns)} UTC, {stops}"
+        return f"{JOURNAL_NAME} says that the run was resumed at {utc.local_text(journal.resumed_ns)}, {stops}"
     if done and (more := len(journal.done - done)):
         return f"{JOURNAL_NAME} says that {len(journal.done)} steps are done, {more} more than the telemetry; {stops}"
     if journal.last_ns > end_ns + AHEAD_NS and not is_salvaged and not is_ended:
-        return f"{JOURNAL_NAME} continues to {utc.date_time(journal.last_ns)} UTC, {stops}"
+        return f"{JOURNAL_NAME} continues to {utc.local_text(journal.last_ns)}, {stops}"
     return ""

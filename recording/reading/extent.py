@@ -23,7 +23,7 @@ class Extent:
 
     def text(self, utc: UtcOffsets) -> str:
         """As a sentence."""
-        span = f"{utc.date_time(self.begin_ns)} to {utc.date_time(self.end_ns)} UTC"
+        span = f"{utc.date_time(self.begin_ns)} to {utc.local_text(self.end_ns)}"
         return f"a part of the session {self.session_id}: {span}; the run's journal and its other part are not in it"
 
     def record(self) -> str:

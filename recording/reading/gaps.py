@@ -40,7 +40,7 @@ class Silence:
     def text(self, utc: UtcOffsets) -> str:
         """The silence as a sentence."""
         verb = "was" if len(self.names) == 1 else "were"
-        span = f"from {utc.date_time(self.begin_ns)} to {utc.date_time(self.end_ns)} UTC"
+        span = f"from {utc.date_time(self.begin_ns)} to {utc.local_text(self.end_ns)}"
         return f"{', '.join(self.names)} {verb} silent {span} ({duration(self.end_ns - self.begin_ns)})"
 
 

@@ -326,11 +326,11 @@ def _frames(
     if keys:
         times_ns, blocks = sorted(time_ns for time_ns, _ in keys), sorted(block for _, block in keys)
         if len(keys) == 1:
-            yield kind(f"1 frame is {what}: block {blocks[0]}, {utc.date_time(times_ns[0])} UTC")
+            yield kind(f"1 frame is {what}: block {blocks[0]}, {utc.local_text(times_ns[0])}")
             return
         yield kind(
             f"{len(keys)} frames are {what}: blocks {blocks[0]} to {blocks[-1]}, "
-            f"{utc.date_time(times_ns[0])} to {utc.date_time(times_ns[-1])} UTC"
+            f"{utc.date_time(times_ns[0])} to {utc.local_text(times_ns[-1])}"
         )
 
 
@@ -339,7 +339,7 @@ def _frames_lost(contents: Contents) -> Iterator[Finding]:
     utc = offsets_of(contents.events)
     for event in contents.events:
         if event.kind == FRAMES_DROPPED:
-            yield _note(f"{utc.date_time(event.time_ns)} UTC: {event.text}")
+            yield _note(f"{utc.local_text(event.time_ns)}: {event.text}")
     dropped: Counter[str] = Counter()
     for _, meta in contents.metas:
         dropped[meta.step_id] += meta.dropped

@@ -11,7 +11,7 @@ import typer
 
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import one_line_errors
-from foundation.instants import date_time, duration
+from foundation.instants import duration, local_text
 from foundation.usage import one_line
 from recording.format.inventory import inventory
 from stand.commands.session_text import size
@@ -107,8 +107,8 @@ def status_lines(session: Path, found: RunStatus) -> Iterator[str]:
     state = found.state if found.state != "held" else f"held: {', '.join(found.reasons)}"
     yield _row("session", str(session))
     yield _row("recipe", found.recipe)
-    since = date_time(found.since_ns + found.since_utc_offset_ns)
-    yield _row("state", f"{state}, since {since} UTC ({_span(found.now_ns - found.since_ns)})")
+    since = local_text(found.since_ns + found.since_utc_offset_ns)
+    yield _row("state", f"{state}, since {since} ({_span(found.now_ns - found.since_ns)})")
     if found.fault:
         yield _row("fault", f"{found.fault_rule}: {found.fault}")
     yield _row("step", f"{found.step}/{found.steps} {found.doing}")
@@ -131,14 +131,14 @@ def _span(length_ns: int) -> str:
 def _end(found: RunStatus) -> str:
     if found.end_ns is None:
         return "not known"
-    return f"{date_time(found.end_ns + found.utc_offset_ns)} UTC (in {_span(found.end_ns - found.now_ns)})"
+    return f"{local_text(found.end_ns + found.utc_offset_ns)} (in {_span(found.end_ns - found.now_ns)})"
 
 
 def _warning(found: RunStatus) -> str:
     if found.warning_ns is None:
         return found.warning or "none"
     level = "error, " if found.warning_level == "error" else ""
-    return f"{level}{date_time(found.warning_ns + found.warning_utc_offset_ns)} UTC: {found.warning}"
+    return f"{level}{local_text(found.warning_ns + found.warning_utc_offset_ns)}: {found.warning}"
 
 
 def _still(answer: Mapping[str, object]) -> str:

@@ -35,7 +35,7 @@ OutOption = Annotated[
 RunArgument = Annotated[int, typer.Argument(metavar="ID", help="The run's number in `stand queue list`.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
 
-_COLUMNS = ("id", "next", "recipe", "state", "added (UTC)", "took", "session", "reason")
+_COLUMNS = ("id", "next", "recipe", "state", "added (local)", "took", "session", "reason")
 
 
 @app.command()

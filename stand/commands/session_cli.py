@@ -253,13 +253,13 @@ def _check_new(out: Path, session: Path) -> None:
 
 @contextmanager
 def _replay_progress(seen: Glance, session: Session) -> Generator[Callable[[Hub], None]]:
-    """Progress in seconds of the session; its steps and events as lines, in UTC."""
+    """Progress in seconds of the session; its steps and events as lines, in local time."""
     begin_ns, end_ns, utc = seen.begin_ns or 0, seen.end_ns or 0, session.utc
     with progress("replay", (end_ns - begin_ns) / NS_PER_S) as report:
 
         def follow(item: Item) -> None:
             at = utc.date_time(item.time_ns)
-            report((item.time_ns - begin_ns) / NS_PER_S, f"{at} UTC")
+            report((item.time_ns - begin_ns) / NS_PER_S, at)
             if isinstance(item, StepMark):
                 typer.echo(f"{at}  step {item.index} {one_line(item.kind)} {item.state}")
             elif isinstance(item, Event):
@@ -309,9 +309,9 @@ def export_session(
 def trim_session(
     directory: SessionArgument,
     out: OutOption,
-    begin: Annotated[str, typer.Option("--from", metavar="T", help="2026-01-01T18:30:00 (UTC), +1h30m or step:12.")] = (
-        "+0s"
-    ),
+    begin: Annotated[
+        str, typer.Option("--from", metavar="T", help="2026-01-01T18:30:00 (local), +1h30m or step:12.")
+    ] = ("+0s"),
     end: Annotated[str | None, typer.Option("--to", metavar="T", help="Not included; else the session's end.")] = None,
     incomplete: IncompleteOption = False,
 ) -> None:
@@ -330,7 +330,7 @@ def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple
     """From when up to when; ConfigError when that is not a time, or none."""
     begin_ns = _instant(begin, session, seen)
     if seen.end_ns is not None and begin_ns > seen.end_ns:
-        raise ConfigError(f"--from {begin} is after the session's end ({session.utc.date_time(seen.end_ns)} UTC)")
+        raise ConfigError(f"--from {begin} is after the session's end ({session.utc.local_text(seen.end_ns)})")
     end_ns = (seen.end_ns or 0) + 1 if end is None else _instant(end, session, seen)
     if end_ns <= begin_ns:
         raise ConfigError(f"--to {end} is not after --from {begin}")

@@ -23,7 +23,7 @@ from recording.repair.verify import Verification
 WIDTH = 100
 _LABEL = 14
 _MOST = 20  # entries of a list before the rest is only counted
-LIST_COLUMNS = ("session", "recipe", "start (UTC)", "duration", "frames", "size", "devices", "run", "files")
+LIST_COLUMNS = ("session", "recipe", "start (local)", "duration", "frames", "size", "devices", "run", "files")
 ENCODING = {CompressedImage.DESCRIPTOR.full_name: "PNG", RawImage.DESCRIPTOR.full_name: "raw"}
 
 
@@ -115,7 +115,7 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     yield from _row("files", str(found.state))
     yield from _row("recipe", told("recipe", "?") + (", simulated devices" if seen.simulated else ""))
     if seen.begin_ns is not None and seen.end_ns is not None:
-        span = f"{utc.date_time(seen.begin_ns)} to {utc.date_time(seen.end_ns)} UTC"
+        span = f"{utc.date_time(seen.begin_ns)} to {utc.local_text(seen.end_ns)}"
         yield from _row(
             "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {told('clock_source', '?')} clock"
         )
@@ -170,7 +170,7 @@ def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     for step in steps:
         if step.state is not StepState.DONE:
             parameters = " ".join(f"{name}={value}" for name, value in step.parameters.items())
-            begun = f"begun {utc.date_time(step.begin_ns)} UTC"
+            begun = f"begun {utc.local_text(step.begin_ns)}"
             text = f"{step.index} {step.kind} {parameters} {told[step.state]}, {begun}"
             yield from _row("  not done", text)
 
@@ -184,7 +184,7 @@ def _frames(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     each = size(round(frames.size_bytes / frames.count))
     yield from _row("frames", f"{frames.count}, {frames.pixels}, {encoding}, {each} each{_lost(frames)}")
     if frames.first_ns is not None and frames.last_ns is not None:
-        yield from _row("", f"from {utc.date_time(frames.first_ns)} to {utc.date_time(frames.last_ns)} UTC")
+        yield from _row("", f"from {utc.date_time(frames.first_ns)} to {utc.local_text(frames.last_ns)}")
     captures = [step for step in found.steps if step.frames]
     yield from _limited([_capture(step, utc) for step in captures])
 

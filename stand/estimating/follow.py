@@ -52,7 +52,7 @@ class Follow:
             self.eta.event(item)
             self._utc = offsets_of([item]) if item.kind == CLOCK_STEP else self._utc
             if item.level != "info":
-                self._warn(f"{item.level}: {self._utc.date_time(item.time_ns)[11:]} UTC {item.text}")
+                self._warn(f"{item.level}: {self._utc.local_text(item.time_ns)[11:]} {item.text}")
             return
         if isinstance(item, StepMark):
             self.eta.mark(item)
@@ -68,7 +68,7 @@ class Follow:
         left_ns = seconds_ns(left_s)
         done_s = self._total_s * gone_s / max(gone_s + left_s, 1e-9)
         end = self._utc.date_time(now_ns + left_ns)[:16]
-        self._report(done_s, f"until {end} UTC ({duration(left_ns)} of stand time); {self._step}")
+        self._report(done_s, f"until {end} ({duration(left_ns)} of stand time); {self._step}")
 
 
 def parameters_text(parameters: Mapping[str, object]) -> str:

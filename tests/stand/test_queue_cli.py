@@ -30,7 +30,7 @@ def test_runs_are_added_listed_moved_and_removed(tmp_path: Path):
     assert invoke(tmp_path, "move", 3, 1).exit_code == 0
     assert invoke(tmp_path, "remove", 1).exit_code == 0
     lines = invoke(tmp_path, "list").stdout.splitlines()
-    assert lines[0].split() == ["id", "next", "recipe", "state", "added", "(UTC)", "took", "session", "reason"]
+    assert lines[0].split() == ["id", "next", "recipe", "state", "added", "(local)", "took", "session", "reason"]
     assert [line.split()[:4] for line in lines[1:]] == [
         ["3", "1", "warm-up", "waiting"],
         ["2", "2", "demo", "waiting"],

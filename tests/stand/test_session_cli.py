@@ -64,7 +64,7 @@ def test_the_list_has_a_line_for_each_session_and_for_a_damaged_one(session: Pat
         "session",
         "recipe",
         "start",
-        "(UTC)",
+        "(local)",
         "duration",
         "frames",
         "size",
