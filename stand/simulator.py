@@ -45,6 +45,7 @@ def laboratory_of(
         "camera_kind": simulation.camera,
         "laboratory_degC": simulation.laboratory_degC,
         "chamber_seed": simulation.chamber_seed,
+        "faults": list(simulation.faults),
         "bus": address_of(config.bus.address),
         "regulator_unit": config.regulator.unit,
         "relays_unit": config.relays.unit,
@@ -78,6 +79,15 @@ def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
             "simulation": simulation and simulation.model_copy(update={"control": addresses["control"]}),
         }
     )
+
+
+def list_faults() -> list[dict[str, object]]:
+    """The simulator's table of faults: name, worst, mended, text."""
+    found = subprocess.run(
+        [sys.executable, "-m", "drivers.sim", "--faults"], capture_output=True, text=True, check=True
+    )
+    rows: list[dict[str, object]] = json.loads(found.stdout)
+    return rows
 
 
 class Simulator:

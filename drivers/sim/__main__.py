@@ -3,6 +3,8 @@
 Prints the addresses at which it answers (JSON, one line) when every fake does; ends on SIGTERM, SIGINT or the control
 socket's `quit`; exits with 2 and one line when it cannot start. When its parent process dies, it lives on for a minute,
 as a real laboratory would: long enough to see the heater's dead-man drop.
+
+`python -m drivers.sim --faults` prints the table of faults (JSON) instead.
 """
 
 from __future__ import annotations
@@ -13,29 +15,41 @@ import signal
 import sys
 
 from drivers.sim.control import serve_control
+from drivers.sim.fault_schedule import FaultSchedule, parse_fault
 from drivers.sim.laboratory import Laboratory, LaboratorySpec
+from drivers.sim.laboratory_faults import table
 from foundation.documents import parse_document
 from foundation.ending import Ending
 from foundation.errors import ConfigError
 
-_ORPHAN_LIMIT_S = 60
+_ORPHAN_LIMIT_S = 60.0
+_TICK_S = 0.1
 
 
 def main() -> int:
     """Build the laboratory, serve it, take it down."""
+    if sys.argv[1:] == ["--faults"]:
+        print(json.dumps(table()))  # noqa: T201 - the answer
+        return 0
     ending, parent = Ending((signal.SIGTERM, signal.SIGINT)), os.getppid()
     try:
         spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
+        faults = [parse_fault(text) for text in spec.faults]
         laboratory = Laboratory(spec)
+        schedule = FaultSchedule(laboratory, faults)
     except (ConfigError, OSError) as error:
         print(f"{error}", file=sys.stderr)  # noqa: T201 - the process' answer to who started it
         return 2
-    control = serve_control(laboratory, ending.ask)
+    control = serve_control(laboratory, schedule, ending.ask)
     addresses = {**laboratory.addresses, "control": control.address}
     print(json.dumps(addresses), flush=True)  # noqa: T201 - the process' answer to who started it
-    orphaned_s = 0
-    while not ending.wait(1.0) and orphaned_s < _ORPHAN_LIMIT_S:
-        orphaned_s += os.getppid() != parent
+    orphaned_s = 0.0
+    while not ending.wait(_TICK_S) and orphaned_s < _ORPHAN_LIMIT_S:
+        try:
+            schedule.tick()
+        except ConfigError as error:
+            print(f"{error}", file=sys.stderr)  # noqa: T201 - the laboratory stays as it is
+        orphaned_s += _TICK_S * (os.getppid() != parent)
     control.close()
     laboratory.close()
     return 0

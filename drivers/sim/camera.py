@@ -147,6 +147,11 @@ class FakeCamera:
         with self._wake:
             self._restart(self._clock.now_ns())
 
+    def seize(self, on: bool) -> None:
+        """Another client is in control of it, until it is not."""
+        with self._wake:
+            self._channel.seize(on)
+
     def advance(self, now_ns: int) -> None:
         """The clock has moved to now_ns: note a change of power, wake the free run. Returns at once."""
         with self._wake:
@@ -211,8 +216,9 @@ class FakeCamera:
         if fault == "stuck":
             return
         sensor = self._registers.integer("DeviceTemperatureSelector") == 0
-        true_degC = self._plant.sensor_degC if sensor else self._plant.body_degC
-        shown_degC = 0.0 if fault == "zero" else round(true_degC / _RESOLUTION_K) * _RESOLUTION_K
+        chip_degC = self._plant.sensor_degC if sensor else self._plant.body_degC
+        chip_degC += self.faults.temperature_offset_K
+        shown_degC = 0.0 if fault == "zero" else round(chip_degC / _RESOLUTION_K) * _RESOLUTION_K
         self._registers.put("DeviceTemperature", shown_degC)
 
     def after_write(self, name: str) -> None:

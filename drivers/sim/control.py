@@ -14,18 +14,21 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
+from drivers.sim.fault_schedule import FaultSchedule
 from drivers.sim.faults import LinkFaults
 from drivers.sim.laboratory import Laboratory
 from drivers.sim.laboratory_faults import FAULTS, inject
 from drivers.sim.wire import Lines, TcpWire
 from foundation.addresses import tcp_place
+from foundation.errors import ConfigError
 
 
 class Control:
     """Answers control requests for one laboratory."""
 
-    def __init__(self, laboratory: Laboratory, quit_: Callable[[], None]) -> None:
+    def __init__(self, laboratory: Laboratory, schedule: FaultSchedule, quit_: Callable[[], None]) -> None:
         self._laboratory = laboratory
+        self._schedule = schedule
         self._quit = quit_
 
     def answer(self, line: bytes) -> bytes:
@@ -38,13 +41,13 @@ class Control:
             if not isinstance(request, dict):
                 raise ValueError(f"expected an object, got {line[:80]!r}")
             return self._perform({str(key): value for key, value in request.items()})
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, ConfigError) as error:
             return {"error": f"{type(error).__name__}: {error}"}
 
     def _perform(self, request: dict[str, object]) -> dict[str, object]:
         match request:
             case {"do": "advance", "now_ns": int(now_ns)}:
-                self._laboratory.advance(now_ns)
+                self._schedule.advance(now_ns)
                 return {"now_ns": now_ns}
             case {"do": "state"}:
                 return dict(self._laboratory.state())
@@ -62,8 +65,8 @@ class Control:
                 raise ValueError(f"cannot understand {request}")
 
 
-def serve_control(laboratory: Laboratory, quit_: Callable[[], None]) -> TcpWire:
+def serve_control(laboratory: Laboratory, schedule: FaultSchedule, quit_: Callable[[], None]) -> TcpWire:
     """Listen on the laboratory's control address; `quit_` is called for a `quit` request."""
-    control = Control(laboratory, quit_)
+    control = Control(laboratory, schedule, quit_)
     place = tcp_place(laboratory.spec.control, may_be_free=True)
     return TcpWire(*place, lambda: Lines(control.answer), LinkFaults())

@@ -38,6 +38,9 @@ class Device(Protocol):
         ...
 
 
+_STRANGER: Peer = ("192.0.2.1", 3956)
+
+
 class ControlChannel:
     """The control protocol of one device; times are s of the host's boot time."""
 
@@ -68,8 +71,16 @@ class ControlChannel:
     def check_heartbeat(self, now_s: float) -> None:
         """Take the privilege from a controller that has been silent for too long."""
         timeout_s = self._registers.integer("GevHeartbeatTimeout") / 1000
-        if self._controller is not None and now_s - self._heard_s > timeout_s:
+        if self._controller not in (None, _STRANGER) and now_s - self._heard_s > timeout_s:
             self._release()
+
+    def seize(self, on: bool) -> None:
+        """Another client takes control and keeps its heartbeat up, or lets go."""
+        if self._controller is not None and (on or self._controller == _STRANGER):
+            self._release()
+        if on:
+            self._controller = _STRANGER
+            self._registers.put("GevCCP", _CONTROL)
 
     def forget(self) -> None:
         """The device lost its power: no controller, nothing remembered, no client informed."""

@@ -31,7 +31,7 @@ class CameraFaults:
     neither hears nor answers. silent_gvsp: no stream packet leaves. unpaced: packets leave as fast as they can.
     drop_leader, drop_trailer: missing from every frame until asked for again. trigger_twice: every software trigger
     gives two frames. no_stream_channel: it says that it has none, as one that is not ready yet. temperature:
-    DeviceTemperature reads 0, is refused, or keeps its last value.
+    DeviceTemperature reads 0, is refused, or keeps its last value; temperature_offset_K: it is wrong by so much.
     """
 
     seed: int = 0
@@ -46,6 +46,7 @@ class CameraFaults:
     trigger_twice: bool = False
     no_stream_channel: bool = False
     temperature: Literal["zero", "access", "stuck"] | None = None
+    temperature_offset_K: float = 0.0
 
 
 @dataclass

@@ -14,6 +14,7 @@ from pydantic import Field
 from drivers.sim.camera import FakeCamera
 from drivers.sim.faults import LinkFaults
 from drivers.sim.flap import FakeFlap
+from drivers.sim.link_faults import Link
 from drivers.sim.modbus import RtuEngine, TcpEngine
 from drivers.sim.optics import true_centres_px
 from drivers.sim.plant import Plant, PlantSpec
@@ -76,6 +77,7 @@ class LaboratorySpec(Document):
     flap: EndpointSpec
     cameras: dict[str, EndpointSpec]
     camera_boot_s: float = Field(default=3.0, ge=0)
+    faults: tuple[str, ...] = ()
 
 
 class Laboratory:
@@ -99,6 +101,7 @@ class Laboratory:
         self.axes: dict[str, FakeAxis] = {}
         self.cameras: dict[str, FakeCamera] = {}
         self.addresses: dict[str, str] = {}
+        self._links: dict[str, Link] = {}
         self.ssr_welded_share = 0.0
         self.camera_sensor_degC: float | None = None
         self._closers: list[Callable[[], None]] = []
@@ -118,8 +121,32 @@ class Laboratory:
 
     @property
     def camera(self) -> FakeCamera:
-        """The camera that is named so, or the first."""
+        """The camera that is named so, or the first; ValueError when there is none."""
+        if not self.cameras:
+            raise ValueError("this laboratory has no camera")
         return self.cameras.get("camera") or next(iter(self.cameras.values()))
+
+    @property
+    def now_ns(self) -> int:
+        """The laboratory's time."""
+        return self._clock.now_ns()
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether its time moves by `advance` alone."""
+        return self._followed is not None
+
+    def link(self, name: str) -> Link:
+        """The wire of the bus or an axis; ValueError when there is none."""
+        if name not in self._links:
+            raise ValueError(f"this laboratory has no {name}")
+        return self._links[name]
+
+    def axis(self, name: str) -> FakeAxis:
+        """One axis of the table; ValueError when there is none."""
+        if name not in self.axes:
+            raise ValueError(f"this laboratory has no {name}")
+        return self.axes[name]
 
     def advance(self, now_ns: int) -> None:
         """Virtual time moves to `now_ns`; ValueError in real time or backwards."""
@@ -160,7 +187,7 @@ class Laboratory:
         )
         units = (self.regulator, self.relays, self.thermometers)
         framing = RtuEngine if spec.bus.startswith("serial:") else TcpEngine
-        self.bus, self.bus_faults = self._listen("bus", spec.bus, lambda: framing(units))
+        self._listen("bus", spec.bus, lambda: framing(units))
         for name, settings in spec.axes.items():
             axis = FakeAxis(plant, clock, PROFILES[settings.profile], settings.serial_number, name)
             self.axes[str(name)] = axis
@@ -211,9 +238,7 @@ class Laboratory:
         if self.camera_sensor_degC is not None:
             self.plant.sensor_degC = self.camera_sensor_degC
 
-    def _listen(
-        self, name: str, address: str, make_engine: Callable[[], Engine]
-    ) -> tuple[PtyWire | TcpWire, LinkFaults]:
+    def _listen(self, name: str, address: str, make_engine: Callable[[], Engine]) -> None:
         faults = LinkFaults(seed=self.spec.seed)
         if address.startswith("serial:"):
             path = address.removeprefix("serial:")
@@ -222,7 +247,7 @@ class Laboratory:
             wire = TcpWire(*tcp_place(address, may_be_free=True), make_engine, faults)
         self._closers.append(wire.close)
         self.addresses[name] = wire.address
-        return wire, faults
+        self._links[name] = Link(wire, faults)
 
     def _render(self, time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
         with self.plant.lock:

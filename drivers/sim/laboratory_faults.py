@@ -1,97 +1,96 @@
-"""What can be broken in a simulated laboratory, by name."""
+"""What can be broken in a simulated laboratory: one table, name -> how, with which value, and how it is mended.
+
+A name begins with the device or the link. Every fault is set by a value, which is its `worst` unless another is given,
+and undone by its `mended` one. A fault that cannot be undone (somebody pressed a key) just ends.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 from pydantic import TypeAdapter
 
+from drivers.sim.flap import (
+    ERROR_FEEDBACK_DISCONNECT,
+    ERROR_HARD_OVER_CURRENT,
+    ERROR_NO_POWER,
+)
 from drivers.sim.laboratory import Laboratory
-from drivers.sim.wire import TcpWire
+from drivers.sim.link_faults import LINK_FAULTS, set_link_fault
+from drivers.sim.ximc import FakeAxis
+from drivers.sim.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
 from foundation.clock import seconds_ns
+
+Setter = Callable[[Laboratory, object], None]
+
+_AIR = "air"
+_ERRORS = {"feedback": ERROR_FEEDBACK_DISCONNECT, "power": ERROR_NO_POWER, "current": ERROR_HARD_OVER_CURRENT}
+_AXES = ("linear", "rotary")
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """How something is broken: `apply(laboratory, value)`, the value it has when none is given, the one that mends it,
+    and what it means. `locks`: whether it is set under the plant's lock; a wire that is unplugged waits for its
+    thread, which may want that lock."""
+
+    apply: Setter
+    worst: object
+    mended: object
+    text: str
+    locks: bool = True
 
 
 def inject(laboratory: Laboratory, name: str, value: object) -> None:
-    """Set one of FAULTS; `value` as the fault's own attribute takes it."""
+    """Set one of FAULTS to `value`; KeyError, TypeError or ValueError when name or value is none."""
+    fault = FAULTS[name]
+    if not fault.locks:
+        return fault.apply(laboratory, value)
     with laboratory.plant.lock:
-        FAULTS[name](laboratory, value)
+        fault.apply(laboratory, value)
 
 
-def _open_thermometer(laboratory: Laboratory, value: object) -> None:
-    channels = laboratory.spec.thermometer_channels
-    laboratory.thermometers.open_channels = {channels[str(value)]} if value else set()
-
-
-def _sensor_break(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.sensor_break = bool(value)
-
-
-def _pv_offset(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.pv_offset_K = float(str(value))
-
-
-def _offset_thermometer(laboratory: Laboratory, value: object) -> None:
-    laboratory.thermometers.offset_K = _of_thermometers(laboratory, value)
-
-
-def _stuck_thermometer(laboratory: Laboratory, value: object) -> None:
-    laboratory.thermometers.stuck_degC = _of_thermometers(laboratory, value)
-
-
-def _of_thermometers(laboratory: Laboratory, value: object) -> dict[int, float]:
+def _numbers(laboratory: Laboratory, value: object) -> dict[int, float]:
     """`{"air": 30.0}` by the module's channel numbers."""
     named = TypeAdapter(dict[str, float]).validate_python(value or {})
     return {laboratory.spec.thermometer_channels[name]: number for name, number in named.items()}
 
 
-def _silent_thermometers(laboratory: Laboratory, value: object) -> None:
-    laboratory.thermometers.silent = bool(value)
+def _channel(laboratory: Laboratory, value: object) -> set[int]:
+    return {laboratory.spec.thermometer_channels[str(value)]} if value else set()
 
 
-def _refuse_fault_bits(laboratory: Laboratory, value: object) -> None:
-    laboratory.thermometers.no_fault_bits = bool(value)
+def _number(value: object) -> float:
+    return float(str(value or 0))
 
 
-def _stuck_pv(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.stuck_pv_degC = None if value is None else float(str(value))
+def _number_or_none(value: object) -> float | None:
+    return None if value is None else float(str(value))
 
 
-def _pv_drift(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.pv_drift_K_per_h = float(str(value))
+def _to(find: Callable[[Laboratory], object], attribute: str, kind: Callable[[object], object] = bool) -> Setter:
+    """Sets one attribute of one fake."""
+
+    def apply(laboratory: Laboratory, value: object) -> None:
+        setattr(find(laboratory), attribute, kind(value))
+
+    return apply
 
 
-def _probe_out(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.probe_out = bool(value)
+def _thermometers(attribute: str, kind: Callable[[Laboratory, object], object]) -> Setter:
+    def apply(laboratory: Laboratory, value: object) -> None:
+        setattr(laboratory.thermometers, attribute, kind(laboratory, value))
+
+    return apply
+
+
+def _noisy(laboratory: Laboratory, value: object) -> int | None:
+    return next(iter(_channel(laboratory, value)), None)
 
 
 def _exchange_probes(laboratory: Laboratory, value: object) -> None:
     laboratory.regulator.probe_exchanged = laboratory.thermometers.air_exchanged = bool(value)
-
-
-def _pull_thermometer_out(laboratory: Laboratory, value: object) -> None:
-    channels = laboratory.spec.thermometer_channels
-    laboratory.thermometers.pulled_out = {channels[str(value)]} if value else set()
-
-
-def _short_thermometer(laboratory: Laboratory, value: object) -> None:
-    channels = laboratory.spec.thermometer_channels
-    laboratory.thermometers.shorted_channels = {channels[str(value)]} if value else set()
-
-
-def _drift_thermometer(laboratory: Laboratory, value: object) -> None:
-    laboratory.thermometers.drift_K_per_h = _of_thermometers(laboratory, value)
-
-
-def _hold_thermometer(laboratory: Laboratory, value: object) -> None:
-    laboratory.thermometers.held_degC = _of_thermometers(laboratory, value)
-
-
-def _press_set_point(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.press_setpoint(float(str(value)))
-
-
-def _press_stop(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.press_stop()
 
 
 def _press_manual(laboratory: Laboratory, value: object) -> None:
@@ -101,50 +100,31 @@ def _press_manual(laboratory: Laboratory, value: object) -> None:
         laboratory.regulator.press_manual(float(str(value)))
 
 
-def _press_autotune(laboratory: Laboratory, value: object) -> None:
-    laboratory.regulator.press_autotune(bool(value))
+def _once(act: Callable[[Laboratory], None]) -> Setter:
+    """Something that happens when the fault is set, and is not undone."""
+
+    def apply(laboratory: Laboratory, value: object) -> None:
+        if value:
+            act(laboratory)
+
+    return apply
 
 
-def _cut_out(laboratory: Laboratory, value: object) -> None:
-    laboratory.plant.cut_out_open = bool(value)
+def _press_set_point(laboratory: Laboratory, value: object) -> None:
+    if value is not None:
+        laboratory.regulator.press_setpoint(float(str(value)))
 
 
-def _weld_ssr(laboratory: Laboratory, value: object) -> None:
-    laboratory.ssr_welded_share = float(str(value or 0))
-
-
-def _alarm_axis(laboratory: Laboratory, value: object) -> None:
-    for name, axis in laboratory.axes.items():
-        axis.alarm = name == value
-
-
-def _silent_bus(laboratory: Laboratory, value: object) -> None:
-    laboratory.bus_faults.silent = bool(value)
-
-
-def _unplug_bus(laboratory: Laboratory, value: object) -> None:
-    wire = laboratory.bus
-    if not isinstance(wire, TcpWire):
-        raise ValueError("only a bus behind a gateway (tcp) can be unplugged")
-    if value:
-        wire.close()
-    else:
-        wire.plug()
-
-
-def _garble_bus(laboratory: Laboratory, value: object) -> None:
-    laboratory.bus_faults.garbled = int(str(value))
-
-
-def _late_reply(laboratory: Laboratory, value: object) -> None:
-    laboratory.bus_faults.late_s = float(str(value))
+def _clamp_set_point(laboratory: Laboratory, value: object) -> None:
+    limits = None if value is None else TypeAdapter(tuple[float, float]).validate_python(value)
+    laboratory.regulator.setpoint_clamp_degC = limits
 
 
 def _silent_relays(laboratory: Laboratory, value: object) -> None:
     """The board does not answer for so many s of simulated time."""
     relays, plant = laboratory.relays, laboratory.plant
-    until_ns = plant.now_ns + seconds_ns(float(str(value)))
-    relays.silent = True
+    until_ns = plant.now_ns + seconds_ns(_number(value))
+    relays.silent = plant.now_ns < until_ns
 
     def wait(time_ns: int, dt_s: float) -> None:
         relays.silent = relays.silent and time_ns < until_ns
@@ -152,48 +132,37 @@ def _silent_relays(laboratory: Laboratory, value: object) -> None:
     plant.on_step.append(wait)
 
 
-def _brown_out(laboratory: Laboratory, value: object) -> None:
-    laboratory.relays.power_cycle()
+def _weld(laboratory: Laboratory, value: object) -> None:
+    laboratory.relays.welded = {str(value)} if value else set()
 
 
-def _stop_rearming(laboratory: Laboratory, value: object) -> None:
-    laboratory.relays.rearms = not value
+def _alarm_axis(laboratory: Laboratory, value: object) -> None:
+    for name, axis in laboratory.axes.items():
+        axis.alarm = name == value
 
 
-def _stop_timing(laboratory: Laboratory, value: object) -> None:
-    laboratory.relays.times = not value
+def _restart_flap(laboratory: Laboratory) -> None:
+    laboratory.flap.restart()
 
 
-def _lose_relay_writes(laboratory: Laboratory, value: object) -> None:
-    laboratory.relays.lost_writes = bool(value)
+def _flap_errors(laboratory: Laboratory, value: object) -> None:
+    laboratory.flap.active_errors = _ERRORS[str(value)] if value else 0
 
 
-def _overheat_camera(laboratory: Laboratory, value: object) -> None:
-    laboratory.camera_sensor_degC = None if value is None else float(str(value))
+def _wrong_module(laboratory: Laboratory, value: object) -> None:
+    laboratory.thermometers.type_codes = [0x22 if value else 0x20] * len(laboratory.thermometers.type_codes)
 
 
-def _flap_jam(laboratory: Laboratory, value: object) -> None:
-    laboratory.flap.jam_position = None if value is None else int(str(value))
-
-
-def _camera_loss(laboratory: Laboratory, value: object) -> None:
-    laboratory.camera.faults.loss = float(str(value))
+def _stall_stream(laboratory: Laboratory, value: object) -> None:
+    laboratory.camera.faults.silent_gvsp = bool(value)
 
 
 def _silent_camera(laboratory: Laboratory, value: object) -> None:
     laboratory.camera.faults.silent_gvcp = laboratory.camera.faults.silent_gvsp = bool(value)
 
 
-def _freeze_temperature(laboratory: Laboratory, value: object) -> None:
-    laboratory.camera.faults.temperature = "stuck" if value else None
-
-
-def _hide_temperature(laboratory: Laboratory, value: object) -> None:
-    laboratory.camera.faults.temperature = "zero" if value else None
-
-
-def _restart_camera(laboratory: Laboratory, value: object) -> None:
-    laboratory.camera.restart()
+def _temperature_shown(kind: str) -> Setter:
+    return _to(lambda lab: lab.camera.faults, "temperature", lambda value: kind if value else None)
 
 
 def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
@@ -202,45 +171,178 @@ def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
         laboratory.camera.restart()
 
 
-# Name -> how to break a link or a quantity; the value undoes it as None, false or 0.
-FAULTS: dict[str, Callable[[Laboratory, object], None]] = {
-    "thermometer.open": _open_thermometer,  # the channel's name: its wire is broken
-    "regulator.sensor_break": _sensor_break,
-    "regulator.pv_offset_K": _pv_offset,  # the probe reads wrong by this much
-    "regulator.stuck_pv_degC": _stuck_pv,
-    "regulator.pv_drift_K_per_h": _pv_drift,
-    "regulator.probe_out": _probe_out,  # hangs in the laboratory
-    "regulator.probe_exchanged": _exchange_probes,  # with the air's thermometer
-    "thermometer.pulled_out": _pull_thermometer_out,  # the channel's name: it hangs in the laboratory
-    "thermometer.shorted": _short_thermometer,  # the channel's name
-    "thermometer.drift_K_per_h": _drift_thermometer,  # {channel's name: K/h}
-    "thermometer.held_degC": _hold_thermometer,  # {channel's name: degC}, with the converter's noise
-    "regulator.set_point_degC": _press_set_point,  # somebody changes it with the keys
-    "regulator.stop_key": _press_stop,  # somebody stops control with the keys
-    "regulator.manual_percent": _press_manual,  # somebody dials in a heating output; None gives control back
-    "regulator.autotune": _press_autotune,  # somebody starts it with the keys, or cancels it
-    "thermometer.offset_K": _offset_thermometer,  # {channel's name: K}
-    "thermometer.stuck_degC": _stuck_thermometer,  # {channel's name: degC}
-    "thermometers.silent": _silent_thermometers,
-    "thermometers.no_fault_bits": _refuse_fault_bits,  # which makes their values STALE
-    "heater.cut_out": _cut_out,  # the hard-wired thermal cut-out is open: a dead heater
-    "heater.welded_share": _weld_ssr,  # share of the time its solid-state relay conducts at least
-    "axis.alarm": _alarm_axis,  # the axis' name
-    "bus.silent": _silent_bus,
-    "bus.unplugged": _unplug_bus,  # nobody listens at the gateway's address, and its connections are cut
-    "bus.garbled": _garble_bus,  # so many of the coming replies
-    "bus.late_s": _late_reply,  # the next reply, by so many real seconds
-    "relays.silent_s": _silent_relays,  # its timed-on relays time out and drop
-    "relays.lost_writes": _lose_relay_writes,  # acknowledged, not done
-    "relays.brown_out": _brown_out,  # off and on again: every relay is open
-    "relays.no_rearm": _stop_rearming,  # a timed-on that runs does not start its time again
-    "relays.no_timer": _stop_timing,  # a timed-on stays on
-    "flap.jam": _flap_jam,  # feedback counts at which it stops
-    "camera.sensor_degC": _overheat_camera,  # its sensor chip stays at this
-    "camera.restart": _restart_camera,  # by itself, its supply on all the while
-    "camera.no_stream_channel": _camera_without_stream,  # it restarts, and does not offer one until this is undone
-    "camera.frozen_temperature": _freeze_temperature,  # it keeps showing the last one
-    "camera.no_temperature": _hide_temperature,  # it shows 0 degC
-    "camera.loss": _camera_loss,  # share of stream packets lost
-    "camera.silent": _silent_camera,  # neither answers nor sends
+def _link_faults() -> Iterator[tuple[str, Fault]]:
+    """Every link has the same, `bus.drop`, `linear.drop`, ..."""
+    for link in ("bus", *_AXES):
+        for kind, (worst, mended, text) in LINK_FAULTS.items():
+
+            def apply(laboratory: Laboratory, value: object, link: str = link, kind: str = kind) -> None:
+                set_link_fault(laboratory.link(link), kind, value)
+
+            yield f"{link}.{kind}", Fault(apply, worst, mended, text, locks=False)
+
+
+def _axis_faults() -> Iterator[tuple[str, Fault]]:
+    """Every axis has the same."""
+
+    def cycle(axis: FakeAxis, value: object) -> None:
+        if value:
+            axis.power_cycle()
+
+    def to(attribute: str, kind: Callable[[object], object]) -> Callable[[FakeAxis, object], None]:
+        return lambda axis, value: setattr(axis, attribute, kind(value))
+
+    def danger(bits: int) -> Callable[[FakeAxis, object], None]:
+        return lambda axis, value: setattr(axis, "danger", axis.danger & ~bits | (bits if value else 0))
+
+    faults: dict[str, tuple[Callable[[FakeAxis, object], None], object, object, str]] = {
+        "limit_hit": (
+            to("limit", lambda side: str(side or "")),
+            "right",
+            "",
+            "left or right: this switch reads closed",
+        ),
+        "wrong_limit": (to("wrong_limit", bool), True, False, "a stop at a switch is taken for the other one's"),
+        "lost_steps": (to("lost_steps", _number), 200, 0, "steps by which the mechanics fall back, the count does not"),
+        "jam_steps": (to("stall_steps", _number_or_none), 0, None, "steps beyond which the mechanics do not go"),
+        "ctp_error": (to("ctp_error", bool), True, False, "encoder and count differ"),
+        "overheated": (danger(FLAG_DRIVER_OVERHEAT), True, False, "the motor's driver is too warm"),
+        "winding": (danger(FLAG_WINDING_MISMATCH), True, False, "the windings differ"),
+        "endless": (to("endless", bool), True, False, "a move does not end"),
+        "motor_off": (to("motor_off", bool), True, False, "no current; the next move brings it back"),
+        "restart": (cycle, True, False, "off and on again: not homed, position 0"),
+    }
+    for name in _AXES:
+        for kind, (act, worst, mended, text) in faults.items():
+
+            def apply(
+                laboratory: Laboratory,
+                value: object,
+                name: str = name,
+                act: Callable[[FakeAxis, object], None] = act,
+            ) -> None:
+                act(laboratory.axis(name), value)
+
+            yield f"{name}.{kind}", Fault(apply, worst, mended, text)
+
+
+FAULTS: dict[str, Fault] = {
+    **dict(_link_faults()),
+    **dict(_axis_faults()),
+    # The regulator and its probe.
+    "regulator.silent": Fault(_to(lambda lab: lab.regulator, "silent"), True, False, "it does not answer"),
+    "regulator.compoway": Fault(_to(lambda lab: lab.regulator, "compoway"), True, False, "back to its own protocol"),
+    "regulator.restart": Fault(_once(lambda lab: lab.regulator.power_cycle()), True, False, "off and on again"),
+    "regulator.sensor_break": Fault(_to(lambda lab: lab.regulator, "sensor_break"), True, False, "open sensor"),
+    "regulator.ad_error": Fault(_to(lambda lab: lab.regulator, "ad_error"), True, False, "its converter has failed"),
+    "regulator.pv_offset_K": Fault(_to(lambda lab: lab.regulator, "pv_offset_K", _number), 5.0, 0.0, "it reads wrong"),
+    "regulator.stuck_pv_degC": Fault(
+        _to(lambda lab: lab.regulator, "stuck_pv_degC", _number_or_none), 24.0, None, "its PV stays there"
+    ),
+    "regulator.pv_drift_K_per_h": Fault(
+        _to(lambda lab: lab.regulator, "pv_drift_K_per_h", _number), 5.0, 0.0, "its PV drifts"
+    ),
+    "regulator.probe_out": Fault(
+        _to(lambda lab: lab.regulator, "probe_out"), True, False, "its probe hangs in the laboratory"
+    ),
+    "regulator.probe_exchanged": Fault(_exchange_probes, True, False, "its probe with the air's thermometer"),
+    "regulator.set_point_degC": Fault(_press_set_point, 45.0, None, "somebody changes it with the keys"),
+    "regulator.set_point_clamp_degC": Fault(
+        _clamp_set_point, (15.0, 30.0), None, "[low, high]: it takes no set-point outside, and acknowledges it"
+    ),
+    "regulator.stop_key": Fault(_once(lambda lab: lab.regulator.press_stop()), True, False, "somebody stops control"),
+    "regulator.manual_percent": Fault(_press_manual, 50.0, None, "somebody dials in a heating output"),
+    "regulator.autotune": Fault(
+        lambda lab, value: lab.regulator.press_autotune(bool(value)), True, False, "somebody starts it with the keys"
+    ),
+    "regulator.decimals": Fault(
+        _to(lambda lab: lab.regulator, "display_decimals", lambda value: int(_number(value))), 0, 1, "its decimal point"
+    ),
+    # Contact thermometers; values by the channel's name.
+    "thermometer.open": Fault(_thermometers("open_channels", _channel), _AIR, None, "this one's wire is broken"),
+    "thermometer.shorted": Fault(_thermometers("shorted_channels", _channel), _AIR, None, "this one is shorted"),
+    "thermometer.pulled_out": Fault(
+        _thermometers("pulled_out", _channel), _AIR, None, "this one hangs in the laboratory"
+    ),
+    "thermometer.noisy": Fault(_thermometers("noisy_channel", _noisy), _AIR, None, "this one has 1 K of noise"),
+    "thermometer.offset_K": Fault(_thermometers("offset_K", _numbers), {_AIR: 5.0}, None, "{name: K}"),
+    "thermometer.drift_K_per_h": Fault(_thermometers("drift_K_per_h", _numbers), {_AIR: 2.0}, None, "{name: K/h}"),
+    "thermometer.stuck_degC": Fault(_thermometers("stuck_degC", _numbers), {_AIR: 24.0}, None, "{name: degC}"),
+    "thermometer.held_degC": Fault(
+        _thermometers("held_degC", _numbers), {_AIR: 24.0}, None, "{name: degC}, with the converter's noise"
+    ),
+    "thermometers.silent": Fault(_to(lambda lab: lab.thermometers, "silent"), True, False, "they do not answer"),
+    "thermometers.no_fault_bits": Fault(
+        _to(lambda lab: lab.thermometers, "no_fault_bits"), True, False, "unreadable: their values are STALE"
+    ),
+    "thermometers.wrong_type": Fault(_wrong_module, True, False, "a module with another range"),
+    # The plant, and the relays.
+    "heater.cut_out": Fault(_to(lambda lab: lab.plant, "cut_out_open"), True, False, "the thermal cut-out is open"),
+    "heater.welded_share": Fault(
+        _to(lambda lab: lab, "ssr_welded_share", _number), 1.0, None, "its solid-state relay conducts this share"
+    ),
+    "relays.silent": Fault(_to(lambda lab: lab.relays, "silent"), True, False, "the board does not answer"),
+    "relays.silent_s": Fault(_silent_relays, 60.0, 0, "for so long; its timed-on relays time out and drop"),
+    "relays.lost_writes": Fault(_to(lambda lab: lab.relays, "lost_writes"), True, False, "acknowledged, not done"),
+    "relays.brown_out": Fault(_once(lambda lab: lab.relays.power_cycle()), True, False, "every relay opens"),
+    "relays.welded": Fault(_weld, "heater_enable", None, "this contact conducts regardless of the coil"),
+    "relays.no_rearm": Fault(
+        _to(lambda lab: lab.relays, "rearms", lambda value: not value),
+        True,
+        False,
+        "a timed-on that runs does not start its time again",
+    ),
+    "relays.no_timer": Fault(
+        _to(lambda lab: lab.relays, "times", lambda value: not value), True, False, "a timed-on stays on"
+    ),
+    # Axes by the name of the axis, as value.
+    "axis.alarm": Fault(_alarm_axis, "linear", None, "the alarm of this axis stands"),
+    # The flap.
+    "flap.jam": Fault(
+        _to(lambda lab: lab.flap, "jam_position", _number_or_none), 2000, None, "feedback counts at which it stops"
+    ),
+    "flap.error": Fault(_flap_errors, "feedback", None, "feedback, power or current: this error bit stands"),
+    "flap.unplugged": Fault(_to(lambda lab: lab.flap, "unplugged"), True, False, "off the USB"),
+    "flap.stall": Fault(_to(lambda lab: lab.flap, "stall"), True, False, "its transfers stall (EPIPE)"),
+    "flap.timeout": Fault(_to(lambda lab: lab.flap, "timeout"), True, False, "its transfers time out"),
+    "flap.short_read": Fault(_to(lambda lab: lab.flap, "short_read"), True, False, "half of each reply"),
+    "flap.restart": Fault(_once(_restart_flap), True, False, "its controller restarts"),
+    # The camera that is named so, or the first.
+    "camera.loss": Fault(
+        _to(lambda lab: lab.camera.faults, "loss", _number), 0.05, 0.0, "share of stream packets lost"
+    ),
+    "camera.burst": Fault(
+        _to(lambda lab: lab.camera.faults, "burst", lambda value: int(_number(value))), 20, 1, "packets lost in a row"
+    ),
+    "camera.no_resend": Fault(_to(lambda lab: lab.camera.faults, "no_resend"), True, False, "nothing is sent again"),
+    "camera.no_leader": Fault(_to(lambda lab: lab.camera.faults, "drop_leader"), True, False, "frames lack it"),
+    "camera.no_trailer": Fault(_to(lambda lab: lab.camera.faults, "drop_trailer"), True, False, "frames lack it"),
+    "camera.trigger_twice": Fault(
+        _to(lambda lab: lab.camera.faults, "trigger_twice"), True, False, "a trigger gives two frames"
+    ),
+    "camera.silent": Fault(_silent_camera, True, False, "neither answers nor sends"),
+    "camera.stalled": Fault(_stall_stream, True, False, "answers, but sends no frame"),
+    "camera.deaf": Fault(_to(lambda lab: lab.camera.faults, "silent_gvcp"), True, False, "sends, but does not answer"),
+    "camera.control_lost": Fault(
+        lambda lab, value: lab.camera.seize(bool(value)), True, False, "another client has taken control of it"
+    ),
+    "camera.restart": Fault(_once(lambda lab: lab.camera.restart()), True, False, "by itself, its supply on"),
+    "camera.no_stream_channel": Fault(_camera_without_stream, True, False, "it restarts, and does not offer one"),
+    "camera.sensor_degC": Fault(
+        _to(lambda lab: lab, "camera_sensor_degC", _number_or_none), 75.0, None, "its sensor chip stays at this"
+    ),
+    "camera.frozen_temperature": Fault(_temperature_shown("stuck"), True, False, "it keeps showing the last one"),
+    "camera.no_temperature": Fault(_temperature_shown("zero"), True, False, "it shows 0 degC"),
+    "camera.refused_temperature": Fault(_temperature_shown("access"), True, False, "its register cannot be read"),
+    "camera.temperature_offset_K": Fault(
+        _to(lambda lab: lab.camera.faults, "temperature_offset_K", _number), 10.0, 0.0, "it shows a wrong one"
+    ),
 }
+
+
+def table() -> list[dict[str, object]]:
+    """FAULTS for people and programs: name, worst, mended, text."""
+    return [
+        {"name": name, "worst": fault.worst, "mended": fault.mended, "text": fault.text}
+        for name, fault in sorted(FAULTS.items())
+    ]

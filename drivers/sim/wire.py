@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import shutil
 import socket
+import tempfile
 import threading
 import tty
 from collections.abc import Callable
@@ -43,24 +45,32 @@ class Lines:
 class PtyWire:
     """A serial port: `path` becomes a symlink to a fresh pseudo-terminal in raw mode; replug by making a new one.
 
-    Without a path it is reached at the pseudo-terminal's own one. `address` is where.
+    Without a path it has one in a folder of its own. `address` is where.
     """
 
     def __init__(self, path: Path | None, engine: Engine, faults: LinkFaults) -> None:
-        self._path = path
+        self._folder = None if path else Path(tempfile.mkdtemp(prefix="thermostand-port-"))
+        self._path = path or Path(f"{self._folder}/port")
         self._engine = engine
         self._faults = faults
+        self._is_plugged = False
+        self.address = f"serial:{self._path}"
+        self.plug()
+
+    def plug(self) -> None:
+        """Answer at a fresh pseudo-terminal behind the same path, unless plugged in."""
+        if self._is_plugged:
+            return
         self._master, self._slave = os.openpty()  # the slave stays open, or reads fail while no driver is connected
         tty.setraw(self._slave)
         terminal = os.ttyname(self._slave)
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.unlink(missing_ok=True)
-            path.symlink_to(terminal)
-        self.address = f"serial:{path or terminal}"
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._path.unlink(missing_ok=True)
+        self._path.symlink_to(terminal)
         self._stop_read, self._stop_write = os.pipe()
         self._thread = threading.Thread(target=self._serve, name=f"pty {terminal}", daemon=True)
         self._thread.start()
+        self._is_plugged = True
 
     def _serve(self) -> None:
         while True:
@@ -75,12 +85,20 @@ class PtyWire:
                 os.write(self._master, piece)
 
     def close(self) -> None:
-        """Unplug: the symlink goes and an open driver gets an I/O error."""
+        """Unplug for good; may be called twice."""
+        self.unplug()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def unplug(self) -> None:
+        """The symlink goes and an open driver gets an I/O error."""
+        if not self._is_plugged:
+            return
+        self._is_plugged = False
         with contextlib.suppress(OSError):
             os.write(self._stop_write, b"x")
         self._thread.join()
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)
         for descriptor in (self._master, self._slave, self._stop_read, self._stop_write):
             with contextlib.suppress(OSError):
                 os.close(descriptor)
@@ -129,6 +147,10 @@ class TcpWire:
                     connection.sendall(piece)
         with self._lock:
             self._connections.discard(connection)
+
+    def unplug(self) -> None:
+        """As `close`, until it is plugged in again."""
+        self.close()
 
     def close(self) -> None:
         """Stop listening and drop every connection; may be called twice."""

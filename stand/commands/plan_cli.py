@@ -18,7 +18,7 @@ from stand.estimating.estimate import PricedStep, price
 from stand.estimating.follow import parameters_text
 from stand.estimating.learned import load_learned
 from stand.running.order import load_order
-from stand.simulator import Simulator, laboratory_of
+from stand.simulator import Simulator, laboratory_of, list_faults
 
 app = typer.Typer(add_completion=False)
 
@@ -65,15 +65,25 @@ def plan(
 @app.command()
 def simulate(
     config: Annotated[str, typer.Argument(help="A configuration with a `simulation` section.")] = "simulated",
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="NAME[=VALUE][@TIME][:DURATION]", help="Break something; may be repeated."),
+    ] = None,
+    faults: Annotated[bool, typer.Option("--faults", help="List what can be broken, and end.")] = False,
 ) -> None:
     """The simulated laboratory in real time, until interrupted: every device answers at its configured address.
 
-    Example: stand simulate & stand run demo
+    Example: stand simulate --fault bus.drop=0.1@60:30 & stand run demo
     """
     with one_line_errors():
+        if faults:
+            for row in list_faults():
+                typer.echo(f"{row['name']:<32}{json.dumps(row['worst']):<18}{row['text']}")
+            return
         stand_config = load_config(packaged("", config))
         laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
-        simulator = Simulator(laboratory)
+        planned = (*(stand_config.simulation.faults if stand_config.simulation else ()), *(fault or ()))
+        simulator = Simulator({**laboratory, "faults": list(planned)})
         typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
         ending.wait()
         simulator.stop()

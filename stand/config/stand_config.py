@@ -83,9 +83,14 @@ class RecordingConfig(Document):
     alert_below_percent: float = Field(default=10.0, ge=0, le=100)
 
 
+FaultText = Annotated[str, Field(pattern=r"^[A-Za-z_]+\.[A-Za-z_]+(=.+)?(@[\d.]+(s|min|h)?)?(:[\d.]+(s|min|h)?)?$")]
+
+
 class SimulationConfig(Document):
     """The simulated laboratory behind these addresses; a real laboratory has no such section. chamber_seed: another
-    chamber than the standard one, its conductances, lags and powers drawn within +-30 %."""
+    chamber than the standard one, its conductances, lags and powers drawn within +-30 %. faults: what breaks, each
+    NAME[=VALUE][@TIME][:DURATION], times in s unless they end in s, min or h (`stand simulate --faults` lists the
+    names)."""
 
     control: TcpAddress
     start: Annotated[AwareDatetime, AfterValidator(_of_this_century)] = datetime(2026, 1, 1, 18, tzinfo=UTC)
@@ -93,6 +98,7 @@ class SimulationConfig(Document):
     camera: Literal["modified", "unmodified"] = "modified"
     laboratory_degC: float = Field(default=24.0, ge=-10, le=40)
     chamber_seed: int | None = Field(default=None, ge=0)
+    faults: tuple[FaultText, ...] = Field(default=(), max_length=1000)
 
 
 class StandConfig(Document):

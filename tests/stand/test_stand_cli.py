@@ -166,3 +166,12 @@ def test_ctrl_c_while_the_commands_are_imported_ends_with_a_line(tmp_path: Path)
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
         assert process.stderr.read() == "interrupted; nothing was started\n"
+
+
+def test_what_can_be_broken_is_listed_and_a_wrong_name_is_refused():
+    listed = runner.invoke(app, ["simulate", "--faults"])
+    assert listed.exit_code == 0
+    assert "bus.drop" in listed.output
+    refused = runner.invoke(app, ["simulate", "--fault", "bus.drip"])
+    assert refused.exit_code == 2
+    assert "did you mean bus.drop" in refused.output
