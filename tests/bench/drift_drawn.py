@@ -13,7 +13,7 @@ from compensation.drift.training import frame_states
 from experiments.steps import Role
 from tests.bench.figures import Figure, absolute, at_most, progress, side_by_side
 from tests.compensation.drawn_cameras import REPEATING, UNREPEATING, drawn_camera
-from tests.compensation.drawn_nights import Night, full_night, night
+from tests.compensation.drawn_nights import Night, cycle, full_night, night, reference, unseen_begin
 
 CAMERAS = 20
 GOAL_MPX = {"repeating": 5.0, "beside what does not repeat": 10.0}
@@ -33,18 +33,20 @@ class Score:
     claimed_mpx: float
 
 
-def effects_of(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], bool]:
-    """What this camera has, and whether its night begins with a warm-up."""
+def effects_of(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], str]:
+    """What this camera has, and how its night begins: with a recorded warm-up, with switching it on, or after that."""
     rng = np.random.default_rng([18, seed])
     names = [name for name in REPEATING if rng.random() < _CHANCE]
-    begins_with_warm_up = rng.random() > _CHANCE / 2
+    begin = str(rng.choice(["warm up", "switched on", "unseen"], p=[0.6, 0.2, 0.2]))
     one = UNREPEATING[rng.integers(2)]
-    return (*names, one) if unrepeating else tuple(names), begins_with_warm_up
+    return (*names, one) if unrepeating else tuple(names), begin
 
 
 def drawn_night(seed: int, *, unrepeating: bool) -> Night:
-    names, begins_with_warm_up = effects_of(seed, unrepeating=unrepeating)
-    return night(drawn_camera(seed, *names), full_night(with_warm_up=begins_with_warm_up), seed)
+    names, begin = effects_of(seed, unrepeating=unrepeating)
+    unrecorded = unseen_begin() if begin == "unseen" else []
+    parts = [*reference(), *cycle()] if begin == "unseen" else full_night(with_warm_up=begin == "warm up")
+    return night(drawn_camera(seed, *names), parts, seed, unrecorded=unrecorded)
 
 
 def score(model: DriftModel, made: Night, role: str = Role.VALIDATION) -> Score:

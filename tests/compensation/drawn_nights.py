@@ -94,6 +94,11 @@ def full_night(cycles: int = 1, *, with_warm_up: bool = True) -> list[Stretch]:
     return [*begin, *reference(), *cycle(cycles=cycles)]
 
 
+def unseen_begin(air_degC: float = 20.0, seconds: int = 1800) -> list[Stretch]:
+    """For `night(unrecorded=)`: switched on in the room, half an hour before anybody records."""
+    return [Stretch(air_degC, 60, powered=False), Stretch(air_degC, seconds)]
+
+
 def night(
     camera: Camera,
     parts: Sequence[Stretch],
@@ -101,10 +106,12 @@ def night(
     bumps: Sequence[Bump] = (),
     session_id: str = "night-1",
     noise_px: float = NOISE_PX,
+    unrecorded: Sequence[Stretch] = (),
 ) -> Night:
-    """One session of a camera that begins as cold as the chamber."""
+    """One session of a camera that begins as cold as the chamber, or with what happened before and was not recorded."""
     rng = np.random.default_rng([17, seed])
-    plan = _Plan(parts)
+    plan = _Plan([*unrecorded, *parts])
+    before = len(_Plan(unrecorded).powered)
     air = _air_degC(plan.set_point_degC)
     powered = plan.powered
     nodes = nodes_degC(camera, air, powered)
@@ -118,7 +125,7 @@ def night(
     for bump in bumps:
         seen[at_s >= 3600 * bump.after_h] += bump.shift_px
     told, near = sensor_degC(camera, nodes, powered), air_near_degC(camera, air, rng)
-    return Night(_observations(plan, session_id, grid_s, seen, told, near, noise_px), truth)
+    return Night(_observations(plan, session_id, grid_s, seen, told, near, noise_px, before), truth)
 
 
 class _Plan:
@@ -153,18 +160,20 @@ def _air_degC(set_point_degC: Float) -> Float:
 
 
 def _observations(
-    plan: _Plan, session_id: str, grid_s: Float, seen: Float, told: Float, near: Float, noise_px: float
+    plan: _Plan, session_id: str, grid_s: Float, seen: Float, told: Float, near: Float, noise_px: float, before: int
 ) -> Observations:
+    """before: steps that are not recorded."""
     count = len(plan.roles)
     times_ns = START_NS + np.round(grid_s * NS_PER_S).astype(np.int64)
     frames_ns = START_NS + np.round(plan.frames_s * NS_PER_S).astype(np.int64)
     on = np.isfinite(told)
     nearest = np.clip(np.searchsorted(grid_s, plan.frames_s, side="right") - 1, 0, len(grid_s) - 1)
     nearest = np.where(on[nearest], nearest, np.minimum(nearest + 1, len(grid_s) - 1))
-    switched = np.flatnonzero(np.diff(plan.powered, prepend=np.nan) != 0)
-    history = History(
-        times_ns, near, times_ns[switched] - STEP_S * NS_PER_S, plan.powered[switched], times_ns[on], told[on]
-    )
+    since = np.arange(len(times_ns)) >= before
+    switched = np.flatnonzero((np.diff(plan.powered, prepend=np.nan) != 0) | (np.arange(len(times_ns)) == before))
+    switched = switched[switched >= before]
+    supply = times_ns[switched] - STEP_S * NS_PER_S, plan.powered[switched]
+    history = History(times_ns[since], near[since], *supply, times_ns[on & since], told[on & since])
     return Observations(
         target=TARGET,
         sessions=(replace(facts(session_id), simulated=True),),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from .drawn_cameras import ALL_EFFECTS, Camera, Float, centres_px, drawn_camera, nodes_degC, settled_degC
-from .drawn_nights import full_night, night, reference, warm_up
+from .drawn_nights import cycle, full_night, night, reference, unseen_begin, warm_up
 
 STILL = np.zeros((1, 2))
 SEEDS = range(12)
@@ -63,3 +63,14 @@ def test_a_switched_off_camera_tells_no_temperature_and_is_as_cold_as_the_air() 
     assert len(history.camera_ns) < len(history.ambient_ns) / 2
     assert abs(made.observed.camera_degC[0] - made.observed.air_degC[0]) < 6
     assert made.observed.camera_degC[-1] - made.observed.air_degC[-1] > 8
+
+
+def test_what_was_before_the_record_moves_the_image_and_is_not_in_the_history() -> None:
+    camera = drawn_camera(1)
+    parts = [*reference(), *cycle()]
+    unseen, known = night(camera, parts, unrecorded=unseen_begin()), night(camera, parts)
+    assert 0.02 < np.abs(unseen.truth_px[0] - known.truth_px[0]).max() < 2.0
+    history = unseen.observed.histories[0]
+    before_s = (unseen.observed.time_ns[0] - history.ambient_ns[0]) / 1e9
+    assert before_s == pytest.approx(2700, abs=20)
+    assert history.camera_degC[0] - history.ambient_degC[0] > 4
