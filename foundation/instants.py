@@ -6,11 +6,11 @@ import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
-from foundation.clock import NS_PER_S
 from foundation.errors import ConfigError
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NS_PER_US = 1000
+_NS_PER_S = 1_000_000_000  # as in the clock, which takes asyncio to import
 _LAST_NS = (datetime.max.replace(tzinfo=UTC) - _EPOCH) // timedelta(microseconds=1) * _NS_PER_US
 _OFFSET = re.compile(r"\+(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
 
@@ -27,7 +27,7 @@ def local_text(time_ns: int) -> str:
 
 def utc_text(time_ns: int) -> str:
     """ISO 8601 to the ns, which datetime does not have: `2026-01-01T18:00:00.123456789Z`."""
-    return f"{_datetime(time_ns):%Y-%m-%dT%H:%M:%S}.{time_ns % NS_PER_S:09d}Z"
+    return f"{_datetime(time_ns):%Y-%m-%dT%H:%M:%S}.{time_ns % _NS_PER_S:09d}Z"
 
 
 def _datetime(time_ns: int) -> datetime:
@@ -45,9 +45,9 @@ def _local(time_ns: int) -> datetime:
 
 def duration(length_ns: int) -> str:
     """`16:12:33`, with the days before it when there are any; below a minute in seconds, `4.2 s`."""
-    if length_ns < 60 * NS_PER_S:
-        return f"{length_ns / NS_PER_S:.1f} s"
-    return str(timedelta(seconds=round(length_ns / NS_PER_S)))
+    if length_ns < 60 * _NS_PER_S:
+        return f"{length_ns / _NS_PER_S:.1f} s"
+    return str(timedelta(seconds=round(length_ns / _NS_PER_S)))
 
 
 def parse_instant(text: str, begin_ns: int, stand_ns: Callable[[int], int] = int) -> int:
@@ -64,7 +64,7 @@ def _parsed(text: str, begin_ns: int, stand_ns: Callable[[int], int]) -> int:
     offset = _OFFSET.fullmatch(text)
     if offset is not None and any(offset.groups()):
         hours, minutes, seconds = (float(group or 0) for group in offset.groups())
-        return begin_ns + round(min((3600 * hours + 60 * minutes + seconds) * NS_PER_S, _LAST_NS + 1))
+        return begin_ns + round(min((3600 * hours + 60 * minutes + seconds) * _NS_PER_S, _LAST_NS + 1))
     try:
         instant = datetime.fromisoformat(text)
     except ValueError as error:

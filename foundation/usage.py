@@ -87,7 +87,9 @@ def tell(sentence: object) -> None:
 
 def one_line(sentence: object) -> str:
     """The text with line ends, and what else cannot be printed, as escapes: a file's name may hold anything."""
+    text = str(sentence)
+    if text.isprintable():
+        return text
     return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode()
-        for character in str(sentence)
+        character if character.isprintable() else character.encode("unicode_escape").decode() for character in text
     )

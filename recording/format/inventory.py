@@ -64,14 +64,14 @@ def _segment_file(path: Path) -> SegmentFile | None:
         if name is None or not path.is_file():
             return None
         state = _STATE[name[2]]
-        if state is State.UNFINISHED and _is_locked(path):
+        if state is State.UNFINISHED and is_locked(path):
             state = State.RECORDING
         return SegmentFile(path, path.parent.name, int(name[1]), state, path.stat().st_size)
     except FileNotFoundError:
         return None
 
 
-def _is_locked(path: Path) -> bool:
+def is_locked(path: Path) -> bool:
     """A living recorder holds its file locked. Our own lock is shared and released at once: nothing waits for it."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

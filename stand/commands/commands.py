@@ -23,7 +23,7 @@ app = lazy_app(
         "config": Lazy("stand.commands.config_cli", "Configuration files: JSON Schemas for editors, older versions."),
         "queue": Lazy("stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
         "session": Lazy(
-            "stand.commands.session_cli",
+            "stand.commands.session_commands",
             "Recorded sessions: list, look at, verify, salvage, replay, export, trim.",
         ),
     },

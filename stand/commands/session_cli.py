@@ -5,16 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.errors import ConfigError, SessionError
@@ -31,21 +27,19 @@ from recording.format.damage import FileDamaged
 from recording.format.inventory import State, inventory
 from recording.reading.glance import Glance, glance
 from recording.reading.overview import overview
-from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.reading.using import check_whole
 from recording.repair.salvage import Salvaged, salvage_line, salvage_session
 from recording.repair.verify import verify
-from stand.commands.session_text import (
-    LIST_COLUMNS,
-    glance_json,
-    info_json,
-    info_lines,
-    list_row,
-    table_lines,
-    verify_json,
-    verify_lines,
+from stand.commands.session_args import (
+    IncompleteOption,
+    JsonOption,
+    OutOption,
+    SessionArgument,
+    check_folder,
+    check_session,
 )
+from stand.commands.session_text import info_json, info_lines, verify_json, verify_lines
 
 app = typer.Typer(
     cls=OneLineUsage,
@@ -55,64 +49,6 @@ app = typer.Typer(
     "Example: stand session info sessions/20260101T180000Z-thermal-cycle",
 )
 
-SessionArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a recorded session.")]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to make; it must not exist.")]
-IncompleteOption = Annotated[bool, typer.Option("--incomplete", help="Use a session although part of it is missing.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
-
-
-@app.command("list")
-def list_sessions(
-    directory: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the sessions are.")] = Path("sessions"),
-    as_json: JsonOption = False,
-) -> None:
-    """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, how the
-    run ended, and whether the files are sound.
-
-    Example: stand session list /data/sessions
-    """
-    with one_line_errors():
-        seen = sorted(_glances(_sessions_in(directory)), key=lambda session: (session.begin_ns or 0, session.path))
-        if as_json:
-            typer.echo(json.dumps([glance_json(session) for session in seen], indent=2))
-        elif not seen:
-            typer.echo(f"{directory}: no sessions there", err=True)
-        elif sys.stdout.isatty():
-            Console().print(_table(seen))
-        else:
-            for line in table_lines(map(list_row, seen)):
-                typer.echo(line)
-
-
-def _glances(paths: Sequence[Path]) -> list[Glance]:
-    seen: list[Glance] = []
-    with late_progress("look at sessions", len(paths)) as report:
-        for path in paths:
-            report(len(seen), one_line(path.name))
-            seen.append(glance(path))
-    return seen
-
-
-def _sessions_in(directory: Path) -> list[Path]:
-    """`directory` itself when it is a session, else those in it; ConfigError when there is no such folder."""
-    if not directory.is_dir():
-        raise ConfigError(f"{directory}: {'is a file, not a folder' if directory.exists() else 'no such folder'}")
-    if inventory(directory):
-        return [directory]
-    return [path for path in sorted(directory.iterdir()) if path.is_dir() and inventory(path)]
-
-
-def _table(sessions: list[Glance]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for column in LIST_COLUMNS:
-        table.add_column(column, justify="right" if column in ("duration", "frames", "size") else "left")
-    for session in sessions:
-        *cells, run, files = list_row(session)
-        run_style = "" if session.run in (Run.COMPLETE, Run.RUNNING) else "yellow"
-        files_style = "" if session.state is Files.SOUND else "yellow"
-        table.add_row(*map(Text, cells), Text(run, style=run_style), Text(files, style=files_style))
-    return table
-
 
 @app.command()
 def info(directory: SessionArgument, as_json: JsonOption = False) -> None:
@@ -121,7 +57,7 @@ def info(directory: SessionArgument, as_json: JsonOption = False) -> None:
     Example: stand session info sessions/20260101T180000Z-thermal-cycle
     """
     with one_line_errors():
-        found = overview(_session_in(directory))
+        found = overview(check_session(directory))
         if as_json:
             typer.echo(json.dumps(info_json(found), indent=2))
             return
@@ -129,13 +65,12 @@ def info(directory: SessionArgument, as_json: JsonOption = False) -> None:
             typer.echo(line)
 
 
-def _session_in(directory: Path) -> Path:
-    """`directory`; ConfigError when it is no session."""
+def _sessions_in(directory: Path) -> list[Path]:
+    """`directory` itself when it is a session, else those in it; ConfigError when there is no such folder."""
+    check_folder(directory)
     if inventory(directory):
-        return directory
-    if _sessions_in(directory):
-        raise ConfigError(f"{directory}: is a folder of sessions; `stand session list {directory}` shows them")
-    raise ConfigError(f"{directory}: not a session; `stand session list` shows those in a folder")
+        return [directory]
+    return [path for path in sorted(directory.iterdir()) if path.is_dir() and inventory(path)]
 
 
 @contextmanager
@@ -143,7 +78,7 @@ def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
     """The session in `directory` for a command that takes all of it. SessionError when something of it is missing or
     not finished, and not `incomplete`; what is being recorded is left out with a warning. Damage that the command meets
     becomes a sentence that says what helps."""
-    files = inventory(_session_in(directory))
+    files = inventory(check_session(directory))
     help_text = f"`stand session salvage {directory}`"
     growing = [file.name for file in files if file.state is State.RECORDING]
     if growing:
@@ -168,7 +103,7 @@ def verify_session(directory: SessionArgument, as_json: JsonOption = False) -> N
     Example: stand session verify sessions/20260101T180000Z-thermal-cycle
     """
     with one_line_errors():
-        files = inventory(_session_in(directory))
+        files = inventory(check_session(directory))
         total_bytes = sum(file.size_bytes for file in files if file.state is State.FINISHED)
         with late_progress("verify", total_bytes) as report:
             found = verify(directory, report)
@@ -226,7 +161,7 @@ def replay_session(
         times = _speed(speed)
         if record is not None:
             _check_new(record, directory)
-        seen = glance(_session_in(directory))
+        seen = glance(check_session(directory))
         with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session) as watch:
             if record is None:
                 asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
@@ -321,7 +256,7 @@ def trim_session(
     """
     with one_line_errors():
         _check_new(out, directory)
-        seen = glance(_session_in(directory))
+        seen = glance(check_session(directory))
         with _session_to_use(directory, incomplete) as session:
             typer.echo(trim(session, out, *_range(begin, end, session, seen)))
 

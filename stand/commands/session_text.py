@@ -5,80 +5,27 @@ from __future__ import annotations
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from foundation.instants import duration
+from foundation.instants import duration, local_text
 from foundation.items import Event, StepState
 from foundation.usage import one_line
 from recording.format.inventory import State
 from recording.format.utc_offsets import UtcOffsets
+from recording.reading.catalogue import Entry, entry_of
 from recording.reading.glance import Glance
 from recording.reading.overview import Frames, Overview, Step, Temperature
 from recording.repair.verify import Verification
+from stand.commands.session_table import entry_json, size
 
 WIDTH = 100
 _LABEL = 14
 _MOST = 20  # entries of a list before the rest is only counted
-LIST_COLUMNS = ("session", "recipe", "start (local)", "duration", "frames", "size", "devices", "run", "files")
 ENCODING = {CompressedImage.DESCRIPTOR.full_name: "PNG", RawImage.DESCRIPTOR.full_name: "raw"}
-
-
-def size(size_bytes: int) -> str:
-    """`143.7 MB`, in powers of 1000."""
-    for limit, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if size_bytes >= limit:
-            return f"{size_bytes / limit:.1f} {unit}"
-    return f"{size_bytes} B"
-
-
-def list_row(seen: Glance) -> tuple[str, ...]:
-    """A session's cells below LIST_COLUMNS."""
-    length = "" if seen.begin_ns is None or seen.end_ns is None else duration(seen.end_ns - seen.begin_ns)
-    return (
-        one_line(seen.path.resolve().name),
-        one_line(seen.metadata.get("recipe", "?")),
-        "" if seen.begin_ns is None else seen.utc.date_time(seen.begin_ns),
-        length,
-        str(seen.frames),
-        size(seen.size_bytes),
-        "simulated" if seen.simulated else "real",
-        str(seen.run),
-        one_line(f"{seen.state_text}{'; ' if seen.lacks else ''}{seen.lacks}"),
-    )
-
-
-def glance_json(seen: Glance, utc: UtcOffsets | None = None) -> dict[str, object]:
-    """One session of `stand session list --json`, the head of `info --json`. start and end are UTC, what ends in _ns is
-    an instant of the stand's clock, and durations are differences of those."""
-    utc = seen.utc if utc is None else utc
-    has_times = seen.begin_ns is not None and seen.end_ns is not None
-    return {
-        "name": seen.path.resolve().name,
-        "path": str(seen.path),
-        "metadata": seen.metadata,
-        "start": _instant(seen.begin_ns, utc),
-        "end": _instant(seen.end_ns, utc),
-        "begin_ns": seen.begin_ns,
-        "end_ns": seen.end_ns,
-        "duration_s": ((seen.end_ns or 0) - (seen.begin_ns or 0)) / 1e9 if has_times else None,
-        "frames": seen.frames,
-        "bytes": seen.size_bytes,
-        "simulated": seen.simulated,
-        "run": str(seen.run),
-        "files": str(seen.state),
-        "segments": [{"file": file.name, "state": str(file.state), "bytes": file.size_bytes} for file in seen.files],
-        "troubles": list(seen.troubles),
-        "missing": list(seen.missing),
-        "has_camera_temperature": seen.has_camera_degC,
-    }
-
-
-def _instant(time_ns: int | None, utc: UtcOffsets) -> str | None:
-    return None if time_ns is None else utc.utc_text(time_ns)
 
 
 def info_lines(found: Overview) -> Iterator[str]:
@@ -95,6 +42,18 @@ def info_lines(found: Overview) -> Iterator[str]:
         if position:
             yield ""
         yield from part
+
+
+def _entry(found: Overview) -> Entry:
+    """As the list has it, with the steps of the system clock in between."""
+    seen, utc = found.glance, found.utc
+    start_ns = None if seen.begin_ns is None else utc.utc_ns(seen.begin_ns)
+    end_ns = None if seen.end_ns is None else utc.utc_ns(seen.end_ns)
+    return replace(entry_of(seen), start_ns=start_ns, end_utc_ns=end_ns)
+
+
+def _instant(time_ns: int | None, utc: UtcOffsets) -> str | None:
+    return None if time_ns is None else utc.utc_text(time_ns)
 
 
 def _row(label: str, text: str) -> Iterator[str]:
@@ -127,12 +86,22 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     yield from _row("software", f"thermostand {told('software_version', '?')}{host}")
     yield from _row("segments", _segments(seen))
     yield from _row("attached", ", ".join(seen.attachments) or "nothing")
+    yield from _said(entry_of(seen))
     for trouble in _limited(found.troubles):
         yield from _row("damaged", trouble)
     for text in _limited(seen.missing):
         yield from _row("missing", text)
     if found.troubles or seen.count(State.UNFINISHED):
         yield from _row("to do", f"stand session salvage {seen.path}")
+
+
+def _said(entry: Entry) -> Iterator[str]:
+    """What people said of the session, and where a copy is."""
+    if entry.tags:
+        yield from _row("tags", ", ".join(entry.tags))
+    for text in _limited([f"{local_text(note.time_ns)} {note.by}: {note.text}" for note in entry.notes]):
+        yield from _row("note", text)
+    yield from _row("archived", entry.archived or ("not as it is now" if entry.copies else "not yet"))
 
 
 def _segments(seen: Glance) -> str:
@@ -236,10 +205,10 @@ def _events(events: Sequence[Event], utc: UtcOffsets) -> Iterator[str]:
 
 def info_json(found: Overview) -> dict[str, object]:
     """`stand session info --json`: everything, lists in full; a temperature that was never good is null.
-    Instants are as in glance_json."""
+    Instants are as in entry_json."""
     utc = found.utc
     return {
-        **glance_json(found.glance, utc),
+        **entry_json(_entry(found)),
         "files": str(found.state),
         "troubles": list(found.troubles),
         "planned_steps": found.planned_steps,
@@ -280,11 +249,3 @@ def verify_lines(found: Verification) -> Iterator[str]:
 def verify_json(found: Verification) -> dict[str, object]:
     """`stand session verify --json`."""
     return {"sound": found.is_sound, "files": str(found.files), **asdict(found)}
-
-
-def table_lines(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
-    """LIST_COLUMNS and the rows in columns, for a file or a pipe."""
-    lines = [LIST_COLUMNS, *rows]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(LIST_COLUMNS))]
-    for line in lines:
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()

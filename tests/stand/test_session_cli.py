@@ -3,6 +3,8 @@ import fcntl
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ from typer.testing import CliRunner
 
 from foundation.items import Event
 from recording.reading.session import Session
-from stand.commands.session_cli import app
+from stand.commands.session_commands import app
 from tests.recording.recorded import START_NS, half_second, item_key, record
 
 runner = CliRunner()
@@ -48,7 +50,7 @@ def flip(path: Path, marker: bytes, behind: int) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("command", ["list", "info", "verify", "salvage", "replay", "export", "trim"])
+@pytest.mark.parametrize("command", ["list", "note", "tag", "info", "verify", "salvage", "replay", "export", "trim"])
 def test_every_command_explains_itself_with_an_example(command: str):
     assert f"Example: stand session {command}" in " ".join(ask(command, "--help").stdout.split())
 
@@ -95,6 +97,50 @@ def test_the_list_as_json(session: Path):
     assert listed["bytes"] == sum(path.stat().st_size for path in session.rglob("*.mcap"))
     assert {entry["file"].partition("/")[0] for entry in listed["segments"]} == {"telemetry", "frames"}
     assert json.loads(ask("list", session, "--json").stdout) == [listed]  # a session is a list of itself
+
+
+def test_notes_and_tags_are_listed_and_found(session: Path):
+    other = Path(shutil.copytree(session, session.parent / "other"))
+    assert "tags" not in ask("list", session.parent).stdout
+    ask("note", session, "door", "opened")
+    assert ask("tag", session, "paper", "lens-B").stdout == f"{session}: 1 note, tags: paper, lens-B\n"
+    ask("tag", other, "paper")
+    assert json.loads(ask("list", session.parent, "--tag", "paper", "--tag", "lens-B", "--json").stdout)[0]["tags"] == [
+        "paper",
+        "lens-B",
+    ]
+    header, line = ask("list", session.parent, "--tag", "lens-B").stdout.splitlines()
+    assert header.split()[-2:] == ["tags", "note"]
+    assert line.endswith("paper,lens-B  door opened")
+    ask("tag", session, "lens-B", "--remove")
+    assert "no sessions with the tag lens-B there" in ask("list", session.parent, "--tag", "lens-B").stderr
+    said = ask("info", session).stdout
+    assert "tags          paper" in said
+    assert ": door opened" in said
+    assert "a tag is one word" in refused("tag", session, "two words")
+    assert ask("verify", session).stdout.endswith("read\n")
+
+
+def test_a_session_that_is_being_recorded_takes_a_note(session: Path):
+    growing = session / "telemetry" / "0009.mcap.part"
+    growing.write_bytes(b"")
+    with growing.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        ask("note", session, "watch the flap")
+        (listed,) = json.loads(ask("list", session.parent, "--json").stdout)
+    assert (listed["run"], listed["notes"][0]["text"]) == ("running", "watch the flap")
+    assert listed["notes"][0]["by"]
+
+
+def test_a_list_of_known_sessions_imports_nothing_that_takes_time(session: Path):
+    ask("list", session.parent)
+    code = (
+        "import sys\nfrom stand.commands.session_commands import app\n"
+        f"try: app(['list', {str(session.parent)!r}])\nexcept SystemExit as end: assert not end.code\n"
+        "assert not {'numpy', 'google.protobuf', 'mcap', 'asyncio', 'rich.console'} & {*sys.modules}, sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, session.name in done.stdout) == (0, True), done.stderr
 
 
 def test_a_folder_without_sessions_and_no_folder(tmp_path: Path):

@@ -1,0 +1,283 @@
+"""The sessions of a folder, from an index beside them: `.sessions.sqlite`.
+
+The index is made from the sessions and holds nothing else. An entry counts as long as the names, sizes and times of its
+session's files are those it was made of; all others are made again. An index that is lost, damaged, of another version
+or somebody else's is made anew; where none can be written, the list takes as long as it takes to look at each session.
+
+Nothing is imported here that takes time: a list of known sessions needs neither numpy nor protobuf.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from foundation.errors import SessionError
+from recording.format.inventory import is_locked
+from recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from recording.reading.journal_lines import JOURNAL_NAME
+from recording.reading.notes import NOTES_NAME, Archived, Note, read_notes
+
+if TYPE_CHECKING:
+    from recording.reading.glance import Glance
+
+INDEX_NAME = ".sessions.sqlite"
+_VERSION = 1  # of the index; the program's version counts, too, for what it says of a session
+_BUSY_S = 1.0  # how long another one that writes the index is waited for
+_SCHEMA = "CREATE TABLE sessions (name BLOB PRIMARY KEY, files TEXT NOT NULL, entry TEXT NOT NULL)"
+_File = tuple[str, int, int, bool]  # name, size, time of its last change in ns, whether a recorder has it open
+_INSTANT, _TEXT = (int, type(None)), (str,)
+_KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("frames", "size_bytes"), (int,)),
+    **dict.fromkeys(("begin_ns", "end_ns", "start_ns", "end_utc_ns"), _INSTANT),
+    **dict.fromkeys(("run", "files", "state_text", "lacks", "contents"), _TEXT),
+    "has_camera_degC": (bool, type(None)),
+}  # of an index that somebody else has written, too
+_SUFFIXES = (FINISHED, UNFINISHED, DAMAGED)
+
+Report = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A session at a glance (`glance.Glance` has the meanings), with what people said of it.
+
+    start_ns: begin_ns as UTC, end_utc_ns: end_ns. run, files: words of Run and Files. state_text, lacks: in words.
+    contents: names and sizes of the segments and the journal as a digest, which a copy elsewhere shares.
+    """
+
+    path: Path
+    metadata: dict[str, str]
+    attachments: tuple[str, ...]
+    frames: int
+    size_bytes: int
+    begin_ns: int | None
+    end_ns: int | None
+    start_ns: int | None
+    end_utc_ns: int | None
+    run: str
+    files: str
+    state_text: str
+    lacks: str
+    has_camera_degC: bool | None
+    segments: tuple[tuple[str, str, int], ...]
+    troubles: tuple[str, ...]
+    missing: tuple[str, ...]
+    contents: str = ""
+    notes: tuple[Note, ...] = ()
+    tags: tuple[str, ...] = ()
+    copies: tuple[Archived, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return self.path.name or self.path.resolve().name
+
+    @property
+    def simulated(self) -> bool:
+        """The devices were fakes."""
+        return self.metadata.get("simulated") == "true"
+
+    @property
+    def archived(self) -> str:
+        """The folder of the last verified copy of all of it as it is now; "" when there is none."""
+        return next((copy.to for copy in reversed(self.copies) if copy.contents == self.contents), "")
+
+
+def entry_of(seen: Glance, contents: str = "") -> Entry:
+    """What a list shows of a session that was looked at."""
+    said = read_notes(seen.path)
+    return Entry(
+        seen.path,
+        dict(seen.metadata),
+        tuple(seen.attachments),
+        seen.frames,
+        seen.size_bytes,
+        seen.begin_ns,
+        seen.end_ns,
+        None if seen.begin_ns is None else seen.utc.utc_ns(seen.begin_ns),
+        None if seen.end_ns is None else seen.utc.utc_ns(seen.end_ns),
+        str(seen.run),
+        str(seen.state),
+        seen.state_text,
+        seen.lacks,
+        seen.has_camera_degC,
+        tuple((file.name, str(file.state), file.size_bytes) for file in seen.files),
+        seen.troubles,
+        seen.missing,
+        contents or contents_of(seen.path),
+        said.notes,
+        said.tags,
+        said.archived,
+    )
+
+
+def catalogue(folder: Path, report: Callable[[int], Report] | None = None) -> list[Entry]:
+    """The sessions in `folder`, the oldest first. `report`: called with how many must be looked at, gives what is told
+    of the progress. Blocking; OSError when the folder cannot be read."""
+    found = {path: files for path in _folders(folder) if (files := _files(path)) is not None}
+    digests = {path: _digest(files) for path, files in found.items()}
+    with closing(_Index(folder)) as index:
+        known = {path: entry for path in found if (entry := index.get(path, digests[path])) is not None}
+        new = [path for path in found if path not in known]
+        tell = report(len(new)) if report is not None and new else None
+        for number, path in enumerate(new):
+            if tell is not None:
+                tell(number, path.name)
+            with suppress(SessionError):  # it was removed meanwhile
+                known[path] = look_at(path)
+                index.put(path, digests[path], known[path])
+        index.keep(found)
+    return sorted(known.values(), key=lambda entry: (entry.begin_ns or 0, str(entry.path)))
+
+
+def look_at(path: Path) -> Entry:
+    """The session in `path`, whatever an index says; SessionError when there is none."""
+    from recording.reading.glance import glance  # takes half a second to import
+
+    return entry_of(glance(path))
+
+
+def contents_of(path: Path) -> str:
+    """Names and sizes of a session's segments and journal as a digest: the same of a complete copy of them."""
+    files = _files(path)
+    return (
+        ""
+        if files is None
+        else _digest([(name, size) for name, size, *_ in files if "/" in name or name == JOURNAL_NAME])
+    )
+
+
+def _folders(folder: Path) -> Iterator[Path]:
+    with os.scandir(folder) as entries:
+        yield from [folder / entry.name for entry in entries if entry.is_dir()]
+
+
+def _files(path: Path) -> list[_File] | None:
+    """Those that a session consists of; None when there is no segment. One that a living recorder has open counts as
+    another file, and so does one in another folder of the same name."""
+    found: list[_File] = []
+    place = os.fspath(path)
+    for series in (TELEMETRY, FRAMES):
+        with suppress(OSError), os.scandir(f"{place}/{series}") as entries:
+            for entry in entries:
+                if entry.name.endswith(_SUFFIXES):
+                    told = entry.stat()
+                    is_open = entry.name.endswith(UNFINISHED) and is_locked(Path(entry.path))
+                    found.append((f"{series}/{entry.name}", told.st_size, told.st_mtime_ns, is_open))
+    if not found:
+        return None
+    found.sort()
+    for name in (JOURNAL_NAME, NOTES_NAME):
+        with suppress(OSError):
+            told = os.stat(f"{place}/{name}")  # path objects would double the time of a list
+            found.append((name, told.st_size, told.st_mtime_ns, False))
+    with suppress(OSError):
+        found.append((".", os.stat(place).st_ino, 0, False))
+    return found
+
+
+def _digest(values: object) -> str:
+    return hashlib.blake2b(repr(values).encode(errors="surrogateescape"), digest_size=16).hexdigest()
+
+
+class _Index:
+    """The file; every trouble with it means that nothing is known."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / INDEX_NAME
+        self._version = f"{_VERSION} {importlib.metadata.version('thermostand')}"
+        self._rows: dict[bytes, tuple[str, str]] = {}
+        self._new: dict[bytes, tuple[str, str]] = {}
+        self._gone: set[bytes] = set()
+        with suppress(OSError, sqlite3.Error, ValueError):
+            if self._is_ours():
+                self._rows = self._read()
+
+    def get(self, path: Path, files: str) -> Entry | None:
+        """What was entered of these files; None when nothing was."""
+        found = self._rows.get(os.fsencode(path.name))
+        if found is None or found[0] != files:
+            return None
+        try:
+            return _decoded(path, found[1])
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            return None
+
+    def put(self, path: Path, files: str, entry: Entry) -> None:
+        """Enter it, with the others, at the end."""
+        self._new[os.fsencode(path.name)] = (files, _encoded(entry))
+
+    def keep(self, found: Mapping[Path, object]) -> None:
+        """Forget all others."""
+        self._gone = set(self._rows) - {os.fsencode(path.name) for path in found}
+
+    def close(self) -> None:
+        """Write what is new; where that is refused, the next list looks again."""
+        if not self._new and not self._gone:
+            return
+        with suppress(OSError, sqlite3.Error):
+            if not self._is_ours() or not self._rows:
+                for name in (INDEX_NAME, f"{INDEX_NAME}-journal"):  # one of its changes must not be undone in a new one
+                    self._path.with_name(name).unlink(missing_ok=True)
+            with closing(self._opened()) as opened, opened:
+                if not opened.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+                    opened.execute(_SCHEMA)
+                opened.executemany("DELETE FROM sessions WHERE name = ?", [(name,) for name in self._gone])
+                rows = [(name, self._tagged(files), text) for name, (files, text) in self._new.items()]
+                opened.executemany("INSERT OR REPLACE INTO sessions VALUES (?, ?, ?)", rows)
+
+    def _opened(self) -> sqlite3.Connection:
+        opened = sqlite3.connect(self._path, timeout=_BUSY_S)
+        opened.execute("PRAGMA trusted_schema = OFF")
+        return opened
+
+    def _is_ours(self) -> bool:
+        """Whether it is a file, and no link to another place."""
+        return self._path.is_file() and not self._path.is_symlink()
+
+    def _read(self) -> dict[bytes, tuple[str, str]]:
+        """Name -> digest of the files, entry; sqlite3.Error when it is no index."""
+        with closing(self._opened()) as opened:
+            tables = opened.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
+            if tables != [(_SCHEMA,)]:
+                return {}
+            rows = opened.execute("SELECT name, files, entry FROM sessions").fetchall()
+        mark = self._tagged("")
+        return {
+            name: (files.removeprefix(mark), text)
+            for name, files, text in rows
+            if isinstance(name, bytes) and isinstance(text, str) and str(files).startswith(mark)
+        }
+
+    def _tagged(self, files: str) -> str:
+        return f"{self._version}: {files}"
+
+
+def _encoded(entry: Entry) -> str:
+    values = {field.name: getattr(entry, field.name) for field in fields(entry) if field.name != "path"}
+    for name in ("notes", "copies"):
+        values[name] = [asdict(each) for each in values[name]]
+    return json.dumps(values)
+
+
+def _decoded(path: Path, text: str) -> Entry:
+    """ValueError, TypeError, KeyError or AttributeError when the text is none."""
+    values = cast("dict[str, Any]", json.loads(text))
+    segments = tuple((str(name), str(state), int(size)) for name, state, size in values.pop("segments"))
+    notes = tuple(Note(**each) for each in values.pop("notes"))
+    copies = tuple(Archived(**each) for each in values.pop("copies"))
+    lists = {name: tuple(map(str, values.pop(name))) for name in ("attachments", "troubles", "missing", "tags")}
+    metadata = {str(key): str(value) for key, value in values.pop("metadata").items()}
+    for name, value in values.items():
+        if type(value) not in _KINDS[name]:
+            raise TypeError(name)
+    return Entry(path=path, metadata=metadata, segments=segments, notes=notes, copies=copies, **lists, **values)

@@ -1,0 +1,155 @@
+"""What people say of a session: notes and tags, and where it was archived, in a small file of its own, `notes.jsonl`.
+
+Lines are only ever added, each with who and when, in the form of the journal's: a CRC, then a JSON object. So a running
+session takes a note, too, and its recording is not touched. A line that was torn or damaged is left out.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import stat
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import cast
+
+from foundation.errors import ConfigError, SessionError
+from recording.reading.journal_lines import journal_line, lines_of
+
+NOTES_NAME = "notes.jsonl"
+LONGEST_NOTE = 4000  # characters
+LIMIT_BYTES = 4_000_000
+_TAG = re.compile(r"[^\W_][\w.:+-]{0,39}")
+_NOTE, _TAGS, _UNTAG, _ARCHIVED = "note", "tags", "untag", "archived"
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A sentence about the session: when (UTC, ns), by whom, what."""
+
+    time_ns: int
+    by: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Archived:
+    """A verified copy: the folder it is in, when it was made (UTC, ns), and of which files (`archive.contents_of`)."""
+
+    to: str
+    time_ns: int
+    contents: str
+
+
+@dataclass(frozen=True, slots=True)
+class Notes:
+    """All that was said; `tags` in the order they were given first."""
+
+    notes: tuple[Note, ...] = ()
+    tags: tuple[str, ...] = ()
+    archived: tuple[Archived, ...] = ()
+
+    def as_json(self) -> dict[str, object]:
+        """Fields for programs."""
+        return asdict(self)
+
+
+def read_notes(directory: Path) -> Notes:
+    """Of the session in `directory`; empty when nothing was said, or none of it can be read."""
+    try:
+        fd = os.open(directory / NOTES_NAME, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return Notes()
+    with os.fdopen(fd, "rb") as file:
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            return Notes()
+        found = lines_of(file.read(LIMIT_BYTES)).sound
+    return _folded(entry for line in found if (entry := _entry(line)) is not None)
+
+
+def add_note(directory: Path, text: str, by: str, time_ns: int) -> None:
+    """A note, durable when this returns. ConfigError for an empty or endless one, SessionError when it is not kept."""
+    text = text.strip()
+    if not 0 < len(text) <= LONGEST_NOTE:
+        raise ConfigError(f"a note has 1 to {LONGEST_NOTE} characters; this one has {len(text)}")
+    _append(directory, {"entry": _NOTE, "time_ns": time_ns, "by": by, "text": text})
+
+
+def add_tags(directory: Path, tags: Iterable[str], by: str, time_ns: int, *, remove: bool = False) -> None:
+    """Give the session these tags, or take them away; as add_note. A tag that it has already is no error."""
+    found = [check_tag(tag) for tag in tags]
+    _append(directory, {"entry": _UNTAG if remove else _TAGS, "time_ns": time_ns, "by": by, "tags": found})
+
+
+def add_archived(directory: Path, copy: Archived, by: str) -> None:
+    """Say that a verified copy is there; as add_note."""
+    fields = {"entry": _ARCHIVED, "time_ns": copy.time_ns, "by": by, "to": copy.to, "contents": copy.contents}
+    _append(directory, fields)
+
+
+def check_tag(tag: str) -> str:
+    """The tag; ConfigError when it is none."""
+    if _TAG.fullmatch(tag) is None:
+        raise ConfigError(
+            f"{tag!r}: a tag is one word of at most 40 letters, digits and . : + - _, and begins with a letter or digit"
+        )
+    return tag
+
+
+def _append(directory: Path, fields: Mapping[str, object]) -> None:
+    """One line, behind whatever is there; the end of a line that was torn stays apart from it."""
+    path = directory / NOTES_NAME
+    line = journal_line(json.dumps(fields, ensure_ascii=False).encode(errors="replace"))
+    try:
+        fd = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX)
+            told = os.fstat(fd)
+            if not stat.S_ISREG(told.st_mode) or told.st_size + len(line) > LIMIT_BYTES:
+                raise SessionError(f"{path}: is no file of notes, or is full")
+            torn = told.st_size and os.pread(fd, 1, told.st_size - 1) != b"\n"
+            os.write(fd, b"\n" + line if torn else line)
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+    except OSError as error:
+        raise SessionError(f"{path}: the note could not be kept ({error.strerror})") from error
+
+
+def _entry(line: bytes) -> dict[str, object] | None:
+    try:
+        found: object = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return cast("dict[str, object]", found) if isinstance(found, dict) else None
+
+
+def _folded(entries: Iterable[dict[str, object]]) -> Notes:
+    notes: list[Note] = []
+    tags: dict[str, None] = {}
+    archived: list[Archived] = []
+    for entry in entries:
+        time_ns, by = entry.get("time_ns"), str(entry.get("by", ""))
+        if not isinstance(time_ns, int) or not 0 <= time_ns < 1 << 63:
+            continue
+        match entry.get("entry"):
+            case "note":
+                notes.append(Note(time_ns, by, str(entry.get("text", ""))))
+            case "tags":
+                tags |= dict.fromkeys(_tags(entry))
+            case "untag":
+                tags = {tag: None for tag in tags if tag not in set(_tags(entry))}
+            case "archived":
+                archived.append(Archived(str(entry.get("to", "")), time_ns, str(entry.get("contents", ""))))
+            case _:
+                pass  # of a later version
+    return Notes(tuple(notes), tuple(tags), tuple(archived))
+
+
+def _tags(entry: dict[str, object]) -> list[str]:
+    found = entry.get("tags")
+    texts = cast("list[object]", found) if isinstance(found, list) else []
+    return [tag for tag in texts if isinstance(tag, str) and _TAG.fullmatch(tag)]

@@ -1,0 +1,128 @@
+"""`stand session list`, `note` and `tag`: what is known of many sessions, and what people say of one."""
+
+from __future__ import annotations
+
+import json
+import os
+import pwd
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from foundation.exit_codes import one_line_errors
+from foundation.usage import OneLineUsage, one_line
+from recording.format.inventory import inventory
+from recording.reading.catalogue import Entry, Report, catalogue, look_at
+from recording.reading.notes import add_note, add_tags, check_tag, read_notes
+from stand.commands.session_args import JsonOption, SessionArgument, check_folder, check_session
+from stand.commands.session_table import ON_THE_RIGHT, entry_json, lines, rows
+
+app = typer.Typer(cls=OneLineUsage, no_args_is_help=True, add_completion=False)
+_USUAL = {"run": ("complete", "running"), "files": ("sound",)}  # anything else is shown in another colour
+
+
+@app.command("list")
+def list_sessions(
+    directory: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the sessions are.")] = Path("sessions"),
+    tag: Annotated[
+        list[str] | None, typer.Option("--tag", help="Only those with this tag; with each, when repeated.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, how the
+    run ended, whether the files are sound, and what people said of them.
+
+    Example: stand session list /data/sessions --tag paper
+    """
+    with one_line_errors():
+        wanted = set(map(check_tag, tag or ()))
+        seen = [entry for entry in _entries(check_folder(directory)) if wanted <= set(entry.tags)]
+        if as_json:
+            typer.echo(json.dumps([entry_json(entry) for entry in seen], indent=2))
+        elif not seen:
+            with_tag = f" with the tag {', '.join(sorted(wanted))}" if wanted else ""
+            typer.echo(f"{directory}: no sessions{with_tag} there", err=True)
+        elif sys.stdout.isatty():
+            _show(seen)
+        else:
+            typer.echo("\n".join(lines(*rows(seen))))
+
+
+def _entries(directory: Path) -> list[Entry]:
+    """`directory` itself when it is a session, else those in it."""
+    if inventory(directory):
+        return [look_at(directory)]
+    with ExitStack() as stack:
+
+        def progress(count: int) -> Report:
+            from foundation.progress import late_progress
+
+            report = stack.enter_context(late_progress("look at sessions", count))
+            return lambda done, text: report(done, one_line(text))
+
+        return catalogue(directory, progress)
+
+
+def _show(seen: list[Entry]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    columns, cells = rows(seen)
+    table = Table(box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="right" if column in ON_THE_RIGHT else "left")
+    for row in cells:
+        named = zip(columns, row, strict=True)
+        table.add_row(
+            *(Text(cell, style="yellow" if cell not in _USUAL.get(name, (cell,)) else "") for name, cell in named)
+        )
+    Console().print(table)
+
+
+@app.command()
+def note(
+    directory: SessionArgument,
+    text: Annotated[list[str], typer.Argument(metavar="TEXT...", help="What is to be remembered.")],
+) -> None:
+    """Add a note to a session, also while it runs; kept in it with your name and the time.
+
+    Example: stand session note sessions/20260101T180000Z-thermal-cycle "door opened at 19:10"
+    """
+    _say(directory, partial(add_note, text=" ".join(text)))
+
+
+@app.command()
+def tag(
+    directory: SessionArgument,
+    tags: Annotated[list[str], typer.Argument(metavar="TAG...", help="Words to find it by.")],
+    remove: Annotated[bool, typer.Option("--remove", help="Take these tags away instead.")] = False,
+) -> None:
+    """Give a session tags, also while it runs; `stand session list --tag TAG` finds it.
+
+    Example: stand session tag sessions/20260101T180000Z-thermal-cycle paper lens-B
+    """
+    _say(directory, partial(add_tags, tags=tags, remove=remove))
+
+
+def _say(directory: Path, add: Callable[..., None]) -> None:
+    from foundation.clock import WallClock
+
+    with one_line_errors():
+        add(check_session(directory), by=user_name(), time_ns=WallClock().now_ns())
+        said = read_notes(directory)
+        told = f"{len(said.notes)} note{'' if len(said.notes) == 1 else 's'}"
+        typer.echo(one_line(f"{directory}: {told}, tags: {', '.join(said.tags) or 'none'}"))
+
+
+def user_name() -> str:
+    """Of who gives the command."""
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return str(os.getuid())

@@ -1,0 +1,42 @@
+"""`stand session list` of a thousand sessions, a process each time, against one that only sums up their files."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.bench.figures import Figure, Measurement, absolute, at_most, in_turns, milliseconds, side_by_side
+from tests.recording.runs import record_run
+
+SESSIONS = 1000
+ROUNDS = 5
+MOST_MS = 300.0
+PEER = "stand session list of an empty folder"
+
+
+def sessions(folder: Path, count: int = SESSIONS) -> Path:
+    """That many copies of a small session of 11 segments."""
+    folder.mkdir(parents=True)
+    asyncio.run(record_run(folder / "0000"))
+    for number in range(1, count):
+        shutil.copytree(folder / "0000", folder / f"{number:04d}")
+    return folder
+
+
+def listed(folder: Path) -> Measurement:
+    """A process of its own, from its start to its end, ms."""
+    command = [sys.executable, "-m", "stand.cli", "session", "list", str(folder)]
+    return lambda: milliseconds(lambda: subprocess.run(command, capture_output=True, check=True))
+
+
+def figures(folder: Path) -> list[Figure]:
+    """The first list makes the index; then what it takes beside a list of nothing."""
+    many = sessions(folder / "listing")
+    empty = folder / "no-sessions"
+    empty.mkdir()
+    first = absolute(f"first list of {SESSIONS} sessions", "ms", [listed(many)()])
+    ours, others = in_turns(listed(many), listed(empty), ROUNDS)
+    return [first, at_most(MOST_MS, side_by_side(f"list of {SESSIONS} sessions", "ms", PEER, ours, others))]

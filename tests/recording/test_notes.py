@@ -1,0 +1,70 @@
+"""Notes and tags of a session: kept with who and when, only ever added to, whatever the file has come to."""
+
+import os
+from multiprocessing.pool import ThreadPool
+from pathlib import Path
+
+import pytest
+
+from foundation.errors import ConfigError, SessionError
+from recording.reading.notes import NOTES_NAME, Archived, Note, Notes, add_archived, add_note, add_tags, read_notes
+
+
+def test_notes_and_tags_are_kept_in_order(tmp_path: Path):
+    add_note(tmp_path, " door opened\n at 19:10 ", "eva", 5)
+    add_tags(tmp_path, ["paper", "lens-B"], "eva", 6)
+    add_tags(tmp_path, ["paper", "2026"], "jan", 7)
+    add_tags(tmp_path, ["lens-B"], "jan", 8, remove=True)
+    add_archived(tmp_path, Archived("/nas/night", 9, "0f"), "jan")
+    assert read_notes(tmp_path) == Notes(
+        (Note(5, "eva", "door opened\n at 19:10"),), ("paper", "2026"), (Archived("/nas/night", 9, "0f"),)
+    )
+
+
+def test_without_a_file_nothing_was_said(tmp_path: Path):
+    assert read_notes(tmp_path) == Notes()
+    assert read_notes(tmp_path / "nowhere") == Notes()
+
+
+def test_a_torn_or_damaged_line_costs_only_itself(tmp_path: Path):
+    path = tmp_path / NOTES_NAME
+    add_note(tmp_path, "first", "eva", 1)
+    with path.open("ab") as file:
+        file.write(b'12345678 {"entry": "note", "te')  # torn by a power cut
+    add_note(tmp_path, "second", "eva", 2)
+    with path.open("ab") as file:
+        file.write(b"00000000 {}\n\n[]\n")
+    add_note(tmp_path, "third", "eva", 3)
+    assert [note.text for note in read_notes(tmp_path).notes] == ["first", "second", "third"]
+
+
+@pytest.mark.parametrize("text", ["", "  \n", "x" * 4001])
+def test_a_note_has_a_text_of_a_page_at_most(tmp_path: Path, text: str):
+    with pytest.raises(ConfigError, match="a note has 1 to 4000 characters"):
+        add_note(tmp_path, text, "eva", 1)
+
+
+@pytest.mark.parametrize("tag", ["", "two words", "-x", "a,b", "x" * 41, "a\n", "../x"])
+def test_a_tag_is_a_word(tmp_path: Path, tag: str):
+    with pytest.raises(ConfigError, match="a tag is one word"):
+        add_tags(tmp_path, [tag], "eva", 1)
+    assert not (tmp_path / NOTES_NAME).exists()
+
+
+def test_links_and_pipes_are_no_notes(tmp_path: Path):
+    (tmp_path / "other").write_text("")
+    (tmp_path / NOTES_NAME).symlink_to(tmp_path / "other")
+    assert read_notes(tmp_path) == Notes()
+    with pytest.raises(SessionError, match="could not be kept"):
+        add_note(tmp_path, "x", "eva", 1)
+    (tmp_path / NOTES_NAME).unlink()
+    os.mkfifo(tmp_path / NOTES_NAME)
+    assert read_notes(tmp_path) == Notes()
+    with pytest.raises(SessionError, match="is no file of notes"):
+        add_note(tmp_path, "x", "eva", 1)
+
+
+def test_notes_given_at_once_are_all_kept(tmp_path: Path):
+    with ThreadPool(8) as pool:
+        pool.map(lambda number: add_note(tmp_path, f"note {number}", "eva", number), range(40))
+    assert sorted(note.time_ns for note in read_notes(tmp_path).notes) == list(range(40))
