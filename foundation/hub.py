@@ -26,6 +26,10 @@ class Hub:
         """Call `subscriber(item)` for every item published from now on."""
         self._subscribers.append(subscriber)
 
+    def unsubscribe(self, subscriber: Subscriber) -> None:
+        """Call it no more; nothing happens when it was not subscribed."""
+        self._subscribers = [each for each in self._subscribers if each != subscriber]
+
     def publish(self, item: Item) -> None:
         """Remember the readings of a batch, then hand the item on."""
         if isinstance(item, Batch):

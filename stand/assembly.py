@@ -72,11 +72,12 @@ class Assembly:
         release: Callable[[], None] | None = None,
         recording: Recording | None = None,
         frames_to_come: Callable[[], bool] = lambda: False,
+        announced: Announcements | None = None,
     ) -> Guard:
         """The guard with the configured rules, those of `recording` and of a camera with `frames_to_come` among them;
         on a fault it calls `stop`, or `hold` where waiting is enough, and `release` when a hold has ended by itself.
         From now on nothing is permitted without it."""
-        announced, stand = Announcements(), self.stand
+        announced, stand = announced or Announcements(), self.stand
         self.hub.subscribe(announced.receive)
         guard = Guard(
             stand.safety,

@@ -23,7 +23,8 @@ class Mover(Protocol):
 
 
 class Interlock:
-    """Closed by the first fault for good, and by the gate's interlock until an operator clears it."""
+    """Closed by the first fault until the run that it ends is over, and by the gate's interlock until an operator
+    clears it."""
 
     def __init__(self, gate: Gate, movers: Iterable[Mover]) -> None:
         self.fault: Fault | None = None
@@ -31,9 +32,14 @@ class Interlock:
         self._movers = tuple(movers)
 
     def latch(self, fault: Fault) -> None:
-        """Closed for good; the first fault stays. Nothing earns time while the stand is being made safe."""
+        """Closed until `unlatch`; the first fault stays. Nothing earns time while the stand is being made safe."""
         self.fault = self.fault or fault
         self._gate.hold(STOPPING)
+
+    def unlatch(self) -> None:
+        """The run that the latch has ended is over, and the stand was made safe."""
+        self.fault = None
+        self._gate.clear(STOPPING)
 
     def check(self) -> None:
         """StandTripped after a fault, Interlocked while the guard holds the stand; else everything may move."""

@@ -157,6 +157,10 @@ class Safety:
             self._on_change()
         return self._given_up
 
+    def renew(self) -> None:
+        """Who did not want to wait for one confirmation may want to for the next."""
+        self._given_up = False
+
     def forgive(self) -> None:
         """An operator has cleared the hold: what is not confirmed is tried no more, or it would undo what the run does
         from now on."""

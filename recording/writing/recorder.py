@@ -207,6 +207,7 @@ class Recorder:
             await self._left(within_s)
             raise
         await self._left()
+        self._hub.unsubscribe(self._receive)
         await self._finishing
 
     async def _left(self, within_s: float | None = 0.0) -> None:

@@ -30,7 +30,8 @@ class Guard:
     On a fault `stop(fault)` ends the run, or `hold(fault)` lets it wait; the trip is recorded, the stand is made safe,
     and `notifier` runs. A hold stays until `clear`, but for one that ends by itself: `release()` is then called when no
     rule objects any more and the stand has confirmed that it is safe, at most three times an hour. Without a `hold`
-    every trip aborts. A guard that fails aborts.
+    every trip aborts. A guard that fails aborts. One that `keeps_on` looks on after an abort, which it holds until
+    `clear`: that of a stand on which further runs follow.
 
     A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
     wait for a GOOD reading of each of `vital`, the channels that heat depends on, taken since. What is too old
@@ -48,6 +49,7 @@ class Guard:
     cut_camera: Callable[[], None] | None = None
     notifier: Notifier | None = None
     vital: tuple[str, ...] = ()
+    keeps_on: bool = False
     held: Fault | None = None  # why the run waits
     _ended: bool = False
     _looked_ns: int | None = None
@@ -62,9 +64,9 @@ class Guard:
         self._note_time()
         faults = self._faults()
         fault = next((each for each in faults if each.action == "abort" or self.hold is None), None)
-        if fault is not None:
+        if fault is not None and not self._is_kept:
             self._abort(fault)
-            return False
+            return self.keeps_on
         self._follow_hold(faults)
         return True
 
@@ -98,8 +100,14 @@ class Guard:
                 due_ns = max(due_ns + seconds_ns(self.period_s), self.clock.now_ns())
                 await self.clock.sleep_until(due_ns)
         except Exception as error:
+            self.keeps_on = False
             self._abort(Fault("guard_failed", f"the guard failed ({type(error).__name__}: {error})"))
             raise
+
+    @property
+    def _is_kept(self) -> bool:
+        """Whether the stand is already held for a fault that aborts."""
+        return self.keeps_on and self.held is not None and self.held.action == "abort"
 
     async def told(self) -> None:
         """Return when each notify command of a trip has ended, or could not be run."""
@@ -107,7 +115,8 @@ class Guard:
             await asyncio.wait(self._telling)
 
     def _abort(self, fault: Fault) -> None:
-        self._ended = True
+        self._ended = not self.keeps_on
+        self.held = fault if self.keeps_on else self.held
         self.stop(fault)
         self._make_safe(fault)
 

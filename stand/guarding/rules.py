@@ -64,6 +64,10 @@ class Announcements:
         self.frames_stopped = ""
         self.is_paused = False
 
+    def forget(self) -> None:
+        """The run that announced it is over."""
+        self.is_capturing, self.frames_stopped, self.is_paused = False, "", False
+
     def receive(self, item: Item) -> None:
         """The hub's subscriber."""
         if isinstance(item, StepMark) and item.kind == Capture.__name__:

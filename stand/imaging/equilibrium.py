@@ -46,6 +46,10 @@ class CameraEquilibrium:
         """Call `listener()` at once whenever the equilibrium is lost."""
         self._listeners.append(listener)
 
+    def unsubscribe(self, listener: Callable[[], None]) -> None:
+        """Call it no more; nothing happens when it was not subscribed."""
+        self._listeners = [each for each in self._listeners if each != listener]
+
     def lose(self, reason: str, data: Mapping[str, object] | None = None) -> None:
         """It is lost from now on; event `camera_equilibrium_lost`."""
         self.is_lost = True

@@ -50,6 +50,10 @@ class OffsetWatch:
         self._readings: dict[str, deque[tuple[int, float]]] = {CAMERA: deque(), AIR: deque()}
         hub.subscribe(self._receive)
 
+    def close(self) -> None:
+        """Listen no more: the run is over."""
+        self._hub.unsubscribe(self._receive)
+
     def settled(self, chamber_degC: float) -> None:
         """The set-point has settled: keep its offset, and compare it when it is the first since a gap; the event
         `camera_offset_changed`, or `camera_offset_same`."""

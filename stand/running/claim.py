@@ -92,8 +92,8 @@ _HOLDER_TRIES, _HOLDER_PAUSE_S = 10, 0.02
 
 
 @asynccontextmanager
-async def claimed(config: StandConfig, session: Path) -> AsyncGenerator[None]:
-    """Every address of the stand belongs to the run of `session` while inside.
+async def claimed(config: StandConfig, session: Path | None) -> AsyncGenerator[None]:
+    """Every address of the stand belongs to the run of `session` while inside, without one to a daemon.
 
     InUse when another run has one of them: then nothing was touched. SessionError when the runtime folder cannot be
     used.
@@ -103,11 +103,11 @@ async def claimed(config: StandConfig, session: Path) -> AsyncGenerator[None]:
         yield
 
 
-def _claimed(wanted: Iterable[Address], session: Path, stand: str) -> AbstractContextManager[object]:
+def _claimed(wanted: Iterable[Address], session: Path | None, stand: str) -> AbstractContextManager[object]:
     """All of them, or none and what `claimed` raises. In one order for all processes: of two that want the same ones,
     one gets them."""
     folder = runtime_folder()
-    content = {"session": os.path.abspath(session), "pid": os.getpid(), "stand": stand}
+    content = {"session": os.path.abspath(session) if session else "", "pid": os.getpid(), "stand": stand}
     stack = ExitStack()
     try:
         for place, device in sorted({address.place: address.device for address in wanted}.items()):
@@ -160,4 +160,5 @@ def _told(path: Path) -> str:
         if try_lock(file.fileno(), shared=True):
             raise LookupError(path)
         said = cast("dict[str, object]", json.loads(file.read()))
-    return f"session {said['session']} (pid {said['pid']})"
+    who = f"session {said['session']}" if said["session"] else "the daemon of `stand serve`"
+    return f"{who} (pid {said['pid']})"

@@ -118,6 +118,10 @@ class Executor:
             self._on_lost_equilibrium()
         stand.imaging.supply.equilibrium.subscribe(self._on_lost_equilibrium)
 
+    def close(self) -> None:
+        """The run is over: what is lost now is not its business."""
+        self._stand.imaging.supply.equilibrium.unsubscribe(self._on_lost_equilibrium)
+
     async def run(self) -> None:
         """What is not done of the plan."""
         while (action := next_action(self._state, self._surroundings())) is not None:

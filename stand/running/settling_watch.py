@@ -52,7 +52,8 @@ class SettlingWatch:
         hub.subscribe(self._receive)
 
     def close(self) -> None:
-        """End the thread that finds markers."""
+        """Listen no more, and end the thread that finds markers."""
+        self._hub.unsubscribe(self._receive)
         self._lane.close()
 
     def restart(self) -> None:

@@ -25,16 +25,17 @@ class Stop:
 
     The stand is latched and made safe, the run cancelled where it waits, once, and not while it is being taken down;
     what it then raises becomes Interrupted or StandTripped with the first reason. While an actuator does not confirm
-    that it is safe, a signal a minute after the first ends the wait.
+    that it is safe, a signal a minute after the first ends the wait. Without `has_signals` the signals are somebody
+    else's: those of a daemon, whose guest is stopped.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, has_signals: bool = True) -> None:
         self.fault: Fault | None = None
         self.phase = Phase.IDLE
         self._stand: Stand | None = None
         self._aborting: asyncio.Task[None] | None = None
-        self._signals = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        self._signals = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT] if has_signals else []
+        if has_signals and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             self._signals.append(signal.SIGHUP)
 
     def watch(self, stand: Stand) -> None:

@@ -26,6 +26,10 @@ class Table:
         self._clock = clock
         self._commanded: dict[str, float] = {}  # axis -> mm or deg, where the plan put it last
 
+    def forget(self) -> None:
+        """No plan has put any stage anywhere: the run that did is over."""
+        self._commanded.clear()
+
     async def move_to(self, axis: str, position: float) -> None:
         """Move a stage (mm or deg), homing it first when it lost its scale."""
         stage = self._axis(axis)

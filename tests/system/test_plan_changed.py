@@ -40,7 +40,7 @@ def executors(monkeypatch: pytest.MonkeyPatch) -> list[Executor]:
             super().__init__(*args, **options)
             found.append(self)
 
-    monkeypatch.setattr("stand.running.guarded_run.Executor", Kept)
+    monkeypatch.setattr("stand.running.guest.Executor", Kept)
     return found
 
 

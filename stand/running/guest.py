@@ -1,0 +1,263 @@
+"""A run as the guest of an open stand: journaled, and the stand made safe on every way out."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.metadata
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from foundation.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
+from foundation.documents import parse_document
+from foundation.errors import SessionError, StandTripped
+from foundation.hub import Hub
+from foundation.instants import utc_text
+from foundation.items import Event, Item
+from foundation.tasks import cause_of, failure_text, watched
+from markers.target import Target
+from recording.reading.contents import RUN_END
+from recording.reading.run_word import Run
+from recording.writing.recorder import Recorder
+from stand.assembly import Assembly
+from stand.estimating.estimate import price
+from stand.estimating.learned import load_learned
+from stand.fault import Fault
+from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
+from stand.running.camera_gap import OffsetGap, OffsetWatch, doubt
+from stand.running.entries import Cleared, Ended, Gap, Written
+from stand.running.executor import Executor
+from stand.running.fold import fold
+from stand.running.holds import end_endless_holds
+from stand.running.house import House
+from stand.running.journal import Journal, Logbook
+from stand.running.order import Order, check_plan
+from stand.running.resume import Interruption, begun, plan_hash
+from stand.running.settling_watch import SettlingWatch, load_for
+from stand.running.status import StatusBoard
+from stand.running.stop import STOPPED_BY_OPERATOR, Stop
+from stand.serving.control import handlers, serve
+
+# The recorder's events that hold a run, and those that let it continue.
+_HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
+# A run in virtual time that is held for so many times the longest pause ends.
+_VIRTUAL_PAUSES = 2
+_RELEASING = {"frames_resumed": DISK_LOW, "telemetry_saved_again": NOT_RECORDED}
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What to run and who watches: from the start, in a folder below `out`, or resuming an interruption (`before`).
+
+    begun: gets the folder when its journal is on the disk.
+    """
+
+    order: Order
+    out: Path
+    seed: int | None
+    watch: Callable[[Hub], None]
+    begun: Callable[[Path], None]
+    before: Interruption | None = None
+
+
+class Guest:
+    """A run on an open stand: it reads, begins its journal, performs its plan and leaves the stand safe.
+
+    board, executor: what is published of the run, and what changes its plan; None before its journal is begun.
+    """
+
+    def __init__(self, job: Job, house: House, recorder: Recorder, stop: Stop) -> None:
+        assembly, plan, before = house.assembly, tuple(job.order.recipe.plan()), job.before
+        load_for(plan)
+        self.job = job
+        self.recorder = recorder
+        self.stop = stop
+        self.log = Logbook(assembly.hub, assembly.clock, fold(plan, ()) if before is None else before.state)
+        self.board: StatusBoard | None = None
+        self.executor: Executor | None = None
+        self._house = house
+        self._assembly = assembly
+        assembly.stand.attended = job.order.attended
+
+    @property
+    def frames_to_come(self) -> bool:
+        """Whether the plan still captures."""
+        return self.log.state.frames_to_come
+
+    def trip(self, fault: Fault) -> None:
+        """The guard ends the run."""
+        self.stop(fault)
+        self.log.tripped(fault)
+
+    def hold(self, fault: Fault) -> None:
+        """The guard holds the run."""
+        self.log.tripped(fault)
+
+    async def run(self, recording: asyncio.Task[None]) -> None:
+        """The whole plan, or what is not done of it; the actuators are safe before anything else is taken down. The end
+        of `recording` ends the run."""
+        house, assembly, stop, log = self._house, self._assembly, self.stop, self.log
+        house.guest, house.recorder = self, self.recorder
+        house.prepare()
+        target = parse_document(self.job.order.target_text, Target, "target.yaml")
+        settling = SettlingWatch(assembly.stand, assembly.hub, assembly.clock, target)
+        watchers: list[asyncio.Task[None]] = []
+        ended = Ended(0, "failed", "")
+        async with AsyncExitStack() as leaving:
+            try:
+                executor = await watched(self._begun(settling, leaving), (*house.tasks, recording))
+                self.board = await self._board(leaving)
+                self.executor = executor
+                watchers.append(asyncio.create_task(self._answer(self.board)))
+                house.start()
+                if isinstance(assembly.clock, VirtualClock):
+                    limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
+                    watchers.append(
+                        asyncio.create_task(end_endless_holds(assembly.stand.gate, assembly.clock, limit_h))
+                    )
+                stop.started()
+                await watched(executor.run(), [*house.tasks, recording, *watchers])
+                ended = Ended(0, "complete", "complete")
+            except BaseException as error:
+                ended = _ending(stop.fault, error)
+                raise
+            finally:
+                stop.taking_down()
+                assembly.stand.gate.let_go()  # what an operator presses now holds nothing
+                try:
+                    level = "info" if ended.status == "complete" else "error"
+                    log.tell(level, RUN_END, ended.text, {"status": ended.status})
+                finally:  # also when a subscriber fails
+                    await house.rest(watchers)
+                    settling.close()
+                    stop.ended()
+                    await log.end(ended)
+
+    async def _begun(self, settling: SettlingWatch, leaving: AsyncExitStack) -> Executor:
+        """Everything read and judged once, and the journal begun or continued: nothing moves before that."""
+        house, assembly, log, before, recorder = self._house, self._assembly, self.log, self.job.before, self.recorder
+        await house.read_once()
+        if before is None:
+            log.tell("info", "run.start", f"recipe {self.job.order.recipe.name}", self._begin_data())
+        else:
+            self._tell_interruption(before)
+        if not house.guard.look():
+            raise StandTripped("a rule of the guard is violated")
+        await recorder.flushed()  # a session with a journal can be opened and resumed
+        journal = Journal.create(recorder.directory) if before is None else before.journal
+        await log.begin(journal, *self._first_entries(), disk=recorder.disk)
+        recorder.beside(journal)
+        self.job.begun(recorder.directory)
+        gate, hub, clock = assembly.stand.gate, assembly.hub, assembly.clock
+        gate.subscribe(log.held)
+        if house.latched is not None:  # by the first look, when there was no journal yet
+            log.tripped(house.latched)
+            log.held(INTERLOCK, True)
+        holding = _hold_while_not_recorded(gate)
+        hub.subscribe(holding)
+        leaving.callback(hub.unsubscribe, holding)
+        if before is not None:
+            _judge_camera(before, assembly)
+        offsets = OffsetWatch(hub, clock, None if before is None else _gap(before, clock))
+        leaving.callback(offsets.close)
+        allowed = partial(check_plan, config=self.job.order.config)
+        executor = Executor(assembly.stand, hub, clock, log, recorder.flushed, settling, offsets, allowed)
+        leaving.callback(executor.close)
+        return executor
+
+    async def _board(self, leaving: AsyncExitStack) -> StatusBoard:
+        """The published state of the run, from before its first step on."""
+        assembly, recorder, state, before = self._assembly, self.recorder, self.log.state, self.job.before
+        kept = state if before is None else before.kept
+        with assembly.clock.hold():  # nothing moves yet: the disk may take its time
+            learned = await asyncio.to_thread(load_learned, recorder.directory.parent)
+        steps = price(state.plan, self.job.order.config, learned)
+        gate, clock, house = assembly.stand.gate, assembly.clock, self._house
+        name = self.job.order.recipe.name
+        board = StatusBoard(name, steps, kept, gate, self.stop, lambda: house.latched, recorder, clock)
+        assembly.hub.subscribe(board)
+        leaving.callback(assembly.hub.unsubscribe, board)
+        return board
+
+    async def _answer(self, board: StatusBoard) -> None:
+        """Answer at the control socket until cancelled; a run can do without one."""
+        stand = self._assembly.stand
+        table = handlers(stand.gate, self.stop, board.status, lambda: stand.motions.texts)
+        try:
+            async with serve(self.recorder.directory, self.job.order.config.name, table):
+                await asyncio.Event().wait()
+        except SessionError as error:
+            self.log.tell("warning", "no_control", f"the run cannot be queried or paused: {error}")
+            await asyncio.Event().wait()
+
+    def _begin_data(self) -> dict[str, object]:
+        """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For
+        counts of what is done: how many steps and frames the plan has."""
+        plan, boot = plan_hash(self.job.order.recipe.plan()), boot_of(self._assembly.clock)
+        data: dict[str, object] = {**self.log.state.size, "plan": plan, "seed": self.job.seed}
+        return data if boot is None else {**data, "boot_id": boot.id}
+
+    def _first_entries(self) -> tuple[Written, ...]:
+        now_ns, before = self._assembly.clock.now_ns(), self.job.before
+        if before is None:
+            return (begun(self.job.order, self.recorder.directory.name, now_ns, self.job.seed),)
+        cleared = (Cleared(now_ns),) if before.state.tripped else ()
+        return (*cleared, Gap(before.last_ns, now_ns))
+
+    def _tell_interruption(self, before: Interruption) -> None:
+        """The end of the run that was interrupted, the gap since, and that it is resumed."""
+        clock, log = self._assembly.clock, self.log
+        now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
+        if before.state.ended is None:
+            ended = f"interrupted: killed after {utc_text(last_utc_ns)}"
+            log.tell("error", RUN_END, ended, {"status": Run.INTERRUPTED})
+        gap_s = (now_ns - before.last_ns) / NS_PER_S
+        span = f"from {utc_text(last_utc_ns)} to {utc_text(now_ns + utc_offset_ns(clock))}"
+        log.tell("warning", "gap", f"nothing was recorded and nobody watched the stand {span} ({gap_s:.3f} s)")
+        if before.state.tripped:
+            log.tell("warning", "cleared", f"an operator cleared: {before.state.tripped}")
+        version = importlib.metadata.version("thermostand")
+        done = f"{len(before.kept.done)} steps are done"
+        text = f"recipe {before.order.recipe.name} is resumed, {done}; thermostand {version}"
+        log.tell("info", "run.resume", text, self._begin_data())
+
+
+def _gap(before: Interruption, clock: Clock) -> OffsetGap:
+    return OffsetGap(before.camera.offsets_K, before.last_ns, clock.now_ns())
+
+
+def _judge_camera(before: Interruption, assembly: Assembly) -> None:
+    """A camera that the plan has on, and that may have been off since, has lost its equilibrium."""
+    stand, boot = assembly.stand, boot_of(assembly.clock)
+    if not before.kept.set_up.camera_on:
+        stand.imaging.supply.last = before.camera.last
+    elif reason := doubt(
+        before.camera,
+        None if boot is None else boot.id,
+        stand.imaging.supply.was_on,
+        assembly.hub.latest("camera.temperature"),
+    ):
+        stand.imaging.supply.equilibrium.lose(reason)
+
+
+def _ending(fault: Fault | None, error: BaseException) -> Ended:
+    """How a run ended that did not come to its end."""
+    if fault is None:
+        cause = cause_of(error)
+        reason = "cancelled" if isinstance(cause, asyncio.CancelledError) else failure_text(cause)
+        return Ended(0, "failed", f"failed: {reason}")
+    return Ended(0, "stopped" if fault.rule == STOPPED_BY_OPERATOR else "tripped", f"aborted: {fault.text}")
+
+
+def _hold_while_not_recorded(gate: Gate) -> Callable[[Item], None]:
+    """A subscriber: the run waits while the recorder cannot record frames, or telemetry."""
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Event) and item.kind in _HOLDING:
+            gate.hold(_HOLDING[item.kind])
+        if isinstance(item, Event) and item.kind in _RELEASING:
+            gate.clear(_RELEASING[item.kind])
+
+    return follow

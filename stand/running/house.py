@@ -1,0 +1,280 @@
+"""A stand from before anything is opened until all is closed: devices, guard, pollers, keeper and safety.
+
+Runs are its guests, one at a time: each brings a plan, a recorder and a journal, and leaves a safe stand. The guard
+looks from before the first guest comes until the last has left, and does not pause in between.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from typing import Protocol, TypeVar
+
+from foundation.clock import VirtualClock
+from foundation.errors import StandError
+from foundation.tasks import cancelled, watched
+from recording.writing.disk import FILES_LINE, Disk
+from stand.assembly import Assembly
+from stand.fault import Fault
+from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
+from stand.guarding.guard import Guard
+from stand.guarding.interlocks import Recording
+from stand.guarding.rules import Announcements
+from stand.poller import Poller
+from stand.running.holds import keep_shut_in_holds
+from stand.running.stop import Stop
+
+_OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
+
+# What drives virtual time, or looks after the real one.
+Time = Callable[[], Coroutine[None, None, None]]
+Result = TypeVar("Result")
+
+
+class Recorder(Recording, Protocol):
+    """Of what is recorded now, by a run or by the house."""
+
+    def refound(self) -> None:
+        """An operator has cleared the loss of its folder."""
+        ...
+
+
+class Guest(Protocol):
+    """The run that has the stand."""
+
+    @property
+    def frames_to_come(self) -> bool:
+        """Whether its plan still captures."""
+        ...
+
+    def trip(self, fault: Fault) -> None:
+        """The guard ends the run."""
+        ...
+
+    def hold(self, fault: Fault) -> None:
+        """The guard holds the run: to be journaled."""
+        ...
+
+
+class House:
+    """The open stand. `recorder` is what heat depends on; set it before `prepare`.
+
+    is_for_one: it is closed with its one guest; else a trip is kept until an operator clears it (`latched`), guest or
+    not. background: tasks that must not end, from the opening on.
+    """
+
+    def __init__(self, assembly: Assembly, disk: Disk | None, *, is_for_one: bool) -> None:
+        self.assembly = assembly
+        self.disk = disk
+        self.is_for_one = is_for_one
+        self.background: list[asyncio.Task[None]] = []
+        self.recorder: Recorder | None = None
+        self.guest: Guest | None = None
+        self._announced = Announcements()
+        self._guard: Guard | None = None
+        self._pollers: tuple[Poller, ...] = ()
+        self._tasks: list[asyncio.Task[None]] = []
+
+    @property
+    def guard(self) -> Guard:
+        """There is one after `prepare`."""
+        if self._guard is None:
+            raise ValueError("a stand is guarded when it is prepared")
+        return self._guard
+
+    @property
+    def latched(self) -> Fault | None:
+        """What the guard has made the stand safe for, and nobody has cleared."""
+        return None if self._guard is None else self._guard.held
+
+    @property
+    def tasks(self) -> tuple[asyncio.Task[None], ...]:
+        """Those whose end ends everything."""
+        return (*self.background, *self._tasks)
+
+    def prepare(self) -> None:
+        """Guard and pollers, unless there are some. From now on nothing is permitted without the guard."""
+        if self._guard is not None:
+            return
+        self._pollers = self.assembly.pollers()
+        gate = self.assembly.stand.gate
+        self._guard = self.assembly.guard(
+            self._trip,
+            self._hold,
+            lambda: gate.clear(INTERLOCK),
+            _Recorded(self),
+            self._frames_are_due,
+            self._announced,
+        )
+        self._guard.keeps_on = not self.is_for_one
+
+    async def read_once(self) -> None:
+        """Every device is read and published now; DeviceError the first time, when one cannot be read."""
+        for poller in self._pollers:
+            await (poller.poll() if self._tasks else poller.first())
+
+    def start(self) -> None:
+        """Poll, guard and keep, unless that goes on already, until the last guest's `rest` or `close`."""
+        if self._tasks:
+            return
+        stand, hub, clock = self.assembly.stand, self.assembly.hub, self.assembly.clock
+        stand.gate.subscribe_last(self._on_gate)
+        works = [
+            *(poller.run() for poller in self._pollers),
+            self.guard.run(),
+            stand.chamber.keeper.run(),
+            keep_shut_in_holds(stand, hub, clock),
+            stand.imaging.supply.opening.keep_open(),
+        ]
+        self._tasks.extend(map(asyncio.create_task, works))
+
+    async def or_safe(self, work: Coroutine[None, None, Result], stop: Stop) -> Result:
+        """What `work` returns; when it fails or is stopped before anything was permitted, all that already answers is
+        made safe."""
+        try:
+            return await watched(work, self.tasks)
+        except BaseException:
+            stop.taking_down()
+            safety = self.assembly.stand.safety
+            safety.demand()
+            try:
+                await safety.confirmed(min(_OPENING_SAFE_LIMIT_S, self.assembly.config.guard.safe_limit_s))
+            finally:
+                if not self._tasks:
+                    await safety.close()
+            raise
+
+    async def rest(self, tasks: Sequence[asyncio.Task[None]] = ()) -> None:
+        """The actuators safe, tried until they confirm it, and the guest's `tasks` ended, with the last guest all that
+        could move them; then one more look at every device, so that a recording ends with the safe state as read from
+        the wire."""
+        safety = self.assembly.stand.safety
+        try:
+            safety.demand()
+            await safety.confirmed(self.assembly.config.guard.safe_limit_s)
+        finally:
+            await cancelled([*tasks, *(self._tasks if self.is_for_one else ())])
+            if self.is_for_one:
+                await safety.close()
+            await self.guard.told()
+        for poller in self._pollers:
+            await poller.poll()
+
+    async def close(self) -> None:
+        """Safe for the last time; may be called when nothing was started."""
+        self.is_for_one = True
+        if self._tasks:
+            await self.rest()
+
+    def left(self) -> None:
+        """The guest has gone, and what it alone was held for counts no more. A fault stays until it is cleared."""
+        self.guest = None
+        if self.is_for_one:
+            return
+        stand = self.assembly.stand
+        if self.latched is not None:
+            stand.gate.hold(INTERLOCK)
+        stand.interlock.unlatch()
+        for reason in (OPERATOR, CAMERA_LOST, DISK_LOW, NOT_RECORDED):
+            stand.gate.clear(reason)
+        self._announced.forget()
+        stand.table.forget()
+        stand.safety.renew()
+        stand.attended = False
+
+    def _trip(self, fault: Fault) -> None:
+        if self.guest is None:
+            return self._hold(fault)
+        return self.guest.trip(fault)
+
+    def _hold(self, fault: Fault) -> None:
+        self.assembly.stand.gate.hold(INTERLOCK)
+        if self.guest is not None:
+            self.guest.hold(fault)
+
+    def _frames_are_due(self) -> bool:
+        """From the camera, which is powered."""
+        return self.assembly.stand.imaging.supply.is_on and self.guest is not None and self.guest.frames_to_come
+
+    def _on_gate(self, reason: str, held: bool) -> None:
+        """An operator has cleared the interlock: the guard's hold is over. Of a folder that is lost another one is
+        made."""
+        if reason == INTERLOCK and not held:
+            self.assembly.stand.chamber.permits.forgive()
+            self.assembly.stand.safety.forgive()
+            if self.recorder is not None:
+                self.recorder.refound()
+            self.guard.clear()
+
+
+class _Recorded:
+    """What the guard asks of the recording, whichever that is."""
+
+    def __init__(self, house: House) -> None:
+        self._house = house
+
+    @property
+    def waiting_since_ns(self) -> int | None:
+        return None if self._house.recorder is None else self._house.recorder.waiting_since_ns
+
+    @property
+    def folder_lost(self) -> str:
+        return "" if self._house.recorder is None else self._house.recorder.folder_lost
+
+    @property
+    def writer_ended(self) -> str:
+        return "" if self._house.recorder is None else self._house.recorder.writer_ended
+
+
+@asynccontextmanager
+async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_one: bool) -> AsyncGenerator[House]:
+    """The stand, open and harmless: heat and cold have lost what permission somebody left them, the flap is closed and
+    the relay board's timer tested. Everything is closed at the end; what moves has to be safe before that.
+
+    Raises what opening raises; what answered until then was made safe.
+    """
+    async with AsyncExitStack() as stack:
+        disk = None if isinstance(assembly.clock, VirtualClock) else Disk()
+        if disk is not None:
+            stack.callback(disk.close)
+            assembly.stand.chamber.compressor_file.through(disk.line(FILES_LINE).run)
+        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
+        house = House(assembly, disk, is_for_one=is_for_one)
+        stack.push_async_callback(cancelled, house.background)
+        if time is not None:
+            house.background.append(asyncio.create_task(time()))
+        stack.push_async_callback(_close, assembly)
+        stack.callback(assembly.stand.gate.let_go)
+        stack.push_async_callback(stop.settled)
+        stop.watch(assembly.stand)
+        await house.or_safe(_open(assembly), stop)
+        yield house
+
+
+async def _open(assembly: Assembly) -> None:
+    """Connect everything; nothing may heat, cool or move before that."""
+    devices, stand = assembly.devices, assembly.stand
+    await assembly.bus.open()
+    await devices.relays.open()
+    stand.opened(devices.relays)
+    await stand.chamber.permits.withdraw_left_on()
+    await devices.regulator.open()
+    stand.opened(devices.regulator)
+    await devices.regulator.stop()
+    await devices.thermometers.open()
+    await devices.flap.open()
+    stand.opened(devices.flap)
+    await devices.flap.move_closed()
+    for axis in devices.axes.values():
+        await axis.open()
+        stand.opened(axis)
+    await stand.chamber.test_dead_man()
+
+
+async def _close(assembly: Assembly) -> None:
+    devices = assembly.devices
+    for device in (*devices.cameras.values(), *devices.axes.values(), devices.flap):
+        with suppress(StandError):  # closing never decides a run, and one device must not keep the next from it
+            await device.close()
+    await assembly.bus.close()
