@@ -88,9 +88,10 @@ class Daemon:
         self.wait()
 
     def wait(self):
-        """Its exit code."""
-        self.lives_for(sys.maxsize)
-        self._process.stdout.close()
+        """Its exit code; may be asked again."""
+        if not self._process.stdout.closed:
+            self.lives_for(sys.maxsize)
+            self._process.stdout.close()
         return self._process.wait()
 
 
