@@ -32,11 +32,12 @@ class ConfigError(StandError):
 
 
 class DeviceError(StandError):
-    """A device failed; `device` is its configured name."""
+    """A device failed; `device` is its configured name, `text` what it did."""
 
     def __init__(self, device: str, text: str) -> None:
         super().__init__(f"{device}: {text}")
         self.device = device
+        self.text = text
 
 
 class Unreachable(DeviceError):

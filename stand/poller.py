@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.devices.protocols import Sensor
-from foundation.clock import Clock, seconds_ns
+from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError
 from foundation.hub import Hub
 from foundation.items import Batch, Event
@@ -35,6 +35,7 @@ class Poller:
     def __post_init__(self) -> None:
         self._known: tuple[Reading, ...] = ()
         self._failing = False
+        self._lost_ns = 0
         self._ask_again = False
 
     async def first(self) -> None:
@@ -60,7 +61,10 @@ class Poller:
         self._ask_again = False
         if self._failing:
             self._failing = False
-            self.hub.publish(Event(self.clock.now_ns(), "info", "device_back", f"{self.sensor.name} answers again"))
+            now_ns, name = self.clock.now_ns(), self.sensor.name
+            lost_s = round((now_ns - self._lost_ns) / NS_PER_S, 3)
+            data: dict[str, object] = {"device": name, "lost_s": lost_s}
+            self.hub.publish(Event(now_ns, "info", "device_back", f"{name} answers again after {lost_s:g} s", data))
         self._publish(readings)
 
     def _publish(self, readings: tuple[Reading, ...]) -> None:
@@ -72,7 +76,8 @@ class Poller:
         self._ask_again = error.retryable
         cause: Cause = "wire" if error.retryable else "device"
         if not self._failing:
-            self._failing = True
-            self.hub.publish(Event(now_ns, "warning", "device_lost", reason))
+            self._failing, self._lost_ns = True, now_ns
+            data: dict[str, object] = {"device": self.sensor.name, "error": type(error).__name__, "cause": cause}
+            self.hub.publish(Event(now_ns, "warning", "device_lost", reason, data))
         bad = tuple(bad_reading(reading.channel, reading.unit, now_ns, reason, cause) for reading in self._known)
         self.hub.publish(Batch(self.sensor.name, now_ns, bad))

@@ -6,18 +6,16 @@ import random
 import time
 from dataclasses import dataclass, field
 
-LATE_S = 0.5
-
 
 @dataclass
 class LinkFaults:
     """What happens to replies on one wire. Probabilities are 0..1 per reply; seeded, so that a run repeats.
 
     silent: no reply leaves. drop, flip, cut, junk: probabilities of losing the reply, flipping one bit, sending only
-    its first half, sending 7 random bytes before it; late: of sending it LATE_S late. delay_s: real seconds of lateness
-    of every reply (a wire time, not a simulated one); late_s: of the next one alone. garbled: how many of the coming
-    replies lose their second half. echo: the request comes back before the reply (a badly wired RS-485 adapter).
-    byte_by_byte: one write a byte. `injected` counts what was done, by name.
+    its first half, sending 7 random bytes before it; late: of sending it late_by_s late. delay_s: real seconds of
+    lateness of every reply (a wire time, not a simulated one); late_s: of the next one alone. garbled: how many of the
+    coming replies lose their second half. echo: the request comes back before the reply (a badly wired RS-485
+    adapter). byte_by_byte: one write a byte. `injected` counts what was done, by name.
     """
 
     seed: int = 0
@@ -29,6 +27,7 @@ class LinkFaults:
     delay_s: float = 0.0
     late_s: float = 0.0
     late: float = 0.0
+    late_by_s: float = 0.5
     garbled: int = 0
     echo: bool = False
     byte_by_byte: bool = False
@@ -49,7 +48,7 @@ class LinkFaults:
             self._count("late")
             time.sleep(late_s)  # noqa: TID251 - as above
         if self._chance(self.late, "late"):
-            time.sleep(LATE_S)  # noqa: TID251 - as above
+            time.sleep(self.late_by_s)  # noqa: TID251 - as above
         if self.garbled > 0:
             self.garbled -= 1
             self._count("garbled")

@@ -102,6 +102,11 @@ class Bus:
         self._free_s = 0.0  # time.monotonic() from which the line may be used again
         self._suspect = False  # an error whose late bytes have not been flushed away yet
 
+    @property
+    def is_up(self) -> bool:
+        """Whether the port or connection itself works, as far as is known."""
+        return not self._line_fault
+
     async def open(self) -> None:
         """Open the port or connection; raises Unreachable with the reason. Later losses are reopened by themselves."""
         if self._lane is None:

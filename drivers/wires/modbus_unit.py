@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Iterable
 
 from drivers.wires.bus import Bus
 from drivers.wires.registers import Block, Command, RegisterMap, Snapshot, decode, decode_blocks, encode, plan_blocks
-from foundation.errors import DeviceError, DeviceFault, Refused
+from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 
 WRITE_TRIES = 2
 CONFIRM_LOOKS = 3  # a status bit may lag its command by a scan of the unit
@@ -27,10 +27,15 @@ class ModbusUnit:
         wanted = tuple(names)
         if wanted not in self._plans:
             self._plans[wanted] = plan_blocks(self.map, wanted)
-        replies = {
-            block: await self._bus.read(self.name, self._unit, block.space, block.address, block.count)
-            for block in self._plans[wanted]
-        }
+        try:
+            replies = {
+                block: await self._bus.read(self.name, self._unit, block.space, block.address, block.count)
+                for block in self._plans[wanted]
+            }
+        except Unreachable as error:
+            if self.map.when_silent and self._bus.is_up:
+                raise Unreachable(self.name, f"{error.text}; {self.map.when_silent}") from error
+            raise
         return decode_blocks(self.map, replies)
 
     async def probe(self) -> None:

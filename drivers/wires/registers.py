@@ -131,12 +131,14 @@ class Probe(Document):
 
 
 class RegisterMap(Document):
-    """All that is known about one kind of unit. `fault_bits`: bits that mean trouble, reported as they are."""
+    """All that is known about one kind of unit. `fault_bits`: bits that mean trouble, reported as they are.
+    `when_silent`: what to look at when it does not answer."""
 
     schema_: Literal["regmap/1"] = Field(alias="schema")
     vendor: str
     model: str
     source: str
+    when_silent: str = ""
     transport: Transport
     probe: tuple[Probe, ...] = ()
     points: dict[str, Point] = Field(min_length=1)
