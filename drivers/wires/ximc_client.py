@@ -2,7 +2,9 @@
 
 A late or damaged reply is never credited to another request: after any error zeros are sent, and since the controller
 answers in order, the zeros that come back are behind everything that was still on its way (facts: libximc protocol.xi,
-8SMC5-USB manual chapter 6.2).
+8SMC5-USB manual chapter 6.2). Each request has a zero in front as well, whose echo comes between what was on its way
+before and the answer: a frame without it is no answer to this request. A controller that does not echo the zero of the
+first request on a link is spoken to without them.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from drivers.wires.ximc import ERROR_SIZES, Damage, Frame, decode, encode
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 READ_RETRIES = 2
+_MARK = b"\0"
 _RESYNC_BURSTS = 4
 _RESYNC_ZEROS = bytes(64)
 # So many zeros in a row are an echo: no reply of ours holds more than 29 (GETS at rest, no supply), a break on the line
@@ -35,6 +38,7 @@ class XimcClient:
         self._connect = connect
         self._timeout_s = timeout_s
         self._link: ByteLink | None = None
+        self._echoes: bool | None = None  # whether this link's controller echoes a zero; None when not yet known
         self.errors = 0
 
     @property
@@ -61,7 +65,7 @@ class XimcClient:
         """Let go of the link; may be called twice."""
         if self._link is not None:
             self._link.close()
-        self._link = None
+        self._link = self._echoes = None
 
     def _exchange(self, letters: str, payload: bytes, reply_size: int) -> bytes:
         """One request and its reply; anything else is an error, and the line is clean again when it is raised."""
@@ -70,10 +74,13 @@ class XimcClient:
             if link.read(0.0).strip(b"\0"):  # unrequested, and more may follow
                 self.errors += 1
                 self._resync(link)
-            link.write(encode(letters, payload))
-            frame, rest = self._receive(link, letters, reply_size)
+            link.write((b"" if self._echoes is False else _MARK) + encode(letters, payload))
+            frame, rest, is_marked = self._receive(link, letters, reply_size)
             if frame is not None and (frame.letters, frame.damage) == (letters, Damage.NONE) and not rest.strip(b"\0"):
-                return frame.payload
+                if self._echoes is None:
+                    self._echoes = is_marked
+                if is_marked or not self._echoes:
+                    return frame.payload
             self.errors += 1
             self._resync(link)
         except Unreachable:
@@ -81,13 +88,15 @@ class XimcClient:
             raise
         raise self._complaint(letters, frame)
 
-    def _receive(self, link: ByteLink, letters: str, reply_size: int) -> tuple[Frame | None, bytes]:
-        """The first frame and what came with it; no frame when none was complete in time."""
+    def _receive(self, link: ByteLink, letters: str, reply_size: int) -> tuple[Frame | None, bytes, bool]:
+        """The first frame, what came with it, and whether zeros came before it; no frame when none was complete in
+        time."""
         deadline_s = time.monotonic() + self._timeout_s
-        frame, received = None, b""
+        frame, received, first = None, b"", b""
         while frame is None and (data := _read_before(link, deadline_s)):
+            first = first or data[:1]
             frame, received = decode(received + data, {**ERROR_SIZES, letters: reply_size})
-        return frame, received
+        return frame, received, first == _MARK
 
     def _resync(self, link: ByteLink) -> None:
         """Zeros until they come back, then drop what is left; Unreachable when they do not."""
@@ -114,7 +123,7 @@ class XimcClient:
         if frame.letters == "errd":
             return GarbledReply(self._device, f"the controller received {letters} damaged")
         if frame.damage is Damage.NONE:
-            return GarbledReply(self._device, f"more came than the answer to {letters}")
+            return GarbledReply(self._device, f"more came than the answer to {letters}, or an earlier answer")
         return GarbledReply(self._device, f"the answer to {letters} was {frame.letters!r} ({frame.damage.name})")
 
 

@@ -30,7 +30,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import cache
 from typing import Literal, cast
+
+from pydantic import TypeAdapter, ValidationError
 
 from foundation.errors import SessionError
 from recording.reading.journal_lines import JOURNAL_NAME, journal_line, lines_of
@@ -228,10 +231,20 @@ def read_lines(data: bytes) -> tuple[list[Written], int]:
 
 
 def decoded(text: bytes) -> Written:
-    """The entry in a sound line; SessionError when it is not known here."""
+    """The entry in a sound line; SessionError when it is not known here, or holds values of other types."""
     try:
         values = cast("dict[str, object]", json.loads(text))
-        kind = _WRITTEN[cast("str", values.pop("entry"))]
-        return kind(**values)  # pyright: ignore[reportArgumentType] - a CRC vouches for what was written here
+        return _adapter(cast("str", values.pop("entry"))).validate_python(values)
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
+        if any(fault["type"] in ("missing", "unexpected_keyword_argument") for fault in error.errors()):
+            raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({wrong})") from error
+        raise SessionError(f"{JOURNAL_NAME}: no run has written such entries ({wrong}); begin a new run") from error
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({text[:80]!r})") from error
+
+
+@cache
+def _adapter(name: str) -> TypeAdapter[Written]:
+    """Checks the values of the entries of this name; LookupError when there are none."""
+    return TypeAdapter(_WRITTEN[name])

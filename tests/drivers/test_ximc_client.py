@@ -32,9 +32,11 @@ class Controller:
     """Answers `gpos` with the number of the request, every other request with its letters, zeros with zeros.
 
     faults: for the coming requests, in order. `held` is what comes out before the next answer or echo of zeros.
+    `echoes_marks`: the zeros in front of a request come back, too.
     """
 
     def __init__(self) -> None:
+        self.echoes_marks = True
         self.requests: list[bytes] = []
         self.faults: deque[Fault] = deque()
         self.echoes: deque[Fault] = deque()  # for the coming bursts of zeros
@@ -44,10 +46,11 @@ class Controller:
         if not data.strip(b"\0"):
             held = self._released()
             return held + (self.echoes.popleft()(data) if self.echoes else data)
-        self.requests.append(data)
-        letters = data[:4].decode()
+        request = data.lstrip(b"\0")
+        self.requests.append(request)
+        letters = request[:4].decode()
         payload = POSITION.pack(len(self.requests), 0, 0) if letters == "gpos" else b""
-        held = self._released()
+        held = self._released() + (data[: -len(request)] if self.echoes_marks else b"")
         reply = encode(letters, payload)
         return held + (self.faults.popleft()(reply) if self.faults else reply)
 
@@ -249,6 +252,28 @@ def test_zeros_that_end_a_late_answer_are_not_taken_for_the_echo(hurried: XimcCl
     controller.faults.append(silence)
     controller.echoes.append(first_part)
     assert position(hurried) == len(controller.requests)
+
+
+def test_a_second_copy_of_an_answer_is_not_taken_for_the_next_one_whenever_it_comes(
+    client: XimcClient, controller: Controller
+) -> None:
+    """Here behind the next request, whose answer has the same letters."""
+    copy = encode("gpos", POSITION.pack(1, 0, 0))
+    assert position(client) == 1
+    controller.held = copy
+    assert position(client) == len(controller.requests) == 3
+    controller.held = b"move"
+    with pytest.raises(GarbledReply, match="or an earlier answer"):
+        client.command("move", MOVE_PAYLOAD)
+    assert position(client) == len(controller.requests)
+
+
+def test_a_controller_that_echoes_no_single_zeros_is_spoken_to_without_them(
+    client: XimcClient, controller: Controller
+) -> None:
+    controller.echoes_marks = False
+    assert [position(client) for _ in range(3)] == [1, 2, 3]
+    assert client.errors == 0
 
 
 def test_bytes_that_nobody_asked_for_are_dropped_before_the_next_request(

@@ -55,12 +55,13 @@ class Tap:
     def feed(self, data: bytes) -> bytes:
         if not data.strip(b"\0"):
             return self._engine.feed(data)
-        letters = data[:4].decode()
+        letters = data.lstrip(b"\0")[:4].decode()
         self.requests.append(letters)
         if self.lost_requests.get(letters, 0) > 0:
             self.lost_requests[letters] -= 1
             return b""
-        reply = data[:4] if letters in self.ignored else self._engine.feed(data)
+        acknowledged = data[: data.index(letters.encode()) + 4]  # the zero in front, too
+        reply = acknowledged if letters in self.ignored else self._engine.feed(data)
         if self.lost_replies.get(letters, 0) > 0:
             self.lost_replies[letters] -= 1
             return b""
