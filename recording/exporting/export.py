@@ -3,7 +3,8 @@
     OUT/README.txt                   what is where, and how cells are to be read
     OUT/session.json                 the metadata
     OUT/attachments/config.yaml ...  the attached files
-    OUT/steps.csv, OUT/events.csv
+    OUT/steps.csv, OUT/events.csv    and OUT/notes.csv, what people said of it
+    OUT/frames.csv                   every frame with its role, set-point, temperatures and stages (or .parquet)
     OUT/telemetry/chamber_state.csv  one table per topic (or .parquet), and camera_meta: the descriptions of all frames
     OUT/frames/000001.png, .txt      each frame in order of time, and its temperatures: "each captured frame also had
                                      the temperature information (as a separate file saved with the frame)"
@@ -31,6 +32,7 @@ from foundation.errors import SessionError
 from foundation.files import new_folder
 from foundation.items import Batch
 from foundation.readings import Reading
+from recording.exporting.frames_file import frames_rows
 from recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
 from recording.exporting.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format
 from recording.format import messages
@@ -39,6 +41,7 @@ from recording.format.images import decode_image
 from recording.format.png import SIGNATURE, encode_png
 from recording.format.records import Message, telemetry_messages
 from recording.format.utc_offsets import UtcOffsets
+from recording.reading.notes import read_notes
 from recording.reading.session import RecordedImage, Session
 
 TIME_COLUMNS = (Column("time_ns", "ns"), Column("time_utc", "utc"))
@@ -58,6 +61,7 @@ STEP_COLUMNS = (
     *(Column(name, "text") for name in ("step_id", "index", "kind", "state", "parameters_json")),
 )
 EVENT_COLUMNS = (*TIME_COLUMNS, *(Column(name, "text") for name in ("level", "kind", "text", "data_json")))
+NOTE_COLUMNS = (Column("time_ns", "ns"), *(Column(name, "text") for name in ("by", "kind", "text")))
 
 
 README = """What is here was exported from a recorded session of a thermal test stand by `stand session export`.
@@ -65,6 +69,8 @@ README = """What is here was exported from a recorded session of a thermal test 
 session.json              what the session is: recipe, camera, operator, version, start
 attachments/              configuration, recipe and target, as they were recorded
 steps.csv, events.csv     what was done, and what happened
+notes.csv                 what people said of it, if anybody did
+frames.csv (or .parquet)  every frame: its file, when, what for, set-point, temperatures, stages (columns below)
 telemetry/                one table for each topic; camera_meta describes every frame
 frames/000001.png, .txt   each frame in order of time, and the temperatures at its time; index.csv has all of these
 
@@ -72,6 +78,11 @@ Times    time_ns is the stand's clock, in ns since 1970: it never steps, so take
          the computer had it at that moment.
 Values   An empty cell is what the device does not measure; nan is what it could not measure, and remarks says why.
          Units are in the names of the columns. A number is the shortest text that reads back as the same number.
+Frames   Columns of frames.csv: file (the image here, else the recorded segment that has it); camera; step_id, the step
+         of the plan that took it; role, what for; superseded, yes when the capture was begun again later;
+         set_point_degC of the chamber; camera_temperature_degC, the camera's own; for each thermometer the last
+         reading (NAME_degC, in degrees Celsius) and how old it was (NAME_age_s, in seconds); NAME_position_mm or
+         NAME_position_deg of each stage, in millimetres or degrees, interpolated to the middle of the exposure.
 Texts    Cells of the CSV tables are safe for spreadsheets, also of a stranger's session. A text that a spreadsheet
          would take for a formula (its first character, spaces aside, is one of = + - @) has an apostrophe (') before
          it: take that away to have the text as it was recorded. Control characters and those that turn the direction
@@ -103,6 +114,8 @@ def export(
             _write_telemetry(session, folder / "telemetry", telemetry, work)
         if frames:
             _write_frames(session, folder / "frames", work)
+        if session.frame_count:
+            _write_frames_table(session, folder, frames, telemetry or "csv")
 
 
 class _Work:
@@ -147,6 +160,16 @@ def _write_facts(session: Session, folder: Path) -> None:
             for e in session.events()
         ),
     )
+    if rows := list(_note_rows(session)):
+        _write_csv(folder / "notes.csv", NOTE_COLUMNS, rows)
+
+
+def _note_rows(session: Session) -> Iterator[Sequence[Cell]]:
+    said = read_notes(session.path)
+    for note in said.notes:
+        yield (note.time_ns, note.by, "note", note.text)
+    for tag in said.tags:
+        yield (None, None, "tag", tag)
 
 
 def _json(fields: Mapping[str, object]) -> str:
@@ -258,6 +281,14 @@ def _write_frames(session: Session, folder: Path, work: _Work) -> None:
             (folder / f"{name}.txt").write_text(sidecar_text(stand.columns, facts), encoding="utf-8")
             index.add(facts)
             work.done(len(image.data), f"frame {number} of {session.frame_count}")
+
+
+def _write_frames_table(session: Session, folder: Path, has_images: bool, table_format: TableFormat) -> None:
+    names = [f"frames/{number:06d}.png" for number in range(1, session.frame_count + 1)] if has_images else None
+    columns, rows = frames_rows(session, names)
+    with closing(TABLES[table_format](folder / f"frames.{table_format}", columns)) as table:
+        for row in rows:
+            table.add(row)
 
 
 def _png(image: RecordedImage) -> bytes:

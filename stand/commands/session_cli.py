@@ -21,6 +21,7 @@ from foundation.items import Event, Item, StepMark
 from foundation.progress import Report, late_progress, progress
 from foundation.usage import OneLineUsage, one_line
 from recording.exporting.export import export
+from recording.exporting.one_file import export_mcap
 from recording.exporting.replay import ReplayClock, replay, replay_and_record
 from recording.exporting.trim import trim
 from recording.format.damage import FileDamaged
@@ -221,20 +222,25 @@ async def _replay(session: Session, begin_ns: int, speed: float | None, watch: C
 def export_session(
     directory: SessionArgument,
     out: OutOption,
-    table_format: Annotated[Literal["csv", "parquet"], typer.Option("--format", help="Of the telemetry's tables.")] = (
-        "csv"
-    ),
+    table_format: Annotated[
+        Literal["csv", "parquet", "mcap"],
+        typer.Option("--format", help="Of the tables; mcap: all of it in one file for viewers, OUT."),
+    ] = "csv",
     frames: Annotated[bool, typer.Option("--frames/--no-frames", help="Images with their temperatures.")] = True,
     telemetry: Annotated[bool, typer.Option("--telemetry/--no-telemetry", help="Tables of every topic.")] = True,
     incomplete: IncompleteOption = False,
 ) -> None:
-    """A session as PNG files with their temperatures, and its telemetry as tables.
+    """A session as PNG files with their temperatures, and its telemetry as tables; or as one MCAP file.
 
     Example: stand session export sessions/20260101T180000Z-thermal-cycle --out night --format parquet
     """
     with one_line_errors():
         _check_new(out, directory)
         with _session_to_use(directory, incomplete) as session, late_progress("export", 1.0) as report:
+            if table_format == "mcap":
+                export_mcap(session, out, frames=frames, telemetry=telemetry, report=report)
+                typer.echo(out)
+                return
             tables = table_format if telemetry else None
             export(session, out, frames=frames, telemetry=tables, report=report)
         typer.echo(out)

@@ -11,7 +11,7 @@ from pathlib import Path
 from foundation.errors import SessionError, StandTripped
 from stand.estimating.estimate import price
 from stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
-from stand.running.order import Order, parse_order
+from stand.running.order import Order, parse_order, with_register_maps
 
 
 def order_of(entry: Entry) -> Order:
@@ -20,7 +20,7 @@ def order_of(entry: Entry) -> Order:
     names = {"config.yaml": entry.config, "recipe.yaml": entry.recipe, "target.yaml": "its target"}
     order = parse_order(texts, {key: f"run {entry.id} of the queue: {name}" for key, name in names.items()})
     price(order.recipe.plan(), order.config)
-    return order
+    return with_register_maps(order)
 
 
 def queued(directory: Path) -> Queue:

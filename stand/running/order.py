@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from drivers.wires.registers import load_register_map
 from experiments.sequence import checked
@@ -16,12 +16,16 @@ from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.estimate import price
 
+_MAPPED = ("regulator", "relays", "thermometer_module")  # the devices of a stand that have a register map
+_REGISTERS = "registers-{}.yaml"  # its name in a session
+
 
 @dataclass(frozen=True, slots=True)
 class Order:
     """What to run: the checked files and their texts (they are attached to the recording). attended: somebody is there
     to do what the plan prompts for. at_configured_addresses: the laboratory of a virtual run answers there instead of
-    at free addresses, for a program that has to find it."""
+    at free addresses, for a program that has to find it. register_texts: the register maps, by names of attachments; a
+    session that was recorded without them has none."""
 
     config: StandConfig
     recipe: Recipe
@@ -30,10 +34,12 @@ class Order:
     target_text: str
     attended: bool = False
     at_configured_addresses: bool = False
+    register_texts: Mapping[str, str] = field(default_factory=dict[str, str])
 
     def attachments(self) -> dict[str, str]:
         """The texts by the names under which a session has them."""
-        return {"config.yaml": self.config_text, "recipe.yaml": self.recipe_text, "target.yaml": self.target_text}
+        texts = {"config.yaml": self.config_text, "recipe.yaml": self.recipe_text, "target.yaml": self.target_text}
+        return texts | dict(self.register_texts)
 
 
 def load_order(recipe: str, config: str) -> Order:
@@ -43,11 +49,19 @@ def load_order(recipe: str, config: str) -> Order:
     paths["target.yaml"] = packaged("targets", load_config(paths["config.yaml"]).target)
     texts = {name: read_document(path) for name, path in paths.items()}
     order = parse_order(texts, {name: str(path) for name, path in paths.items()})
-    stand = order.config
-    for registers in (stand.regulator.registers, stand.relays.registers, stand.thermometer_module.registers):
-        load_register_map(packaged("registers", registers))
-    price(order.recipe.plan(), stand)
+    order = with_register_maps(order)
+    price(order.recipe.plan(), order.config)
     return order
+
+
+def with_register_maps(order: Order) -> Order:
+    """The order with the register maps as they are now; ConfigError when one is wrong."""
+    texts: dict[str, str] = {}
+    for name in _MAPPED:
+        path = packaged("registers", getattr(order.config, name).registers)
+        load_register_map(path)
+        texts[_REGISTERS.format(name)] = read_document(path)
+    return replace(order, register_texts=texts)
 
 
 def check_plan(plan: Iterable[PlannedStep], config: StandConfig) -> None:
@@ -70,6 +84,7 @@ def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:
         texts["config.yaml"],
         texts["recipe.yaml"],
         texts["target.yaml"],
+        register_texts={name: texts[name] for name in map(_REGISTERS.format, _MAPPED) if name in texts},
     )
     parse_document(order.target_text, Target, names["target.yaml"])
     return order

@@ -14,12 +14,13 @@ from mcap.writer import CompressionType
 from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
 from foundation.instants import utc_text
-from foundation.items import Batch, Event
+from foundation.items import Batch, Event, StepMark
 from foundation.readings import Reading, bad_reading
 from recording.exporting.export import export
 from recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
 from recording.format.images import CAMERA_IMAGE, ImageEncoding
 from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.notes import add_note, add_tags
 from recording.reading.session import Session
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
@@ -229,6 +230,7 @@ async def test_steps_events_metadata_and_attachments_are_there(tmp_path):
         "README.txt",
         "attachments",
         "events.csv",
+        "frames.csv",
         "session.json",
         "steps.csv",
     ]
@@ -332,6 +334,7 @@ from pathlib import Path
 from recording.exporting.export import export
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
+from recording.reading.notes import add_note, add_tags
 from recording.reading.session import Session
 from recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
 export(Session.open(Path(sys.argv[1])), Path(sys.argv[2]), telemetry="parquet", report=print)
@@ -350,3 +353,61 @@ async def test_without_pyarrow_parquet_is_refused_with_a_sentence(tmp_path):
         "Parquet needs pyarrow, which is not installed: pip install 'thermostand[parquet]', or choose CSV"
     )
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("table_format", "images"), [("csv", True), ("parquet", True), ("csv", False)])
+async def test_one_table_has_a_row_for_each_frame(tmp_path, table_format, images):
+    session, out = await exported(tmp_path, telemetry=table_format, frames=images)
+    rows = (csv_rows if table_format == "csv" else parquet_rows)(out / f"frames.{table_format}")
+    table = session.frames_table()
+    assert [int(row["time_ns"]) for row in rows] == session.frame_times_ns.tolist()
+    assert [row["step_id"] for row in rows] == table.step_id.tolist()
+    for column, values in (
+        ("camera_temperature_degC", table.camera_degC),
+        ("set_point_degC", table.chamber_degC),
+        ("linear_position_mm", table.positions.get("linear")),
+        ("rotary_position_deg", table.positions.get("rotary")),
+    ):
+        if values is not None:
+            np.testing.assert_array_equal([float(row[column]) for row in rows], values)
+    if images:
+        assert all((out / row["file"]).is_file() for row in rows)
+        assert not images or (out / "frames" / "index.csv").exists()
+    else:
+        assert [row["file"] for row in rows] == table.file.tolist()
+    told = (out / "README.txt").read_text()
+    assert all(name in told for name in ("set_point_degC", "role", "NAME_position_mm", "degrees Celsius"))
+
+
+async def test_role_set_point_and_stages_are_those_of_the_step(tmp_path):
+    def items(time_ns, index):
+        told = {"role": "reference", "chamber_degC": 15.0 + index, "frames": 1}
+        for item in half_second(time_ns, index):
+            yield (
+                StepMark(time_ns, item.step_id, index, item.kind, item.state, told)
+                if isinstance(item, StepMark)
+                else item
+            )
+        for axis, unit in (("linear", "mm"), ("rotary", "deg")):
+            readings = (
+                Reading(f"{axis}.position", 2.0 * index, unit, time_ns),
+                Reading(f"{axis}.moving", 0, "1", time_ns),
+            )
+            yield Batch(axis, time_ns, readings)
+
+    _, out = await exported(tmp_path, count=4, items=items)
+    rows = csv_rows(out / "frames.csv")
+    assert [row["role"] for row in rows] == ["reference"] * 4
+    assert [float(row["set_point_degC"]) for row in rows] == [15.0, 16.0, 17.0, 18.0]
+    assert {"linear_position_mm", "rotary_position_deg"} <= rows[0].keys()
+
+
+async def test_notes_and_tags_are_exported(tmp_path):
+    await record(tmp_path / "s", 2)
+    add_note(tmp_path / "s", "=SUM(A1)", "eva", START_NS)
+    add_tags(tmp_path / "s", ["paper"], "eva", START_NS)
+    export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
+    assert [(row["kind"], row["text"]) for row in csv_rows(tmp_path / "out" / "notes.csv")] == [
+        ("note", "'=SUM(A1)"),
+        ("tag", "paper"),
+    ]

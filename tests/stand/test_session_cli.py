@@ -298,9 +298,17 @@ def test_export_writes_images_and_tables(session: Path, tmp_path: Path):
         "README.txt",
         "attachments",
         "events.csv",
+        "frames.csv",
         "session.json",
         "steps.csv",
     ]
+
+
+def test_export_writes_one_file_for_a_viewer(session: Path, tmp_path: Path):
+    out = tmp_path / "night.mcap"
+    assert ask("export", session, "--out", out, "--format", "mcap").stdout == f"{out}\n"
+    assert out.read_bytes()[:5] == b"\x89MCAP"
+    assert "exists already" in refused("export", session, "--out", out, "--format", "mcap")
 
 
 def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):

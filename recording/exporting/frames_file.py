@@ -1,0 +1,65 @@
+"""The table of all frames, one row each: when, what for, at which set-point, how warm it was, where the table stood."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from recording.exporting.sidecar import StandTemperatures
+from recording.exporting.tables import Cell, Column
+from recording.format import messages
+from recording.format.records import telemetry_messages
+from recording.reading.session import Session
+
+_FIRST = (
+    Column("file", "text"),
+    Column("time_utc", "utc"),
+    Column("time_ns", "ns"),
+    Column("camera", "word"),
+    Column("step_id", "word"),
+    Column("role", "word"),
+    Column("superseded", "word"),
+    Column("set_point_degC", "value"),
+    Column("camera_temperature_degC", "value"),
+)
+_AXIS = messages.KINDS["axis"]
+
+
+def frames_rows(session: Session, file_of: Sequence[str] | None) -> tuple[tuple[Column, ...], Iterator[Sequence[Cell]]]:
+    """The columns and the rows of F frames in order of time. file_of: F names of exported images; without them `file`
+    is the segment that has the image."""
+    table, stand = session.frames_table(), StandTemperatures(session)
+    units = _axis_units(session, len(table.positions))
+    axes = [Column(f"{axis}_position{'_' + units[axis] if axis in units else ''}", "value") for axis in table.positions]
+
+    def rows() -> Iterator[Sequence[Cell]]:
+        for place in range(len(table)):
+            time_ns = int(table.time_ns[place])
+            yield (
+                str(table.file[place]) if file_of is None else file_of[place],
+                session.utc.utc_ns(time_ns),
+                time_ns,
+                str(table.camera[place]),
+                str(table.step_id[place]),
+                str(table.role[place]),
+                "yes" if table.superseded[place] else "no",
+                float(table.chamber_degC[place]),
+                float(table.camera_degC[place]),
+                *stand.at(time_ns),
+                *(float(column[place]) for column in table.positions.values()),
+            )
+
+    return (*_FIRST, *stand.columns, *axes), rows()
+
+
+def _axis_units(session: Session, count: int) -> dict[str, str]:
+    """The unit of each axis's position, mm or deg, as it was recorded first; read until those of `count` are known."""
+    units: dict[str, str] = {}
+    for path in session.telemetry_segments if count else ():
+        for message in telemetry_messages(path, lambda channel: channel.topic == _AXIS.topic):
+            batch = messages.decode_batch(message.topic, message.data, message.time_ns)
+            found = {reading.channel.partition(".")[2]: reading.unit for reading in batch.readings}
+            if "position" in found:
+                units.setdefault(batch.device, found["position"])
+            if len(units) == count:
+                return units
+    return units

@@ -1,0 +1,111 @@
+"""A session as one MCAP file, for viewers that take one: the same messages, in order of time."""
+
+from __future__ import annotations
+
+import heapq
+import os
+from collections.abc import Callable, Iterator
+from operator import attrgetter
+from pathlib import Path
+
+from google.protobuf.message import Message as ProtobufMessage
+from mcap.well_known import MessageEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+from foundation.errors import SessionError
+from foundation.files import sync_folder
+from recording.exporting.topics import recorded_topics
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from recording.format.layout import DEVICES, SESSION_METADATA
+from recording.format.records import Message, telemetry_messages
+from recording.reading.notes import NOTES_NAME
+from recording.reading.session import Session
+from recording.writing.segment import Topic
+
+_CHUNK_BYTES = 1 << 22
+_CLASSES: dict[str, type[ProtobufMessage]] = {each.DESCRIPTOR.full_name: each for each in IMAGE_CLASS.values()}
+
+
+def export_mcap(
+    session: Session,
+    out: Path,
+    *,
+    frames: bool = True,
+    telemetry: bool = True,
+    report: Callable[[float, str], None],
+) -> None:
+    """Write `session` as the file `out`, which must not exist; memory stays flat. Images are stored as they are;
+    without images everything is compressed.
+
+    `report` gets the share of the messages that is done (0 to 1). SessionError when the session cannot be read or `out`
+    not be written; `out` then does not appear.
+    """
+    part = out.with_name(f"{out.name}.part")
+    if out.exists() or part.exists():
+        raise SessionError(f"{out if out.exists() else part}: is in the way; remove it or choose another name")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            compression = CompressionType.NONE if frames and session.frame_count else CompressionType.ZSTD
+            writer = Writer(file, _CHUNK_BYTES, compression)
+            _write(session, writer, _messages(session, frames, telemetry), report)
+            file.flush()
+            os.fsync(file.fileno())
+        part.rename(out)
+        sync_folder(out.parent)
+    except OSError as error:
+        raise SessionError(f"{out}: cannot be written ({error})") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _write(
+    session: Session,
+    writer: Writer,
+    found: Iterator[tuple[str, Message]],
+    report: Callable[[float, str], None],
+) -> None:
+    writer.start(library="thermostand")
+    for name, text in session.attachments.items():
+        writer.add_attachment(0, 0, name, "application/yaml" if name.endswith(".yaml") else "text/plain", text.encode())
+    notes = session.path / NOTES_NAME
+    if notes.is_file() and not notes.is_symlink():
+        writer.add_attachment(0, 0, NOTES_NAME, "application/jsonl", notes.read_bytes())
+    writer.add_metadata(SESSION_METADATA, session.metadata)
+    topics = {topic.name: topic for topic in recorded_topics(session)}
+    channels: dict[tuple[str, str], int] = {}
+    times = session.frame_times_ns
+    begin_ns, end_ns = (int(times[0]), int(times[-1])) if len(times) else (0, 0)
+    for schema, message in found:
+        key = (message.topic, schema)
+        if key not in channels:
+            channels[key] = _channel(writer, topics.get(message.topic) or Topic(message.topic, _CLASSES[schema]))
+        writer.add_message(channels[key], message.time_ns, message.data, message.time_ns, message.sequence)
+        if end_ns > begin_ns:
+            report(min(1.0, max(0.0, (message.time_ns - begin_ns) / (end_ns - begin_ns))), "messages")
+    writer.finish()
+
+
+def _channel(writer: Writer, topic: Topic) -> int:
+    devices = {DEVICES: ",".join(topic.devices)} if topic.devices else {}
+    return writer.register_channel(
+        topic.name, MessageEncoding.Protobuf, register_schema(writer, topic.message), devices
+    )
+
+
+def _messages(session: Session, frames: bool, telemetry: bool) -> Iterator[tuple[str, Message]]:
+    """(schema of an image, "" for others; message), in order of time as far as each series is."""
+    of_telemetry = (("", each) for each in _telemetry(session)) if telemetry else iter(())
+    of_frames = (
+        ((image.schema, Message(CAMERA_IMAGE, image.sequence, image.time_ns, image.data)) for image in session.images())
+        if frames
+        else iter(())
+    )
+    by_time = attrgetter("time_ns")
+    return heapq.merge(of_telemetry, of_frames, key=lambda each: by_time(each[1]))
+
+
+def _telemetry(session: Session) -> Iterator[Message]:
+    for path in session.telemetry_segments:
+        yield from telemetry_messages(path, lambda channel: True)

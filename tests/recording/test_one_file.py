@@ -1,0 +1,82 @@
+"""A session as one MCAP file: mcap's own reader finds the same messages, in order of time, with what is attached."""
+
+import pytest
+from mcap.reader import make_reader
+
+from foundation.errors import SessionError
+from recording.exporting.one_file import export_mcap
+from recording.reading.notes import add_note
+from recording.reading.session import Session
+from tests.recording.recorded import ATTACHMENTS, images, record, telemetry
+
+
+def silent(done, text):
+    assert 0.0 <= done <= 1.0
+
+
+async def exported(tmp_path, encoding="png", **choices):
+    await record(tmp_path / "s", encoding=encoding)
+    add_note(tmp_path / "s", "windy", "eva", 1)
+    session = Session.open(tmp_path / "s")
+    export_mcap(session, tmp_path / "night.mcap", report=silent, **choices)
+    return session, tmp_path / "night.mcap"
+
+
+def found(path):
+    """(topic, time, sequence, data) of each message, the summary, attachments and metadata, by mcap's reader."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        messages = [
+            (channel.topic, message.log_time, message.sequence, message.data)
+            for _, channel, message in reader.iter_messages(log_time_order=False)
+        ]
+        attachments = {each.name: each.data for each in reader.iter_attachments()}
+        metadata = {each.name: each.metadata for each in reader.iter_metadata()}
+        return messages, reader.get_summary(), attachments, metadata
+
+
+def keys(messages):
+    return [(message.topic, message.time_ns, message.sequence, message.data) for message in messages]
+
+
+@pytest.mark.parametrize("encoding", ["png", "raw"])
+async def test_every_message_is_there_once_in_order_of_time(tmp_path, encoding):
+    session, path = await exported(tmp_path, encoding)
+    messages, summary, attachments, metadata = found(path)
+    assert sorted(messages) == sorted(keys([*telemetry(session), *images(session)]))
+    of_frames = [message for message in messages if message[0] == "/camera/image"]
+    assert [time_ns for _, time_ns, _, _ in of_frames] == session.frame_times_ns.tolist()
+    assert summary.statistics.message_count == len(messages)
+    assert metadata["session"] == session.metadata
+    assert attachments.keys() == {*ATTACHMENTS, "notes.jsonl"}
+    assert list(tmp_path.glob("*.part")) == []
+
+
+async def test_without_images_it_is_the_telemetry_compressed(tmp_path):
+    session, path = await exported(tmp_path, frames=False)
+    messages, summary, _, _ = found(path)
+    assert messages == keys(telemetry(session))
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+
+
+async def test_without_telemetry_it_is_the_images(tmp_path):
+    session, path = await exported(tmp_path, telemetry=False)
+    assert found(path)[0] == keys(images(session))
+
+
+async def test_of_a_damaged_session_nothing_appears(tmp_path):
+    session, path = await exported(tmp_path)
+    path.unlink()
+    segment = session.frame_segments[0]
+    data = bytearray(segment.read_bytes())
+    data[len(data) // 2] ^= 1
+    segment.write_bytes(data)
+    with pytest.raises(SessionError):
+        export_mcap(Session.open(session.path), path, report=silent)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["s"]
+
+
+async def test_what_is_there_is_not_overwritten(tmp_path):
+    session, path = await exported(tmp_path)
+    with pytest.raises(SessionError, match="is in the way"):
+        export_mcap(session, path, report=silent)
