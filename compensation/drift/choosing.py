@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from compensation.drift.candidates import Candidate, as_good_as_best
+from compensation.drift.candidates import NO_MATTER_PX, Candidate
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_fit import check_degree, fit_paper
 from compensation.drift.paper_model import PaperModel
@@ -25,9 +25,9 @@ Fitted = TypeVar("Fitted")
 def fit(observations: Observations, degree: int | None = None, form: Form | None = None) -> DriftModel:
     """The model of these sessions.
 
-    form: None takes the paper's unless the thermal one is better by more than one standard error at temperatures left
-    out; sessions without the telemetry that the thermal form needs have the paper's. degree: of the paper's form, which
-    it implies. The model has the form that was not taken as `other`, where the sessions support it. SessionError when
+    form: None takes the one that predicts better at temperatures left out between others, the paper's if both do;
+    sessions without the telemetry that the thermal form needs have the paper's. degree: of the paper's form, which it
+    implies. The model has the form that was not taken as `other`, where the sessions support it. SessionError when
     they cannot support what was asked for, or a degree was given for thermal.
     """
     check_request(degree, form)
@@ -61,12 +61,19 @@ def _better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
     """By the squares at temperatures left out; each gets the table with the rows of both."""
     both = paper.candidates + thermal.candidates
     in_use = [next(one for one in model.candidates if one.chosen) for model in (paper, thermal)]
-    is_thermal = _comparable(*in_use) and 0 not in as_good_as_best([one.fold_squares for one in in_use])
+    is_thermal = _comparable(*in_use) and _predicts_better(*in_use)
     form = "thermal" if is_thermal else "paper"
     rows = tuple(one.model_copy(update={"chosen": one.chosen and one.form == form}) for one in both)
     if is_thermal:
         return replace(thermal, candidates=rows, other=paper)
     return replace(paper, candidates=rows, other=thermal)
+
+
+def _predicts_better(paper: Candidate, thermal: Candidate) -> bool:
+    """By more than anybody measures, at set-points between others. That the paper's form needs no history does not
+    weigh against its prediction: it is in the file in any case, and `apply` takes it where there is none."""
+    rms_px = [float(np.sqrt(one.squares_between.mean())) for one in (paper, thermal)]
+    return rms_px[1] < rms_px[0] - NO_MATTER_PX
 
 
 def _comparable(one: Candidate, other: Candidate) -> bool:

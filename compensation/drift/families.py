@@ -8,7 +8,9 @@ from itertools import combinations, pairwise
 
 from compensation.drift.terms import POLYNOMIAL, Kind, Term
 
-TAUS_S = tuple(60.0 * minutes for minutes in (4, 6, 8, 11, 15, 20, 27, 37, 50, 70, 100))
+TAUS_S = tuple(60.0 * minutes for minutes in (4, 6, 8, 11, 15, 20, 27, 37, 50, 70, 100, 145, 210, 300, 450))
+"""The slowest are for what creeps, and for a night that begins before all is warm."""
+
 PLAYS_K = (3.0, 6.0, 10.0, 14.0)
 _PLAYS = tuple(Term(Kind.PLAY, radius_K) for radius_K in PLAYS_K)
 _NEIGHBOURS = 1

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means
+from compensation.drift.candidates import NO_MATTER_PX, Candidate, as_good_as_best, between, discrepancy_px, fold_means
 from compensation.drift.displacements import Displacements
 from compensation.drift.facts import facts_of
 from compensation.drift.families import PLAYS_K, TAUS_S, Family, Terms, all_terms, families
@@ -24,7 +24,6 @@ from experiments.steps import Role
 from foundation.errors import SessionError
 
 _FEWEST_FOLDS = 3
-_NO_MATTER_PX = 0.0005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +62,8 @@ def fit_thermal(observations: Observations) -> ThermalModel:
     if not tried:
         raise SessionError("the markers and temperatures do not determine a thermal model")
     rows = trained.fold_rows
-    squares = [fold_means(rows, one.held_out**2).sum(axis=1) for one in tried]
+    inner = between(rows.chamber_degC)
+    squares = [fold_means(rows.where(inner), one.held_out[inner] ** 2).sum(axis=1) for one in tried]
     chosen = min(_as_good(squares), key=lambda index: (len(tried[index].terms), tried[index].bic))
     candidates = tuple(_candidate(trained, one, index == chosen) for index, one in enumerate(tried))
     return _model(problem, tried[chosen], memory.self_heating_K, candidates)
@@ -72,7 +72,7 @@ def fit_thermal(observations: Observations) -> ThermalModel:
 def _as_good(squares: list[Float]) -> set[int]:
     """Within one standard error of the best, or worse by less than anybody measures."""
     rms_px = np.sqrt([own.mean() for own in squares])
-    near = np.flatnonzero(rms_px <= rms_px.min() + _NO_MATTER_PX)
+    near = np.flatnonzero(rms_px <= rms_px.min() + NO_MATTER_PX)
     return set(as_good_as_best(squares)) | set(near.tolist())
 
 
@@ -163,19 +163,11 @@ def _model(problem: _Problem, one: _Tried, heating_K: float, candidates: tuple[C
         reference_features=trained.reference_features[columns],
         coefficients=solution.coefficients,
         coefficient_covariance=solution.covariance.reshape(count, count),
-        discrepancy_px=_discrepancy_px(trained, one.held_out),
+        discrepancy_px=discrepancy_px(trained.fold_rows, one.held_out),
         valid=_range(trained, one.terms),
         has_warm_up=any(term.kind is Kind.POWER_LAG for term in trained.terms),
         candidates=candidates,
     )
-
-
-def _discrepancy_px(trained: Training, held_out: Float) -> Float:
-    """(2,): of the set-points between others. Without the coldest or the warmest the fit has to extrapolate, which the
-    model is flagged for and need not claim to do."""
-    rows = trained.fold_rows
-    between = (rows.chamber_degC > rows.chamber_degC.min()) & (rows.chamber_degC < rows.chamber_degC.max())
-    return discrepancy_px(rows.where(between), held_out[between])
 
 
 def _range(trained: Training, terms: Terms) -> ThermalRange:
