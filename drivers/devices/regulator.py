@@ -19,7 +19,8 @@ QUANTITIES = ("pv", "sp", "mv_heat", "mv_cool")
 
 
 class Regulator:
-    """A heat/cool regulator that does the PID by itself; we give it set points and watch it.
+    """A heat/cool regulator that does the PID by itself; we give it set points and watch it. A set point that the unit
+    wants refreshed (a remote set point) is sent again at each `read`.
 
     It is "ready" while every start-up command of the map is confirmed by its bit (E5CC: communications writing on, RAM
     write mode, so that set points do not wear the EEPROM). When that is lost, or the unit was unreachable and may have
@@ -32,6 +33,11 @@ class Regulator:
         missing += [command for command in ("run", "stop") if command not in register_map.commands]
         if missing or not register_map.safe_state:
             raise ConfigError(f"{name}: register map {register_map.model} lacks {', '.join(missing) or 'safe_state'}")
+        for command in ("run", *register_map.startup):
+            if (point := register_map.commands[command].confirm.point) not in register_map.polled():
+                raise ConfigError(
+                    f"{name}: {point}, which confirms {command}, needs poll: fast in {register_map.model}"
+                )
         self.name = name
         self.start_ups = 0
         self._unit = ModbusUnit(name, bus, register_map)
@@ -41,8 +47,10 @@ class Regulator:
         self._sp_degC: float | None = None  # the set point as the unit took it, to be sent again
         self._start_up_due = True
         self._probe_ns = 0
-        wanted = {AUTOTUNE, *(register_map.commands[name].confirm.bit for name in register_map.startup)}
-        self._status = [name for name, point in register_map.points.items() if wanted & set(point.bits.values())]
+        confirming = {register_map.commands[name].confirm.point for name in register_map.startup}
+        self._status = [
+            name for name, point in register_map.points.items() if name in confirming or AUTOTUNE in point.bits.values()
+        ]
 
     async def open(self) -> None:
         """Probe identity and scaling, enable writing, RAM mode, each confirmed; neither runs nor stops control."""
@@ -65,7 +73,10 @@ class Regulator:
             if not self._ready(snapshot):
                 await self._start_up()
                 snapshot = await self._unit.snapshot(self._map.polled())
-            return self._readings(snapshot)
+            readings = self._readings(snapshot)
+            if self._map.points["sp"].refresh and self._sp_degC is not None:
+                await self._unit.write("sp", self._sp_degC)
+            return readings
 
     async def set_temperature(self, degC: float) -> None:
         """Send a set point and read it back.
@@ -80,7 +91,7 @@ class Regulator:
                 await self._start_up()
             if status.bits.get(AUTOTUNE):
                 raise Occupied(self.name, "autotuning is active; no set point was sent")
-            self._sp_degC = await self._unit.write("sp", degC)
+            self._sp_degC = await self._write_set_point(degC)
 
     async def run(self) -> None:
         """Start control, confirmed."""
@@ -124,9 +135,16 @@ class Regulator:
         await self._probe()
         await self._commands(self._map.startup)
         if self._sp_degC is not None:
-            await self._unit.write("sp", self._sp_degC)
+            await self._write_set_point(self._sp_degC)
         self._start_up_due = False
         self.start_ups += 1
+
+    async def _write_set_point(self, degC: float) -> float:
+        """As the unit took it. One that every write wears is not given the value it has."""
+        wears = self._map.points["sp"].eeprom and not self._map.startup
+        if wears and (await self._unit.snapshot(["sp"])).samples["sp"].value == degC:
+            return degC
+        return await self._unit.write("sp", degC)
 
     async def _probe(self) -> None:
         """The decimal point above all: a constant that also exposes a reply that is not the unit's."""

@@ -76,11 +76,15 @@ class ModbusUnit:
         await self._bus.write_coil(self.name, self._unit, address, raw_value)
 
     async def command(self, command_name: str) -> None:
-        """Send a command of the map and see its bit confirm it."""
+        """Send a command of the map, all its writes in order, and see it confirmed."""
         command = self.map.commands[command_name]
 
         async def send() -> None:
-            await self._bus.write_register(self.name, self._unit, command.address, command.value)
+            for step in command.steps:
+                if self.map.transport.write_fc == 6:
+                    await self._bus.write_register(self.name, self._unit, step.address, step.value)
+                else:
+                    await self._bus.write_registers(self.name, self._unit, step.address, [step.value])
 
         async def holds() -> bool:
             for _ in range(CONFIRM_LOOKS):
@@ -112,5 +116,8 @@ class ModbusUnit:
 
 
 def is_confirmed(command: Command, snapshot: Snapshot) -> bool:
-    """Whether the bit that confirms `command` stands in a snapshot that has read its point."""
-    return snapshot.bits[command.confirm.bit] == command.confirm.is_
+    """Whether what confirms `command` is so in a snapshot that has read its point."""
+    confirm = command.confirm
+    if confirm.equals is not None:
+        return snapshot.samples[confirm.point].value == confirm.equals
+    return snapshot.bits[confirm.bit] == confirm.is_

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 
 from foundation.documents import Document, load_document
 
+_SMALLEST = 1e-30  # a float of exchanged words is next to nothing: 25.0 would be 2.4e-41
 MAX_GAP_WORDS = 4  # reading four words too many costs less than another request
 
 Space = Literal["holding", "input", "coil", "discrete"]
@@ -61,7 +62,8 @@ class Point(Document):
 
     word_order: of 32-bit points, which half comes first. valid: values outside are no measurement. limits: values
     outside are never written. bits: bit number -> name. bad_if: bits that make this point no measurement. eeprom: a
-    write wears the memory unless every start-up command is confirmed.
+    write wears the memory unless every start-up command is confirmed; without such commands it is written only when it
+    differs. refresh: it is written again at each poll, or the unit falls back to a value of its own.
     """
 
     address: Word
@@ -81,6 +83,7 @@ class Point(Document):
     split: Split | None = None
     pulse: Pulse | None = None
     eeprom: bool = False
+    refresh: bool = False
 
     @property
     def words(self) -> int:
@@ -102,25 +105,53 @@ class Point(Document):
             raise ValueError(f"a {self.type} has no bits {sorted(self.bits)}")
         if self.access == "rw" and self.space in ("input", "discrete"):
             raise ValueError(f"space {self.space} cannot be written")
-        if self.access == "r" and (self.limits or self.pulse or self.eeprom):
-            raise ValueError("limits, pulse and eeprom need access: rw")
+        if self.access == "r" and (self.limits or self.pulse or self.eeprom or self.refresh):
+            raise ValueError("limits, pulse, eeprom and refresh need access: rw")
         return self
 
 
 class Confirm(Document):
-    """The bit that shows a command took effect."""
+    """What shows that a command took effect: a bit of a point that `is`, or a point that `equals` a value."""
 
     point: str
-    bit: str
-    is_: bool = Field(alias="is")
+    bit: str = ""
+    is_: bool = Field(default=True, alias="is")
+    equals: float | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if bool(self.bit) == (self.equals is not None):
+            raise ValueError("a command is confirmed by a bit, or by what its point equals")
+        return self
 
 
-class Command(Document):
-    """One register write (FC 06) that makes the unit do something."""
+class Write(Document):
+    """One register written."""
 
     address: Word
     value: Word
+
+
+class Command(Document):
+    """Register writes that make the unit do something: one, `address` and `value`, or `writes`, in their order."""
+
+    address: Word | None = None
+    value: Word | None = None
+    writes: tuple[Write, ...] = ()
     confirm: Confirm
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if (self.address is None) != (self.value is None) or (self.address is None) == (not self.writes):
+            raise ValueError("a command is `address` and `value`, or `writes`")
+        return self
+
+    @property
+    def steps(self) -> tuple[Write, ...]:
+        """What is written, in order."""
+        if self.address is None or self.value is None:
+            return self.writes
+        return (Write(address=self.address, value=self.value),)
 
 
 class Probe(Document):
@@ -178,9 +209,11 @@ class RegisterMap(Document):
         yield from (f"fault_bits: no bit {bit}" for bit in self.fault_bits if bit not in bits)
         yield from (f"probe: no point {probe.point}" for probe in self.probe if probe.point not in self.points)
         for name, command in self.commands.items():
-            point = self.points.get(command.confirm.point)
-            if point is None or command.confirm.bit not in point.bits.values():
-                yield f"commands.{name}.confirm: no bit {command.confirm.bit} in point {command.confirm.point}"
+            confirm, point = command.confirm, self.points.get(command.confirm.point)
+            if confirm.equals is not None and point is None:
+                yield f"commands.{name}.confirm: no point {confirm.point}"
+            elif confirm.bit and (point is None or confirm.bit not in point.bits.values()):
+                yield f"commands.{name}.confirm: no bit {confirm.bit} in point {confirm.point}"
         for name in (*self.startup, *self.safe_state):
             if name not in self.commands:
                 yield f"startup, safe_state: no command {name}"
@@ -279,6 +312,8 @@ def decode(point: Point, words: list[int]) -> Sample:
         if raw == fault.raw:
             return Sample(raw, math.nan, fault.code)
     number = raw if point.type == "bit" else struct.unpack(FORMATS[point.type], raw.to_bytes(2 * len(words), "big"))[0]
+    if point.type == "float32" and 0 < abs(number) < _SMALLEST:
+        return Sample(raw, math.nan, f"{number:g} is no measurement; is word_order {point.word_order} right?")
     value = number * point.scale + point.offset
     if not math.isfinite(value):
         return Sample(raw, math.nan, "not a number")

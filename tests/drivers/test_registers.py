@@ -79,7 +79,7 @@ def test_the_replies_of_an_e5cc_poll_differ_in_length_so_that_a_shifted_one_show
         ("scale: 0.1", "scale: .inf", "points.pv.scale"),
         ("address: 0x12", "address: 0xFFFF", "points.status: runs past address 0xFFFF"),
         ("address: 0x12", "space: coil, address: 0x12", "points.status: type uint32 cannot live in space coil"),
-        ("scale: 0.1", "limits: [0, 1]", "points.pv: limits, pulse and eeprom need access: rw"),
+        ("scale: 0.1", "limits: [0, 1]", "points.pv: limits, pulse, eeprom and refresh need access: rw"),
         ("scale: 0.1", "valid: [9, 1]", "points.pv: valid must be"),
         ("positive: mv_heat", "positive: pv", "split pv is also a point"),
         ("unit: 3", "unit: 0", "transport.unit"),

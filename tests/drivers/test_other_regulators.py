@@ -1,0 +1,216 @@
+"""Regulators of other makes, by their register maps alone, over the wire of a fake of each."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drivers.devices.regulator import Regulator
+from drivers.sim.faults import LinkFaults
+from drivers.sim.modbus import TcpEngine
+from drivers.sim.other_regulators import DEGC, FakeEurotherm, FakeEzZone, FakeF4t, float_words
+from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.wire import TcpWire
+from drivers.wires.bus import Bus, BusSettings
+from drivers.wires.registers import RegisterMap, load_register_map
+from foundation.clock import FollowedClock, WallClock, seconds_ns
+from foundation.documents import parse_document
+from foundation.errors import ConfigError, DeviceFault, Refused, Unreachable
+from foundation.readings import Quality, Reading
+from stand.config.stand_config import packaged
+
+START_NS = 1_700_000_000_000_000_000
+Fake = FakeEurotherm | FakeEzZone | FakeF4t
+FAKES: dict[str, type[Fake]] = {
+    "eurotherm-3200": FakeEurotherm,
+    "watlow-ez-zone": FakeEzZone,
+    "watlow-f4t": FakeF4t,
+}
+
+
+class Bench:
+    """The unit in the simulated chamber, and its driver."""
+
+    def __init__(self, make: str) -> None:
+        self.plant = Plant(PlantSpec(laboratory_swing_K=0.0), START_NS)
+        self.plant.heater_enabled = True
+        self.clock = FollowedClock(START_NS)
+        self.fake = FAKES[make](self.plant, self.clock, 1)
+        if isinstance(self.fake, FakeEzZone):
+            self.fake.comms_unit = DEGC
+
+    def wait(self, duration_s: float) -> None:
+        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        self.fake.handle(b"\x03\x00\x01\x00\x01")
+
+
+@asynccontextmanager
+async def driven(bench: Bench, register_map: RegisterMap) -> AsyncGenerator[Regulator]:
+    wire = TcpWire("127.0.0.1", 0, lambda: TcpEngine([bench.fake]), LinkFaults())
+    bus = Bus("bus", BusSettings(address=wire.address, timeout_s=0.3), WallClock())
+    await bus.open()
+    try:
+        yield Regulator("regulator", bus, register_map, WallClock())
+    finally:
+        await bus.close()
+        wire.close()
+
+
+def map_of(make: str, change: Callable[[str], str] = lambda text: text) -> RegisterMap:
+    return parse_document(change(packaged("registers", make).read_text()), RegisterMap, make)
+
+
+def by_name(readings: tuple[Reading, ...]) -> dict[str, Reading]:
+    return {reading.channel.removeprefix("regulator."): reading for reading in readings}
+
+
+@pytest.mark.parametrize("make", FAKES)
+async def test_another_make_heats_to_its_set_point_and_stops(make: str):
+    bench = Bench(make)
+    async with driven(bench, map_of(make)) as regulator:
+        await regulator.open()
+        await regulator.stop()
+        assert by_name(await regulator.read())["running"].value == 0
+        await regulator.set_temperature(40.0)
+        await regulator.run()
+        for _ in range(360):
+            bench.wait(5.0)
+            if bench.plant.now_ns % seconds_ns(60) == 0:
+                await regulator.read()
+            elif make == "eurotherm-3200":
+                await regulator.read()  # which refreshes its remote set point
+        found = by_name(await regulator.read())
+        assert found["pv"].value == pytest.approx(40.0, abs=2.6)  # half of the fake's proportional band
+        assert found["pv"].value > 35
+        assert found["sp"].value == 40.0
+        assert 0 < found["mv_heat"].value <= 100
+        assert found["mv_cool"].value == 0
+        assert (found["running"].value, found["fault"].value) == (1, 0)
+        await regulator.make_safe()
+        found = by_name(await regulator.read())
+        assert (found["running"].value, found["mv_heat"].value) == (0, 0)
+        bench.wait(1.0)
+        assert bench.plant.heater_on_fraction == 0
+
+
+@pytest.mark.parametrize("make", FAKES)
+async def test_no_set_point_wears_the_memory(make: str):
+    """The F4T has no way to be told not to save: the same set-point again is not sent."""
+    bench = Bench(make)
+    async with driven(bench, map_of(make)) as regulator:
+        await regulator.open()
+        for _ in range(20):
+            await regulator.set_temperature(30.0)
+        assert bench.fake.eeprom_writes == (1 if make == "watlow-f4t" else 0)
+
+
+@pytest.mark.parametrize("make", FAKES)
+async def test_a_make_that_is_silent_says_what_to_look_at(make: str):
+    bench = Bench(make)
+    bench.fake.silent = True
+    async with driven(bench, map_of(make)) as regulator:
+        with pytest.raises(Unreachable, match=r"; is |Modbus"):
+            await regulator.read()
+
+
+async def test_a_remote_set_point_that_is_not_refreshed_is_given_up_for_the_local_one():
+    """What keeps the chamber safe when the computer dies; told by a bit while it lives."""
+    bench = Bench("eurotherm-3200")
+    async with driven(bench, map_of("eurotherm-3200")) as regulator:
+        await regulator.open()
+        await regulator.set_temperature(40.0)
+        await regulator.run()
+        for _ in range(10):
+            bench.wait(5.0)
+            found = by_name(await regulator.read())
+            assert found["fault"].value == 0
+        bench.wait(1800.0)  # the computer is dead
+        assert bench.plant.chamber_degC < 40.0
+        bench.wait(5.0)
+        assert bench.plant.heater_on_fraction == 0  # its local set-point is 20 degC
+        found = by_name(await regulator.read())
+        assert found["fault"].reason == "remote_sp_fail"
+
+
+async def test_eurotherm_sensor_break_makes_the_pv_bad():
+    bench = Bench("eurotherm-3200")
+    async with driven(bench, map_of("eurotherm-3200")) as regulator:
+        await regulator.open()
+        assert isinstance(bench.fake, FakeEurotherm)
+        bench.fake.sensor_break = True
+        found = by_name(await regulator.read())
+        assert (found["pv"].quality, found["pv"].reason) == (Quality.BAD, "sensor_break")
+
+
+async def test_a_unit_that_speaks_degrees_fahrenheit_is_refused():
+    bench = Bench("watlow-ez-zone")
+    assert isinstance(bench.fake, FakeEzZone)
+    bench.fake.comms_unit = 30
+    async with driven(bench, map_of("watlow-ez-zone")) as regulator:
+        with pytest.raises(DeviceFault, match="comms_unit is 30 where the register map expects 15"):
+            await regulator.open()
+
+
+@pytest.mark.parametrize("make", ["watlow-ez-zone", "watlow-f4t"])
+async def test_exchanged_words_are_no_temperature(make: str):
+    bench = Bench(make)
+    assert not isinstance(bench.fake, FakeEurotherm)
+    bench.fake.high_first = True
+    bench.fake.stuck_pv_degC = 25.0  # 41C8 0000: a round number is next to nothing the other way round
+    async with driven(bench, map_of(make)) as regulator:
+        await regulator.open()
+        pv = by_name(await regulator.read())["pv"]
+        assert (pv.quality, "word_order" in pv.reason) == (Quality.BAD, True)
+    async with driven(bench, map_of(make, lambda text: text.replace("low_first", "high_first"))) as regulator:
+        await regulator.open()
+        assert by_name(await regulator.read())["pv"].value == 25.0
+
+
+async def test_a_set_point_that_the_unit_clamps_is_an_error():
+    bench = Bench("watlow-f4t")
+    assert isinstance(bench.fake, FakeF4t)
+    bench.fake.limits_degC = (0.0, 35.0)
+    async with driven(bench, map_of("watlow-f4t")) as regulator:
+        await regulator.open()
+        with pytest.raises(Refused, match="reads back otherwise"):
+            await regulator.set_temperature(40.0)
+
+
+def test_floats_are_those_of_the_manuals():
+    """F4T 25.0: 01 10 0A DE 00 02 04 00 00 41 C8; PM 75.0: .. 00 00 42 96."""
+    assert float_words(25.0) == [0x0000, 0x41C8]
+    assert float_words(75.0) == [0x0000, 0x4296]
+
+
+def test_the_generic_map_shows_every_kind_of_entry_and_loads():
+    register_map = load_register_map(packaged("registers", "generic-modbus"))
+    assert [len(command.steps) for command in register_map.commands.values()] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"address": 1}, "a command is `address` and `value`, or `writes`"),
+        ({"writes": [], "confirm": {"point": "status", "bit": "running"}}, "a command is `address`"),
+        ({"confirm": {"point": "status"}}, "confirmed by a bit, or by what its point equals"),
+        ({"confirm": {"point": "none", "equals": 1}}, "no point none"),
+    ],
+)
+def test_a_command_that_is_none_is_refused(change: dict[str, object], complaint: str):
+    data = yaml.safe_load(packaged("registers", "generic-modbus").read_text())
+    data["commands"]["stop"] |= change
+    with pytest.raises(ConfigError, match=complaint):
+        parse_document(yaml.safe_dump(data), RegisterMap, "generic")
+
+
+async def test_what_confirms_a_command_has_to_be_read_at_each_poll(tmp_path: Path):
+    data = yaml.safe_load(packaged("registers", "watlow-f4t").read_text())
+    del data["points"]["mode"]["poll"]
+    bench = Bench("watlow-f4t")
+    with pytest.raises(ConfigError, match="mode, which confirms run, needs poll: fast"):
+        async with driven(bench, parse_document(yaml.safe_dump(data), RegisterMap, "f4t")):
+            pass
