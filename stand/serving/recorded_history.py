@@ -1,0 +1,79 @@
+"""The history of recorded sessions: of one that is looked at, of two that are compared, and of the last week after a
+restart. It reads disks: in a process of its own, never beside the guard.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from foundation.clock import seconds_ns
+from foundation.errors import StandError
+from foundation.items import Batch
+from recording.format.items import item_of
+from recording.format.layout import FINISHED, TELEMETRY
+from recording.format.messages import KIND_OF_TOPIC
+from recording.format.records import telemetry_messages
+from recording.reading.session import Session
+from stand.serving.history import COARSE_CELLS, COARSE_S, Columns, History
+
+WEEK_NS = seconds_ns(COARSE_S * COARSE_CELLS)
+_LOOKED_AT = 500  # batches for the units; every device is polled many times among so many
+
+
+def recorded_week(directory: Path, now_ns: int) -> tuple[History, list[str]]:
+    """After a restart: what the sessions in `directory` have of the week before `now_ns`, and a sentence for each that
+    could not be read."""
+    history, troubles = History(), list[str]()
+    for path in _written_since(directory, now_ns - WEEK_NS):
+        try:
+            fill_from(history, Session.open(path), now_ns - WEEK_NS)
+        except StandError as error:
+            troubles.append(str(error))
+    return history, troubles
+
+
+def session_columns(path: Path | str, points: int) -> Columns:
+    """The whole of one session in at most `points` columns; SessionError when it cannot be read."""
+    session, history = Session.open(path), History()
+    first_ns, last_ns = fill_from(history, session)
+    return history.columns(first_ns, last_ns + 1, points)
+
+
+def fill_from(history: History, session: Session, from_ns: int = 0) -> tuple[int, int]:
+    """Add what a session has from `from_ns` on; the first and last instant of it, (0, 0) when it has nothing."""
+    ends: list[int] = []
+    for channel, unit in _units_of(session).items():
+        times_ns, values = session.readings(channel)
+        first = int(np.searchsorted(times_ns, from_ns))
+        history.fill(channel, times_ns[first:], values[first:], unit)
+        ends += [int(times_ns[at]) for at in (first, -1) if first < len(times_ns)]
+    for mark in sorted((*session.events(), *session.steps()), key=lambda item: item.time_ns):
+        if mark.time_ns >= from_ns:
+            history.mark(mark)
+            ends.append(mark.time_ns)
+    return min(ends, default=0), max(ends, default=0)
+
+
+def _units_of(session: Session) -> dict[str, str]:
+    """Channel -> unit, from the first readings: a column has none."""
+    units: dict[str, str] = {}
+    for segment in session.telemetry_segments[:1]:
+        found = telemetry_messages(segment, lambda channel: channel.topic in KIND_OF_TOPIC)
+        for item in map(item_of, islice(found, _LOOKED_AT)):
+            if isinstance(item, Batch):
+                units |= {reading.channel: reading.unit for reading in item.readings}
+    return {channel: units.get(channel, "") for channel in session.channels()}
+
+
+def _written_since(directory: Path, from_ns: int) -> list[Path]:
+    """Sessions in which something was written since, oldest first. Files' times are UTC, not the stand's clock, so a
+    day more is looked at."""
+    found: list[tuple[int, Path]] = []
+    for telemetry in directory.glob(f"*/{TELEMETRY}"):
+        times = [segment.stat().st_mtime_ns for segment in telemetry.glob(f"*{FINISHED}")]
+        if times and max(times) >= from_ns - seconds_ns(86_400):
+            found.append((max(times), telemetry.parent))
+    return [path for _, path in sorted(found)]
