@@ -2,8 +2,8 @@
 
 Each channel is kept as the smallest and largest value of each cell of two rings: cells of 1 s for the last hours, of
 10 s for the week. A cell is (inf, -inf) without a reading and (_BAD, -_BAD) when all of its readings were BAD, so that
-joining cells to columns is one minimum and one maximum. Of a column without a reading the value before it holds, for a while: a
-channel that is polled every 30 s is no row of gaps, one that is BAD or is not polled any more is one.
+joining cells to columns is one minimum and one maximum. Of a column without a reading the value before it holds, for a
+while: a channel that is polled every 30 s is no row of gaps, one that is BAD or is not polled any more is one.
 """
 
 from __future__ import annotations
@@ -130,6 +130,15 @@ class _Ring:
         np.minimum.at(self._low[row], at, np.nan_to_num(values, nan=_BAD))
         np.maximum.at(self._high[row], at, np.nan_to_num(values, nan=-_BAD))
 
+    def absorb(self, row: int, other: _Ring, other_row: int) -> None:
+        """Another ring's channel of the same cells, as far as they are not too old."""
+        if other.newest > self.newest:
+            self._reach(other.newest)
+        numbers = np.arange(max(other.newest, self.newest) - self.cells + 1, other.newest + 1)
+        at = numbers % self.cells
+        self._low[row, at] = np.minimum(self._low[row, at], other._low[other_row, at])
+        self._high[row, at] = np.maximum(self._high[row, at], other._high[other_row, at])
+
     def reaches_back_ns(self) -> int:
         """The instant of the oldest cell that may hold something."""
         return (self.newest - self.cells + 1) * self.width_ns
@@ -218,6 +227,23 @@ class History:
             for ring in self._rings:
                 ring.fill(row, times_ns, values)
 
+    def absorb(self, other: History) -> None:
+        """Add what another one has, which was before this one."""
+        for channel, other_row in other._rows.items():
+            row = self._row(channel, other._units[channel])
+            if row is not None:
+                self._last_ns[channel] = max(other._last_ns.get(channel, 0), self._last_ns.get(channel, 0))
+                for ring, others in zip(self._rings, other._rings, strict=True):
+                    ring.absorb(row, others, other_row)
+        for marks, others in (
+            (self._told, other._told),
+            (self._warned, other._warned),
+            (self._steps, other._steps),
+        ):
+            own = tuple(marks)
+            marks.clear()
+            marks.extend((*others, *own))
+
     def mark(self, item: Event | StepMark) -> None:
         """Keep an event, or where a step is."""
         if isinstance(item, Event):
@@ -233,9 +259,7 @@ class History:
                 self._steps[index] = Mark(step.time_ns, "step", step.kind, step.text, step.step_id, item.time_ns)
                 return
 
-    def columns(
-        self, from_ns: int, to_ns: int, points: int = 1200, channels: Collection[str] | None = None
-    ) -> Columns:
+    def columns(self, from_ns: int, to_ns: int, points: int = 1200, channels: Collection[str] | None = None) -> Columns:
         """Curves from `from_ns` to `to_ns` in at most `points` columns; ValueError when that is no time or no number.
 
         A column is a whole number of cells, at least one: short times have fewer columns. channels: None for all;

@@ -11,7 +11,6 @@ from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Reading, bad_reading
 from stand.serving.history import MOST_CHANNELS, MOST_MARKS, History
 from stand.serving.recorded_history import recorded_week, session_columns
-
 from tests.recording.recorded import START_NS, half_second, record
 
 DAY_S = 24 * 3600
@@ -23,7 +22,11 @@ def history_of(values, period_s=1.0, channel="thermometers.air", start_ns=T0):
     history = History()
     for index, value in enumerate(values):
         time_ns = start_ns + round(index * period_s * NS_PER_S)
-        reading = bad_reading(channel, "degC", time_ns, "break") if value is None else Reading(channel, value, "degC", time_ns)
+        reading = (
+            bad_reading(channel, "degC", time_ns, "break")
+            if value is None
+            else Reading(channel, value, "degC", time_ns)
+        )
         history(Batch("thermometers", time_ns, (reading,)))
     return history
 
@@ -205,3 +208,29 @@ def test_a_week_of_thirty_channels_is_answered_within_the_page_s_patience():
     began_s = time.perf_counter()
     history.columns(T0, T0 + 7 * DAY_S * NS_PER_S, 1200)
     assert time.perf_counter() - began_s < 0.5
+
+
+def test_a_history_of_before_is_put_under_the_present_one():
+    """As after a restart: the week comes when readings are being made already."""
+    before, now, both = History(), History(), History()
+    for index in range(5000):
+        each = (before, now) if index == 3000 else (before,) if index < 3000 else (now,)
+        for history in (*each, both):
+            history.add("a.b" if index % 2 else "c.d", T0 + index * 10 * NS_PER_S, float(index * 31 % 101), "degC")
+    before(Event(T0, "error", "tripped", "first"))
+    now(Event(T0 + NS_PER_S, "error", "tripped", "second"))
+    now.absorb(before)
+    for points in (100, 2000):
+        found, expected = (each.columns(T0, T0 + 50_000 * NS_PER_S, points) for each in (now, both))
+        for channel in ("a.b", "c.d"):
+            np.testing.assert_array_equal(found.low[channel], expected.low[channel])
+            np.testing.assert_array_equal(found.high[channel], expected.high[channel])
+    assert [mark.text for mark in now.columns(T0 - 1, T0 + 50_000 * NS_PER_S).marks] == ["first", "second"]
+
+
+def test_what_is_too_old_is_not_put_under_the_present_one():
+    before, now = History(), History()
+    before.add("a.b", T0, 99.0, "degC")
+    now.add("a.b", T0 + 8 * DAY_S * NS_PER_S, 1.0, "degC")
+    now.absorb(before)
+    assert np.nanmax(now.columns(T0, T0 + 9 * DAY_S * NS_PER_S, 1000).high["a.b"]) == 1.0

@@ -1,0 +1,65 @@
+"""The process that looks at frames for the page: `python -m stand.serving.preview_process DAEMON FD ...`, see
+foundation/helper_process.py. Everything else on this machine goes before it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from foundation.helper_process import serve
+
+if TYPE_CHECKING:
+    from stand.serving.history import Columns, History
+    from stand.serving.preview import Previewer
+
+MODULE = "stand.serving.preview_process"
+_LEFT_NAME = "stand-look-left"  # of a process whose daemon has gone
+
+
+def previewer(target_text: str) -> Previewer:
+    """For a target; ConfigError when its text is none."""
+    import cv2
+
+    from foundation.documents import parse_document
+    from markers.target import Target
+    from stand.serving.preview import Previewer
+
+    cv2.setNumThreads(1)
+    return Previewer(parse_document(target_text, Target, "the target"))
+
+
+def session_columns(path: str, points: int) -> Columns:
+    """A recorded session's curves; SessionError when it cannot be read."""
+    from stand.serving.recorded_history import session_columns
+
+    return session_columns(path, points)
+
+
+def recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]:
+    """What a daemon before this one has recorded."""
+    from stand.serving.recorded_history import recorded_week
+
+    return recorded_week(Path(directory), now_ns)
+
+
+def _go_behind_all_others() -> None:
+    with suppress(OSError):
+        os.nice(19)
+    with suppress(OSError, AttributeError):  # Linux
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def main() -> None:
+    """Serve until the daemon is gone."""
+    _go_behind_all_others()
+    serve([int(number) for number in sys.argv[2:]], _LEFT_NAME)
+
+
+if __name__ == "__main__":
+    import stand.serving.preview_process  # under this name it is asked for
+
+    stand.serving.preview_process.main()

@@ -1,0 +1,180 @@
+"""What the page is given beyond the state: history, the last frame, and its own files. Made on the control loop, where
+it only takes what passes the hub; everything else happens in the thread that serves clients.
+
+The picture and the markers of a frame are made by a process of its own at the lowest priority. It is given the newest
+frame when it is done with the one before: on a busy machine frames are skipped, and nothing waits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from foundation.clock import Clock
+from foundation.helper import Helper
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item, StepMark, StepState
+from foundation.readings import Frame
+from stand.serving.history import History
+from stand.serving.preview_process import MODULE, previewer, recorded_week
+
+if TYPE_CHECKING:
+    from stand.serving.preview import Preview
+
+_WAITING = 20_000  # items; the thread takes them every second
+_TAKE_S = 1.0
+_SOONEST_S = 0.4  # between two frames that are looked at
+_AGAIN_S = 30.0  # before a process that has ended is started again
+_LOOK, _READ = "look", "read"
+_ENDED = "the process that looks at frames for the page has ended"
+_RUN_START = "run.start"
+
+
+class Viewing:
+    """A subscriber of the hub with the page's history and last frames.
+
+    sessions: the folder in which the last week is looked for; target_text: the target's YAML, "" for none, and then
+    frames are shown without markers' drift.
+    """
+
+    def __init__(self, hub: Hub, clock: Clock, sessions: Path, target_text: str) -> None:
+        self.history = History()
+        self.sessions = sessions
+        self.previews: dict[str, Preview] = {}
+        self.skipped = 0
+        self.trouble = ""  # why there are no previews
+        self._hub, self._clock = hub, clock
+        self._target_text = target_text
+        self._loop = asyncio.get_running_loop()
+        self._items: deque[Item] = deque(maxlen=_WAITING)
+        self._newest: dict[str, tuple[Frame, str]] = {}
+        self._roles: dict[str, str] = {}
+        self._fresh: set[str] = set()  # roles whose next frame is a reference, by camera
+        self._helper: Helper | None = None
+        self._starting = asyncio.Lock()
+        hub.subscribe(self._follow)
+
+    def _follow(self, item: Item) -> None:
+        """On the control loop: a few assignments."""
+        if isinstance(item, Frame):
+            camera = item.channel.partition(".")[0]
+            if camera in self._newest:
+                self.skipped += 1
+            self._newest[camera] = (item, self._roles.get(item.step_id, ""))
+            return
+        if isinstance(item, StepMark) and item.state is StepState.STARTED:
+            role = item.parameters.get("role")
+            self._roles = {item.step_id: role} if isinstance(role, str) else {}
+        self._items.append(item)
+
+    # From here on: in the thread that serves clients.
+
+    async def run(self) -> None:
+        """Until cancelled: keep the history, look at frames."""
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._keep())
+                tasks.create_task(self._watch())
+        finally:
+            self._end_helper()
+
+    def up_to_date(self) -> History:
+        """The history with all that has been published."""
+        with suppress(IndexError):
+            while True:
+                item = self._items.popleft()
+                if isinstance(item, Event) and item.kind == _RUN_START:
+                    self._fresh.clear()
+                    self._fresh.update(self.previews)
+                if isinstance(item, Batch | Event | StepMark):
+                    self.history(item)
+        return self.history
+
+    async def ask(self, function: Callable[..., Any], *args: object) -> Any:
+        """`function(*args)` in the process at the lowest priority; OSError when that has ended."""
+        helper = await self._started()
+        return await asyncio.to_thread(helper.line(_READ).run, function, *args)
+
+    async def _keep(self) -> None:
+        try:
+            await self._remember()
+        except Exception as error:  # noqa: BLE001 - the curves begin now
+            self._warn(f"the curves of the last week are not shown: {error}")
+        while True:
+            self.up_to_date()
+            await asyncio.sleep(_TAKE_S)
+
+    async def _remember(self) -> None:
+        """What was recorded before this daemon was started."""
+        history, troubles = await self.ask(recorded_week, str(self.sessions), self._clock.now_ns())
+        for trouble in troubles:
+            self._warn(f"not in the curves: {trouble}")
+        self.history.absorb(history)
+
+    async def _watch(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            began_s = loop.time()
+            for camera in tuple(self._newest):
+                frame, role = self._newest.pop(camera)
+                await self._look(camera, frame, role)
+            await asyncio.sleep(max(0.05, began_s + _SOONEST_S - loop.time()) if self._newest else 0.1)
+
+    async def _look(self, camera: str, frame: Frame, role: str) -> None:
+        from stand.serving.preview import DRIFT_ROLES, Shot
+
+        as_reference = role in DRIFT_ROLES and (camera in self._fresh or role == "reference" != self._role_of(camera))
+        try:
+            helper = await self._started()
+            shot = Shot(camera, frame.time_ns, frame.image, role, as_reference)
+            preview: Preview = await asyncio.to_thread(helper.line(_LOOK).call, "previewer", "look", shot)
+        except OSError as error:
+            await self._has_ended(str(error))
+        except Exception as error:  # noqa: BLE001 - a frame that cannot be looked at is not shown
+            self._warn(f"a frame of {camera} could not be looked at: {error}")
+        else:
+            self._fresh.discard(camera)
+            self.previews[camera] = preview
+            self.trouble = ""
+            self._plot(camera, preview)
+
+    def _role_of(self, camera: str) -> str:
+        before = self.previews.get(camera)
+        return "" if before is None else before.role
+
+    def _plot(self, camera: str, preview: Preview) -> None:
+        if preview.mean_px is not None and preview.worst_px is not None:
+            self.history.add(f"{camera}.drift_mean", preview.time_ns, preview.mean_px, "px")
+            self.history.add(f"{camera}.drift_worst", preview.time_ns, preview.worst_px, "px")
+
+    async def _started(self) -> Helper:
+        async with self._starting:
+            if self._helper is None:
+                self._helper = await asyncio.to_thread(_start, self._target_text)
+            return self._helper
+
+    async def _has_ended(self, why: str) -> None:
+        self._warn(f"no new frames on the page for {_AGAIN_S:g} s: {why}")
+        self._end_helper()
+        await asyncio.sleep(_AGAIN_S)
+
+    def _end_helper(self) -> None:
+        helper, self._helper = self._helper, None
+        if helper is not None:
+            helper.close()
+
+    def _warn(self, text: str) -> None:
+        self.trouble = text
+        event = Event(self._clock.now_ns(), "warning", "preview", text)
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._hub.publish, event)
+
+
+def _start(target_text: str) -> Helper:
+    helper = Helper(MODULE, (_LOOK, _READ), _ENDED)
+    helper.line(_LOOK).make("previewer", previewer, target_text)
+    return helper
