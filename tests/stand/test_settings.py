@@ -52,7 +52,18 @@ def classes(*packages: ModuleType) -> set[type]:
     }
 
 
-REGISTER_MAP = {"RegisterMap", "Transport", "RawFault", "Split", "Pulse", "Point", "Confirm", "Command", "Probe"}
+REGISTER_MAP = {
+    "RegisterMap",
+    "Transport",
+    "RawFault",
+    "Split",
+    "Pulse",
+    "Point",
+    "Confirm",
+    "Write",
+    "Command",
+    "Probe",
+}
 
 
 def test_every_settings_model_of_a_driver_is_a_part_of_the_stands_file():
