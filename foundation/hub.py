@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from foundation.items import Batch, Item
 from foundation.readings import Quality, Reading
@@ -45,6 +45,11 @@ class Hub:
     def latest(self, channel: str) -> Reading | None:
         """The last reading of `channel`, or None when there was none yet."""
         return self._latest.get(channel)
+
+    @property
+    def readings(self) -> Mapping[str, Reading]:
+        """The last reading of every channel there was one of; it changes as readings come."""
+        return self._latest
 
     def known(self, channel: str) -> Reading | None:
         """The last reading but for those that are BAD by the wire, which say nothing of what is measured: a single lost

@@ -17,6 +17,10 @@ class Motions:
         """As in `["linear to 250 mm", "flap closing"]`."""
         return [f"{name} {text}" for name, text in self._under_way.items()]
 
+    def moves(self, name: str) -> bool:
+        """Whether this one is under way."""
+        return name in self._under_way
+
     @contextmanager
     def under_way(self, name: str, text: str) -> Generator[None]:
         """It moves while inside; where one motion is part of another, the inner one is shown."""

@@ -1,41 +1,50 @@
-"""The commands for a run that is under way: status, pause, continue, stop, clear."""
+"""The commands for a run that is under way: status, watch, pause, continue, skip, extend, stop, clear.
+
+They are thin clients of the HTTP interface: whatever they do, a program can do as well.
+"""
 
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, cast
 
 import typer
 
-from foundation.errors import ConfigError, SessionError
+from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.instants import duration, local_text
 from foundation.usage import one_line
-from recording.format.inventory import inventory
+from stand.commands.reached import (
+    ConfigOption,
+    DirectoryArgument,
+    JsonOption,
+    TokenOption,
+    UrlOption,
+    reached,
+)
 from stand.commands.session_text import size
-from stand.config.stand_config import load_config, packaged
 from stand.gate import INTERLOCK, OPERATOR
-from stand.serving.control_client import ask, ask_status, running_sessions
-from stand.serving.desk import RunStatus
-from stand.serving.door import Answer
+from stand.serving.client import API, Answer, Server
+from stand.serving.desk import RunStatus, StandState
 
 app = typer.Typer(add_completion=False)
 
-DirectoryArgument = Annotated[
-    Path | None,
-    typer.Argument(metavar="[DIR]", help="A session, or a folder of sessions; else recording.directory of --config."),
-]
-ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
-
+StepArgument = Annotated[str, typer.Argument(metavar="STEP", help="Its number in `stand status --plan`, or its id.")]
+_WATCH_S = 2.0
 _LABEL = 14
 
 
 @app.command()
 def status(
-    directory: DirectoryArgument = None, config: ConfigOption = "simulated", as_json: JsonOption = False
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+    plan: Annotated[bool, typer.Option("--plan", help="The steps of the plan in force, and where they are.")] = False,
 ) -> None:
     """What the running session is doing: step, state, expected end, temperatures, frames, disk, last warning.
 
@@ -44,18 +53,50 @@ def status(
     Example: stand status /data/sessions
     """
     with one_line_errors():
-        session = _running(directory, config, anywhere=True)
-        found = ask_status(session)
-        if as_json:
-            fields = found.model_dump(mode="json", exclude={"session"})
-            typer.echo(json.dumps({"session": str(session), **fields}, indent=2))
+        server = reached(directory, config, url, token_file, anywhere=True)
+        if plan:
+            _show_plan(server, as_json=as_json)
             return
-        for line in status_lines(session, found):
-            typer.echo(line)
+        _show(server, server.state(), as_json=as_json)
 
 
 @app.command()
-def pause(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
+def watch(
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+) -> None:
+    """What happens, as it happens: events, one a line, from now on. Ctrl-C ends watching, not the run.
+
+    Example: stand watch
+    """
+    with one_line_errors():
+        server = reached(directory, config, url, token_file, anywhere=True)
+        seq = server.state().seq
+        try:
+            while True:
+                found = cast("Answer", server.request("GET", f"{API}/events?from={seq}"))
+                seq = cast("int", found["seq"])
+                for event in cast("list[Answer]", found["events"]):
+                    typer.echo(json.dumps(event) if as_json else _event_line(event))
+                threading.Event().wait(_WATCH_S)
+        except KeyboardInterrupt:
+            return
+
+
+@app.command()
+def pause(
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+    at_next_step: Annotated[
+        bool, typer.Option("--at-next-step", help="When the step under way is done, not before the next action.")
+    ] = False,
+) -> None:
     """Hold the run before its next action; the chamber keeps its set-point, a dwell what it has earned.
 
     Moves under way are completed, and the answer lists them; `stand stop` stops it. The flap is shut within a
@@ -64,45 +105,162 @@ def pause(directory: DirectoryArgument = None, config: ConfigOption = "simulated
     Example: stand pause && stand continue
     """
     with one_line_errors():
-        session, answer = _ask(directory, config, "pause")
+        server = reached(directory, config, url, token_file)
+        answer = server.order("pause", {"when": "step" if at_next_step else "now"})
         moving = cast("list[str]", answer.get("moving", []))
-        typer.echo(f"{session}: paused; `stand continue` ends the pause; {_moving(moving)}")
+        when = "pauses when the step under way is done" if at_next_step else "paused"
+        _say(server, answer, f"{when}; `stand continue` ends the pause; {_moving(moving)}", as_json=as_json)
 
 
 @app.command("continue")
-def continue_(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
+def continue_(
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+) -> None:
     """End a pause.
 
     Example: stand continue sessions/20260101T180000Z-thermal-cycle
     """
     with one_line_errors():
-        session, answer = _ask(directory, config, "continue")
-        typer.echo(f"{session}: {_still(answer)}")
+        server = reached(directory, config, url, token_file)
+        answer = server.order("continue")
+        _say(server, answer, _still(answer), as_json=as_json)
 
 
 @app.command()
-def clear(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
+def clear(
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+) -> None:
     """Continue a run that an interlock holds, once you have removed the cause.
 
     Example: stand clear
     """
     with one_line_errors():
-        session, answer = _ask(directory, config, "clear")
-        typer.echo(f"{session}: cleared; {_still(answer)}")
+        server = reached(directory, config, url, token_file)
+        answer = server.order("clear")
+        _say(server, answer, f"cleared; {_still(answer)}", as_json=as_json)
 
 
 @app.command()
-def stop(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
+def skip(
+    step: StepArgument,
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+) -> None:
+    """Leave a step out; a soak, capture, cool-down or prompt under way is broken off.
+
+    Example: stand skip 12
+    """
+    with one_line_errors():
+        server = reached(directory, config, url, token_file)
+        answer = server.order("skip", {"step_id": _step_id(server, step)})
+        _say(server, answer, f"step {step} is left out", as_json=as_json)
+
+
+@app.command()
+def extend(
+    step: StepArgument,
+    minutes: Annotated[float, typer.Argument(help="So much longer, in minutes.")],
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+) -> None:
+    """Soak for longer in a step.
+
+    Example: stand extend 12 30
+    """
+    with one_line_errors():
+        server = reached(directory, config, url, token_file)
+        answer = server.order("extend", {"step_id": _step_id(server, step), "by_s": 60.0 * minutes})
+        _say(server, answer, f"step {step} takes {minutes:g} min longer", as_json=as_json)
+
+
+@app.command()
+def stop(
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+) -> None:
     """Make the stand safe and end the run, as Ctrl-C does.
 
     Example: stand stop
     """
     with one_line_errors():
-        session, _ = _ask(directory, config, "stop", anywhere=True)
-        typer.echo(f"{session}: stopping; the stand is made safe first, and the run says when it is")
+        server = reached(directory, config, url, token_file, anywhere=True)
+        answer = server.order("stop")
+        text = "stopping; the stand is made safe first, and the run says when it is"
+        _say(server, answer, text, as_json=as_json)
 
 
-def status_lines(session: Path, found: RunStatus) -> Iterator[str]:
+def _say(server: Server, answer: Mapping[str, object], text: str, *, as_json: bool) -> None:
+    typer.echo(json.dumps(dict(answer), indent=2) if as_json else f"{server.name}: {text}")
+
+
+def _show(server: Server, state: StandState, *, as_json: bool) -> None:
+    if as_json:
+        run = {} if state.run is None else state.run.model_dump(mode="json")
+        typer.echo(json.dumps({**run, "session": server.name, "stand": state.model_dump(mode="json")}, indent=2))
+        return
+    for line in idle_lines(server.name, state) if state.run is None else status_lines(server.name, state.run):
+        typer.echo(line)
+    if state.prompt is not None:
+        typer.echo(_row("asks", f"{state.prompt.text}; `stand continue` when it is done"))
+
+
+def _show_plan(server: Server, *, as_json: bool) -> None:
+    steps = cast("list[Answer]", server.request("GET", f"{API}/plan"))
+    if as_json:
+        typer.echo(json.dumps(steps, indent=2))
+        return
+    for step in steps:
+        typer.echo(one_line(f"{step['index']:>5}  {str(step['standing']).replace('_', ' '):<10}  {step['text']}"))
+
+
+def _step_id(server: Server, step: str) -> str:
+    """The id of a step that is given by its number in the plan."""
+    if not step.isdecimal():
+        return step
+    for planned in cast("list[Answer]", server.request("GET", f"{API}/plan")):
+        if planned["index"] == int(step):
+            return str(planned["step_id"])
+    raise ConfigError(f"the plan has no step {step}; `stand status --plan` shows those there are")
+
+
+def _event_line(event: Mapping[str, object]) -> str:
+    time_ns, offset_ns = cast("int", event["time_ns"]), cast("int", event["utc_offset_ns"])
+    level = "" if event["level"] == "info" else f"{event['level']}: "
+    return one_line(f"{local_text(time_ns + offset_ns)}  {level}{event['text']}")
+
+
+def idle_lines(name: str, state: StandState) -> Iterator[str]:
+    """`stand status` between runs."""
+    yield _row("stand", f"{state.stand} ({name})")
+    yield _row("state", state.phase if not state.reasons else f"{state.phase}: {', '.join(state.reasons)}")
+    if state.fault is not None:
+        yield _row("fault", f"{state.fault.rule}: {state.fault.text}")
+    for channel, reading in state.readings.items():
+        if reading.unit == "degC":
+            yield _row("temperatures", f"{channel} {'BAD' if reading.value is None else f'{reading.value:.2f} degC'}")
+    waiting = sum(run.state in ("waiting", "interrupted") for run in state.queue)
+    yield _row("queue", f"{waiting} to be run" + (f"; halted: {state.queue_halted}" if state.queue_halted else ""))
+    yield _row("disk", f"{size(state.disk_free_bytes)} free")
+
+
+def status_lines(session: Path | str, found: RunStatus) -> Iterator[str]:
     """`stand status`."""
     state = found.state if found.state != "held" else f"held: {', '.join(found.reasons)}"
     yield _row("session", str(session))
@@ -153,22 +311,3 @@ def _still(answer: Mapping[str, object]) -> str:
 
 def _moving(moving: Sequence[str]) -> str:
     return f"still moving: {', '.join(map(one_line, moving))}" if moving else "nothing moves"
-
-
-def _ask(directory: Path | None, config: str, do: str, *, anywhere: bool = False) -> tuple[Path, Answer]:
-    session = _running(directory, config, anywhere=anywhere)
-    return session, ask(session, {"do": do})
-
-
-def _running(directory: Path | None, config: str, *, anywhere: bool = False) -> Path:
-    """`directory` when it is a session that is run, else the only running session in it; ConfigError when there are
-    several. `anywhere`: without a directory the only one on this machine will do, for what can do no harm."""
-    root = directory or load_config(packaged("", config)).recording.directory
-    sessions = running_sessions(root) or (running_sessions() if anywhere and directory is None else [])
-    if len(sessions) > 1:
-        raise ConfigError(f"{root}: several sessions are running, name one: {', '.join(map(str, sessions))}")
-    if sessions:
-        return sessions[0]
-    if inventory(root):
-        raise SessionError(f"{root}: no daemon is running this session")
-    raise SessionError(f"{root}: no daemon is running a session there")

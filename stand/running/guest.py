@@ -12,7 +12,7 @@ from pathlib import Path
 
 from foundation.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
-from foundation.errors import SessionError, StandTripped
+from foundation.errors import StandError, StandTripped
 from foundation.hub import Hub
 from foundation.instants import utc_text
 from foundation.items import Event, Item
@@ -35,11 +35,11 @@ from stand.running.house import House
 from stand.running.journal import Journal, Logbook
 from stand.running.order import Order, check_plan
 from stand.running.resume import Interruption, begun, plan_hash
+from stand.running.run_desk import RunDesk
 from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
-from stand.serving.control import handlers, serve
-from stand.serving.eta_slip import EtaSlip
+from stand.serving.api.server import Interface, serve
 
 # The recorder's events that hold a run, and those that let it continue.
 _HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
@@ -111,7 +111,7 @@ class Guest:
                 executor = await watched(self._begun(settling, leaving), (*house.tasks, recording))
                 self.board = await self._board(leaving)
                 self.executor = executor
-                watchers.append(asyncio.create_task(self._answer(self.board)))
+                watchers.append(asyncio.create_task(self._answer(self.board, executor)))
                 house.start()
                 if isinstance(assembly.clock, VirtualClock):
                     limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
@@ -180,22 +180,32 @@ class Guest:
         board = StatusBoard(name, steps, kept, gate, self.stop, lambda: house.latched, recorder, clock)
         assembly.hub.subscribe(board)
         leaving.callback(assembly.hub.unsubscribe, board)
-        if not isinstance(clock, VirtualClock):  # there nobody waits for the end
-            slip = EtaSlip(assembly.hub, clock, board.left_s, partial(utc_offset_ns, clock))
-            assembly.hub.subscribe(slip)
-            leaving.callback(assembly.hub.unsubscribe, slip)
         return board
 
-    async def _answer(self, board: StatusBoard) -> None:
-        """Answer at the control socket until cancelled; a run can do without one."""
-        stand = self._assembly.stand
-        table = handlers(stand.gate, self.stop, board.status, lambda: stand.motions.texts)
+    async def _answer(self, board: StatusBoard, executor: Executor) -> None:
+        """Answer clients until cancelled; a run can do without any."""
+        assembly, directory = self._assembly, self.recorder.directory
+        desk = RunDesk(
+            assembly,
+            directory,
+            self.stop,
+            self.log,
+            executor,
+            board.status,
+            lambda: self._house.latched,
+            board.priced_s,
+        )
+        assembly.hub.subscribe(desk)
         try:
-            async with serve(self.recorder.directory, self.job.order.config.name, table):
+            async with serve(
+                desk, assembly.hub, assembly.clock, directory, self.job.order.config.name, Interface(directory.parent)
+            ):
                 await asyncio.Event().wait()
-        except SessionError as error:
+        except StandError as error:
             self.log.tell("warning", "no_control", f"the run cannot be queried or paused: {error}")
             await asyncio.Event().wait()
+        finally:
+            assembly.hub.unsubscribe(desk)
 
     def _begin_data(self) -> dict[str, object]:
         """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For

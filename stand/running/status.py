@@ -19,7 +19,7 @@ from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.serving.desk import RunStatus
 
 State = Literal["running", "held", "stopping"]
-_STATES: dict[Phase, State] = {
+STATES: dict[Phase, State] = {
     Phase.IDLE: "running",
     Phase.RUNNING: "running",
     Phase.HELD: "held",
@@ -30,7 +30,10 @@ _STATES: dict[Phase, State] = {
 
 
 class StatusBoard:
-    """A subscriber of the hub that remembers what an operator asks for. `held` gives why the guard holds the run."""
+    """A subscriber of the hub that remembers what an operator asks for. `held` gives why the guard holds the run.
+
+    priced_s: what each step was expected to take before the run, by its id.
+    """
 
     def __init__(
         self,
@@ -43,6 +46,7 @@ class StatusBoard:
         recorder: Recorder,
         clock: Clock,
     ) -> None:
+        self.priced_s = {step.planned.step_id: step.duration_s for step in steps}
         self._recipe = recipe
         self._eta = Eta(steps, state.done, state.earned_s)
         self._gate = gate
@@ -52,7 +56,7 @@ class StatusBoard:
         self._clock = clock
         self._step = 0
         self._doing = ""
-        self._state: State = _STATES[stop.phase]
+        self._state: State = STATES[stop.phase]
         self._since_ns = clock.now_ns()
         self._since_utc_offset_ns = self._warning_utc_offset_ns = utc_offset_ns(clock)
         self._temperatures_degC: dict[str, float | None] = {}
@@ -107,17 +111,13 @@ class StatusBoard:
             fault="" if fault is None else fault.text,
         )
 
-    def left_s(self, now_ns: int) -> float:
-        """How long the run still takes, from now on."""
-        return self._eta.left_s(now_ns)
-
     def _fault(self) -> Fault | None:
         """What has tripped; an operator who stops the run is no fault."""
         fault = self._stop.fault or self._held()
         return None if fault is None or fault.rule == STOPPED_BY_OPERATOR else fault
 
     def _follow_state(self) -> None:
-        state = _STATES[self._stop.phase]
+        state = STATES[self._stop.phase]
         if state != self._state:
             self._state, self._since_ns = state, self._clock.now_ns()
             self._since_utc_offset_ns = utc_offset_ns(self._clock)

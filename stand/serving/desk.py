@@ -171,8 +171,9 @@ class StandState(Value):
     seq: the sequence number of the stream that this state is after. version: of the program. phase: idle between runs.
     reasons: what holds the run. readings: the last of every channel. setpoint_degC: of the chamber, None when it is
     stopped or unknown. output_percent: of the regulator. flap: "open", "closed", "moving", or "" when it is not known.
-    axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles, ...). drops: items that
-    the interface was too slow for.
+    axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles, ...). moving: what is
+    under way, as in `linear to 250 mm`. drops: items that the interface was too slow for. pausing: a pause comes when
+    the step under way is done.
     """
 
     seq: int = 0
@@ -200,6 +201,7 @@ class StandState(Value):
     disk_free_bytes: int = 0
     moving: tuple[str, ...] = ()
     drops: int = 0
+    pausing: bool = False
 
 
 class Done(Value):
@@ -277,7 +279,8 @@ class Desk(Protocol):
         ...
 
     def plan(self) -> tuple[PlanStep, ...]:
-        """The plan in force; empty when nothing is run."""
+        """The plan in force; empty when nothing is run. The one method that any thread may call: a long plan takes a
+        while to tell, so it reads values only that are replaced and never changed."""
         ...
 
     def devices(self) -> tuple[DeviceState, ...]:

@@ -10,9 +10,10 @@ import json
 import os
 import secrets
 import socket
+import threading
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -44,9 +45,10 @@ class Daemon:
 
 
 class Presence:
-    """A daemon's own entry and socket; `appear` before anything else."""
+    """A daemon's own entry and socket; `appear` before anything else. To be used from any thread."""
 
     def __init__(self, entry: Entry) -> None:
+        self._lock = threading.RLock()
         self._entry = entry
         self._id = f"{entry.pid}-{secrets.token_hex(4)}"
         self._path = Path()
@@ -55,33 +57,46 @@ class Presence:
     def appear(self) -> socket.socket:
         """Make, or make again, both files; returns the listening socket. SessionError when they cannot be made."""
         path = runtime_folder() / f"{self._id}.json"
-        try:
-            self._publish(path)
-            return _listening(self._socket)
-        except OSError as error:
-            self.disappear()
-            raise SessionError(f"{path.parent}: no control socket can be made there ({error.strerror})") from error
+        with self._lock:
+            try:
+                self._publish(path)
+                return _listening(self._socket)
+            except OSError as error:
+                self.disappear()
+                raise SessionError(f"{path.parent}: no control socket can be made there ({error.strerror})") from error
 
     def is_there(self) -> bool:
         """Whether both files are still there; a logout removes $XDG_RUNTIME_DIR with all that is in it."""
-        with suppress(OSError):
+        with self._lock, suppress(OSError):
             return self._file is not None and is_at(self._file, self._path) and self._socket.is_socket()
         return False
 
     def tell(self, entry: Entry) -> None:
         """Say this from now on."""
-        self._entry = entry
-        with suppress(OSError):  # what was said before stays
+        with self._lock, suppress(OSError):  # what was said before stays
+            self._entry = entry
             if self._file is not None:
                 self._publish(self._path)
 
+    def identify(self) -> None:
+        """Note what the disk says of the session's folder, when it does: nothing waits for a disk that hangs."""
+
+        def look() -> None:
+            entry = self._entry
+            with suppress(OSError):  # no such folder
+                found, real_path = os.stat(entry.session), os.path.realpath(entry.session)
+                self.tell(replace(entry, real_path=real_path, identity=(found.st_dev, found.st_ino)))
+
+        threading.Thread(target=look, name="session-folder", daemon=True).start()
+
     def disappear(self) -> None:
         """Remove both files; may be called twice."""
-        if self._file is not None:
-            with suppress(OSError):
-                self._socket.unlink()
-            remove(self._path, self._file)
-            self._file = None
+        with self._lock:
+            if self._file is not None:
+                with suppress(OSError):
+                    self._socket.unlink()
+                remove(self._path, self._file)
+                self._file = None
 
     @property
     def _socket(self) -> Path:

@@ -18,10 +18,11 @@ from stand.gate import Gate
 from stand.running.state import RunState
 from stand.running.status import StatusBoard
 from stand.running.stop import Stop
-from stand.serving.control import handlers, serve
-from stand.serving.control_client import ask
+from stand.serving.api.access import this_user
+from stand.serving.client import ask
 from stand.serving.desk import RunStatus
 from tests.host import Host
+from tests.stand.a_desk import ADesk, served
 
 runner = CliRunner()
 
@@ -43,13 +44,6 @@ STATUS = RunStatus(
 )
 
 
-def gate_held_by(*reasons: str) -> Gate:
-    gate = Gate()
-    for reason in reasons:
-        gate.hold(reason)
-    return gate
-
-
 async def invoke(*arguments: str | Path) -> Result:
     return await asyncio.to_thread(runner.invoke, app, [str(argument) for argument in arguments])
 
@@ -62,7 +56,7 @@ def session(root: Path, name: str) -> Path:
 
 async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
     path = session(tmp_path, "night")
-    async with serve(path, "a stand", handlers(Gate(), lambda: None, lambda: STATUS)):
+    async with served(ADesk(run=STATUS), path):
         lines = (await invoke("status", tmp_path)).stdout.splitlines()
         told = json.loads((await invoke("status", path, "--json")).stdout)
     assert lines == [
@@ -107,40 +101,59 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
 
 
 async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_path: Path):
-    path, gate, stopped = session(tmp_path, "night"), gate_held_by("interlock"), asyncio.Event()
-    async with serve(path, "a stand", handlers(gate, stopped.set, lambda: STATUS)):
+    path = session(tmp_path, "night")
+    async with served(ADesk("interlock", run=STATUS), path) as desk:
         assert "paused" in (await invoke("pause", tmp_path)).stdout
-        assert gate.reasons == {"operator", "interlock"}
+        assert desk.gate.reasons == {"operator", "interlock"}
         held = (await invoke("continue", tmp_path)).stdout
         assert "still held: interlock; `stand clear` once the cause is gone" in held
         assert (await invoke("clear", tmp_path)).stdout.strip() == f"{path}: cleared; the run continues"
         nothing = await invoke("clear", tmp_path)
         assert nothing.exit_code == 1
         assert "nothing to clear" in nothing.stderr
-        assert not stopped.is_set()
-        assert (await invoke("stop", path)).exit_code == 0
-        assert stopped.is_set()
+        assert "when the step under way is done" in (await invoke("pause", tmp_path, "--at-next-step")).stdout
+        assert (await invoke("skip", "0", tmp_path)).stdout == f"{path}: step 0 is left out\n"
+        assert (await invoke("extend", "0-soak", "30", tmp_path)).stdout == f"{path}: step 0-soak takes 30 min longer\n"
+        assert (await invoke("skip", "7", tmp_path)).exit_code == 2
+        assert json.loads((await invoke("stop", path, "--json")).stdout)["verb"] == "stop"
+    orders = [(verb, arguments) for _, verb, arguments in desk.orders]
+    assert orders == [
+        ("pause", {"when": "now"}),
+        ("continue", {}),
+        ("clear", {}),
+        ("pause", {"when": "step"}),
+        ("skip", {"step_id": "0-soak"}),
+        ("extend", {"step_id": "0-soak", "by_s": 1800.0}),
+        ("stop", {}),
+    ]
+    assert {(who.name, who.how) for who, _, _ in desk.orders} == {(this_user(), "socket")}
 
 
-@pytest.mark.parametrize(("moving", "said"), [(["linear to 250 mm", "flap opening"], "still moving"), ([], "nothing")])
-async def test_a_pause_says_what_still_moves(tmp_path: Path, moving: list[str], said: str):
-    path, gate = session(tmp_path, "night"), Gate()
-    async with serve(path, "a stand", handlers(gate, lambda: None, lambda: STATUS, lambda: moving)):
+async def test_the_plan_and_what_happens_are_shown(tmp_path: Path):
+    path = session(tmp_path, "night")
+    async with served(ADesk(run=STATUS), path):
+        assert (await invoke("status", path, "--plan")).stdout == "    0  waiting     Soak\n"
+
+
+@pytest.mark.parametrize(("moving", "said"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "nothing")])
+async def test_a_pause_says_what_still_moves(tmp_path: Path, moving: tuple[str, ...], said: str):
+    path, desk = session(tmp_path, "night"), ADesk(run=STATUS)
+    desk.moving = moving
+    async with served(desk, path):
         text = (await invoke("pause", tmp_path)).stdout
         assert said in text
         assert all(each in text for each in moving)
-        assert (await asyncio.to_thread(ask, path, {"do": "pause"}))["moving"] == moving
+        assert (await asyncio.to_thread(ask, path, "pause"))["moving"] == list(moving)
 
 
 async def test_without_a_name_the_only_running_session_is_meant(tmp_path: Path):
     first, second = session(tmp_path, "first"), session(tmp_path, "second")
-    table = handlers(Gate(), lambda: None, lambda: STATUS)
     nobody = await invoke("status", tmp_path)
     assert nobody.exit_code == 1
     assert nobody.stderr == f"error: {tmp_path}: no daemon is running a session there\n"
-    async with serve(second, "a stand", table):
+    async with served(ADesk(run=STATUS), second):
         assert str(second) in (await invoke("status", tmp_path)).stdout
-        async with serve(first, "a stand", table):
+        async with served(ADesk(run=STATUS), first):
             both = await invoke("pause", tmp_path)
     assert both.exit_code == 2
     assert both.stderr == f"error: {tmp_path}: several sessions are running, name one: {first}, {second}\n"
@@ -153,7 +166,7 @@ async def test_the_recording_directory_of_the_configuration_is_searched(tmp_path
     config.write_text(yaml.safe_dump(data))
     (tmp_path / "recordings").mkdir()
     path = session(tmp_path / "recordings", "night")
-    async with serve(path, "a stand", handlers(Gate(), lambda: None, lambda: STATUS)):
+    async with served(ADesk(run=STATUS), path):
         found = await invoke("status", "--config", config)
     assert str(path) in found.stdout
 

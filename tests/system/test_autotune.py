@@ -10,7 +10,7 @@ from foundation.hub import Hub
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.serving.control_client import ask, ask_status
+from stand.serving.client import ask, ask_status
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_guard_run import Watcher, check_safe
 from tests.system.test_run import at_step
@@ -53,7 +53,7 @@ async def test_autotuning_is_held_and_the_run_goes_on_after_clear(
         await watcher.wait(60)
         status = await asyncio.to_thread(ask_status, directory)
         assert (status.state, status.reasons) == ("held", ("interlock",))
-        await asyncio.to_thread(ask, directory, {"do": "clear"})
+        await asyncio.to_thread(ask, directory, "clear")
         await watcher.event("restored", 60)
 
     session = Session.open(await operated(run_virtual(ordered, out, None, watch), operate()))

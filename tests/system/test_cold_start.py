@@ -22,7 +22,7 @@ from stand.running.fold import fold
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_virtual
-from stand.serving.control_client import ask
+from stand.serving.client import ask
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher
@@ -109,7 +109,7 @@ async def test_a_prompt_that_somebody_attends_to_holds_the_run(
 
     async def done() -> None:
         (directory,) = out.iterdir()
-        assert (await asyncio.to_thread(ask, directory, {"do": "continue"}))["reasons"] == []
+        assert (await asyncio.to_thread(ask, directory, "continue"))["reasons"] == []
         kinds.append("continued")
 
     def watch(hub: Hub) -> None:
@@ -172,7 +172,7 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_anew_from_a_cold_came
     async def operator(reason: str) -> None:
         await fault(ordered, "axis.alarm", None)
         (directory,) = out.iterdir()
-        await asyncio.to_thread(ask, directory, {"do": "clear"})
+        await asyncio.to_thread(ask, directory, "clear")
 
     act, tasks, items = acting({3: lambda: fault(ordered, "axis.alarm", "rotary")}, operator)
 
@@ -202,11 +202,11 @@ async def paused(order: Order, out: Path, pause_s: float) -> Session:
     async def operator(reason: str) -> None:
         (directory,) = out.iterdir()
         await watcher.wait(pause_s)
-        await asyncio.to_thread(ask, directory, {"do": "continue"})
+        await asyncio.to_thread(ask, directory, "continue")
 
     async def pause() -> None:
         (directory,) = out.iterdir()
-        await asyncio.to_thread(ask, directory, {"do": "pause"})
+        await asyncio.to_thread(ask, directory, "pause")
 
     act, tasks, _ = acting({3: pause}, operator)
 

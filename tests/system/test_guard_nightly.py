@@ -14,9 +14,9 @@ import pytest
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
 from stand.running.order import Order
-from stand.serving.control_client import ask_status
+from stand.serving.client import ask_status
 from tests.recording.disks import ext4, run
-from tests.stand.test_door import connected
+from tests.stand.test_listening import STATE, connected
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault
 from tests.system.test_unrecorded_heat import heater_is
@@ -62,7 +62,7 @@ def flood(session: Path, count: int) -> Iterator[list[int]]:
             with suppress(OSError, ValueError), connected(session) as client:
                 client.settimeout(10.0)
                 while not over.is_set():
-                    client.sendall(b'{"do": "status"}\n')
+                    client.sendall(STATE)
                     if not client.recv(65536):
                         break
                     answers[number] += 1

@@ -21,7 +21,7 @@ from stand.running.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_virtual
-from stand.serving.control_client import ask, ask_status
+from stand.serving.client import ask, ask_status
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step, fault
@@ -201,16 +201,16 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
             trip = await watcher.event(f"guard.{rule}", 3000)
             assert trip.level == "error"
             if rule == "stage_alarm":  # cleared without a look at the cause
-                assert (await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"] == ["interlock"]
+                assert (await asyncio.to_thread(ask, directory, "clear"))["reasons"] == ["interlock"]
                 await watcher.event("guard.stage_alarm", 60)
             if mend is not None:
                 await mend()
             await watcher.wait(300)
             status = await asyncio.to_thread(ask_status, directory)
             assert (status.state, status.reasons) == ("held", ("interlock",))
-            assert (await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"] == []
+            assert (await asyncio.to_thread(ask, directory, "clear"))["reasons"] == []
             await watcher.event("restored", 60)
-        await asyncio.to_thread(ask, directory, {"do": "stop"})
+        await asyncio.to_thread(ask, directory, "stop")
 
     await run_operated(ordered, out, watcher, operate())
     (directory,) = out.iterdir()
@@ -237,9 +237,9 @@ async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_ro
         await watcher.event("guard.disk_low", 1200)
         (directory,) = out.iterdir()
         assert (await asyncio.to_thread(ask_status, directory)).reasons == ("disk_low", "interlock")
-        assert (await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"] == ["disk_low"]
+        assert (await asyncio.to_thread(ask, directory, "clear"))["reasons"] == ["disk_low"]
         await watcher.event("guard.disk_low", 1200)
-        await asyncio.to_thread(ask, directory, {"do": "stop"})
+        await asyncio.to_thread(ask, directory, "stop")
 
     await run_operated(ordered, out, watcher, operate())
     assert len((tmp_path / "told").read_text().splitlines()) == 2

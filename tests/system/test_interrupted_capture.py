@@ -17,7 +17,7 @@ from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.serving.control_client import ask
+from stand.serving.client import ask
 from tests.recording.disks import limit_files
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault
@@ -77,7 +77,7 @@ class Interrupter:
 def operator(out: Path, do: str) -> Action:
     async def act() -> None:
         (directory,) = out.iterdir()
-        await asyncio.to_thread(ask, directory, {"do": do})
+        await asyncio.to_thread(ask, directory, do)
 
     return act
 

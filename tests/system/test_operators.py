@@ -17,7 +17,7 @@ from stand.running.entries import Held, read_lines
 from stand.running.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from stand.serving.control_client import ask
+from stand.serving.client import ask, ask_status
 from tests.system.conftest import require_aravis
 from tests.system.test_attended import PROMPTED
 from tests.system.test_guard_run import check_safe
@@ -31,6 +31,10 @@ def _aravis() -> None:
     require_aravis()
 
 
+def pressed(directory: Path, do: str) -> object:
+    return ask_status(directory) if do == "status" else ask(directory, do)
+
+
 async def press(out: Path, run: asyncio.Task[Path], seed: int, news: asyncio.Event) -> list[object]:
     """Any request, from before the run is there on; what came back. Nobody leaves a pause behind."""
     rng, answers = random.Random(seed), list[object]()
@@ -42,7 +46,7 @@ async def press(out: Path, run: asyncio.Task[Path], seed: int, news: asyncio.Eve
         for directory in out.glob("*/"):
             for do in (rng.choice(["pause", "pause", "clear", "status"]), "status", "continue"):
                 try:
-                    answers.append(await asyncio.to_thread(ask, directory, {"do": do}))
+                    answers.append(await asyncio.to_thread(pressed, directory, do))
                 except SessionError as error:
                     answers.append(str(error))
     return answers
@@ -84,13 +88,13 @@ async def test_stop_pressed_twice_in_any_phase_leaves_the_stand_safe(
     async def press_stop(directory: Path) -> None:
         for do in ("stop", "pause", "stop", "continue"):
             try:
-                answers.append(await asyncio.to_thread(ask, directory, {"do": do}))
+                answers.append(await asyncio.to_thread(ask, directory, do))
             except StandError as error:
                 answers.append(str(error))
 
     async def pause(directory: Path) -> None:
         with suppress(SessionError):  # the stop that follows at once may take the answer with it
-            await asyncio.to_thread(ask, directory, {"do": "pause"})
+            await asyncio.to_thread(ask, directory, "pause")
 
     def follow(item: Item) -> None:
         begins = isinstance(item, StepMark) and item.state is StepState.STARTED and item.kind == phase

@@ -3,37 +3,48 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 from recording.reading.session import Session
+from stand.assembly import Assembly
+from stand.running.fold import fold
+from stand.running.journal import Logbook
 from stand.running.order import Order
-from stand.serving.control import handlers
-from stand.serving.control_client import ask
-from stand.serving.desk import RunStatus
+from stand.running.run_desk import RunDesk
+from stand.running.stop import Stop
+from stand.serving.client import ask
+from stand.serving.desk import Who
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of
 
 
-def no_status() -> RunStatus:
-    raise AssertionError("nobody asks for it")
+def desk_of(assembly: Assembly) -> RunDesk:
+    """Of a run of which only the stand is asked."""
+    log, nothing = Logbook(assembly.hub, assembly.clock, fold((), ())), cast("Any", None)
+    return RunDesk(assembly, Path("session"), Stop(), log, nothing, nothing, nothing)
+
+
+def paused(desk: RunDesk) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    done = desk.pause(Who(name="somebody", how="socket"))
+    return done.reasons, done.moving
 
 
 async def test_the_answer_to_a_pause_says_what_still_moves(order: Callable[..., Order], simulator: Start):
     async with bench_of(order(), simulator) as bench:
         stand = bench.assembly.stand
-        table = handlers(stand.gate, lambda: None, no_status, lambda: stand.motions.texts)
+        desk = desk_of(bench.assembly)
         tasks = [
             asyncio.create_task(stand.table.move_to("linear", 140)),
             asyncio.create_task(stand.imaging.open_flap()),
         ]
         await bench.wait(1)
-        held = ["operator"]
-        assert table["pause"]({}) == {"reasons": held, "moving": ["linear homing, then to 140 mm", "flap opening"]}
+        assert paused(desk) == (("operator",), ("linear homing, then to 140 mm", "flap opening"))
         await asyncio.gather(*tasks)
-        assert table["pause"]({}) == {"reasons": held, "moving": []}
+        assert paused(desk) == (("operator",), ())
         tasks = [asyncio.create_task(stand.table.move_to("linear", 1)), asyncio.create_task(stand.imaging.close_flap())]
         await bench.wait(1)
-        assert table["pause"]({}) == {"reasons": held, "moving": ["linear to 1 mm", "flap closing"]}
+        assert paused(desk) == (("operator",), ("linear to 1 mm", "flap closing"))
         await asyncio.gather(*tasks)
 
 
@@ -46,15 +57,15 @@ async def test_a_pause_that_lasts_too_long_is_made_safe_and_held(tmp_path: Path,
         await watcher.event("run.start", 60)
         (directory,) = out.iterdir()
         await watcher.wait(600)
-        await asyncio.to_thread(ask, directory, {"do": "pause"})
+        await asyncio.to_thread(ask, directory, "pause")
         await watcher.event("held", 60)
         trip = await watcher.event("guard.paused_too_long", 960)
         assert trip.data == {"rule": "paused_too_long", "action": "hold"}
         await watcher.wait(60)
-        reasons.append((await asyncio.to_thread(ask, directory, {"do": "continue"}))["reasons"])
-        reasons.append((await asyncio.to_thread(ask, directory, {"do": "clear"}))["reasons"])
+        reasons.append((await asyncio.to_thread(ask, directory, "continue"))["reasons"])
+        reasons.append((await asyncio.to_thread(ask, directory, "clear"))["reasons"])
         await watcher.event("restored", 60)
-        await asyncio.to_thread(ask, directory, {"do": "stop"})
+        await asyncio.to_thread(ask, directory, "stop")
 
     await run_operated(ordered, out, watcher, operate())
     assert reasons == [["interlock"], []]

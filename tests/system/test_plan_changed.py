@@ -19,7 +19,7 @@ from stand.running.executor import Executor
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.serving.control_client import ask
+from stand.serving.client import ask
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
@@ -63,7 +63,7 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
             await executor.edit(9, [SetTemperature(24.0), rest[1]])
         await executor.edit(other.index + 1, rest)
         (directory,) = out.iterdir()
-        await asyncio.to_thread(ask, directory, {"do": "stop"})
+        await asyncio.to_thread(ask, directory, "stop")
 
     def watch(hub: Hub) -> None:
         def follow(item: Item) -> None:

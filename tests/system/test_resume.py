@@ -25,7 +25,7 @@ from stand.running.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import Interruption, interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.serving.control_client import ask, ask_status
+from stand.serving.client import ask, ask_status
 from stand.simulator import ControlSocket
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
@@ -162,13 +162,13 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
 
     async def pause_and_stop() -> None:
         (directory,) = out.iterdir()
-        assert (await asyncio.to_thread(ask, directory, {"do": "pause"}))["reasons"] == ["operator"]
+        assert (await asyncio.to_thread(ask, directory, "pause"))["reasons"] == ["operator"]
         status = await asyncio.to_thread(ask_status, directory)
         assert (status.state, status.reasons, status.recipe, status.frames_lost) == ("held", ("operator",), "short", 0)
         with pytest.raises(SessionError, match="a daemon is running this session already"):
             interruption(directory)
-        assert (await asyncio.to_thread(ask, directory, {"do": "continue"}))["reasons"] == []
-        await asyncio.to_thread(ask, directory, {"do": "stop"})
+        assert (await asyncio.to_thread(ask, directory, "continue"))["reasons"] == []
+        await asyncio.to_thread(ask, directory, "stop")
 
     def start(work: Callable[[], Coroutine[None, None, None]]) -> Callable[[Hub], None]:
         return at_step("Soak", lambda: tasks.append(asyncio.create_task(work())))

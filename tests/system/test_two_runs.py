@@ -15,9 +15,9 @@ import pytest
 from foundation.errors import SessionError
 from stand.config.stand_config import load_config
 from stand.running.order import Order
-from stand.serving.control_client import ask_status, running_sessions
+from stand.serving.client import ask_status, running_sessions
 from stand.simulator import ControlSocket
-from tests.stand.test_door import connected
+from tests.stand.test_listening import connected
 from tests.system.conftest import require_aravis
 from tests.system.test_real_time import BRIEF
 

@@ -1,4 +1,4 @@
-"""A daemon's control socket: a real one, and whoever may connect to it."""
+"""A daemon's Unix socket: a real one, and whoever may connect to it."""
 
 import asyncio
 import contextlib
@@ -9,19 +9,18 @@ import signal
 import stat
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from foundation.errors import SessionError
 from stand import runtime
-from stand.gate import Gate
-from stand.serving.control import handlers, serve
-from stand.serving.control_client import ask, ask_status, running_sessions
+from stand.serving.api.listening import MOST_CLIENTS
+from stand.serving.client import ask, ask_status, running_sessions, server_of
 from stand.serving.desk import RunStatus
-from stand.serving.door import LINE_LIMIT_BYTES, MOST_CLIENTS
 from stand.serving.presence import Entry, Presence, address_in, living, opened_folder
+from tests.stand.a_desk import STAND, ADesk, served
 
 STATUS = RunStatus(
     recipe="thermal-cycle",
@@ -39,31 +38,8 @@ STATUS = RunStatus(
     disk_free_bytes=12_300_000_000,
 )
 
-
-def gate_held_by(*reasons: str) -> Gate:
-    gate = Gate()
-    for reason in reasons:
-        gate.hold(reason)
-    return gate
-
-
-def echo(request: Mapping[str, object]) -> dict[str, object]:
-    return {"text": request.get("text")}
-
-
-async def slow_echo(request: Mapping[str, object]) -> dict[str, object]:
-    await asyncio.sleep(0)
-    return echo(request)
-
-
-def refuse(_: Mapping[str, object]) -> dict[str, object]:
-    raise SessionError("the session is not in the mood")
-
-
-HANDLERS = {"echo": echo, "slow_echo": slow_echo, "refuse": refuse}
-
-
-STAND = "a stand"
+HEALTH = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
 def entries_of(session: Path) -> list[Entry]:
@@ -78,127 +54,125 @@ async def connect(session: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWr
         return await asyncio.open_unix_connection(address_in(folder, daemon.socket.name))
 
 
-async def answers(session: Path, sent: bytes) -> list[dict[str, object]]:
-    """Everything that comes back for these bytes, the sender's end closed behind them."""
+async def reply(reader: asyncio.StreamReader) -> tuple[int, dict[str, object]]:
+    """One answer: its status and JSON; (0, {}) when the connection ends instead."""
+    line, length = await reader.readline(), 0
+    if not line:
+        return 0, {}
+    while header := (await reader.readline()).strip():
+        name, _, value = header.decode().partition(":")
+        length = int(value) if name.lower() == "content-length" else length
+    return int(line.split()[1]), json.loads(await reader.readexactly(length))
+
+
+async def answers(session: Path, sent: bytes) -> list[tuple[int, dict[str, object]]]:
+    """Everything that comes back for these bytes, until the daemon hangs up."""
     reader, writer = await connect(session)
-    with contextlib.suppress(OSError):  # it may hang up before it has read everything
+    found = []
+    with contextlib.suppress(OSError, asyncio.IncompleteReadError):  # it may hang up before it has read everything
         writer.write(sent)
         await writer.drain()
-        writer.write_eof()
-    lines = []
-    with contextlib.suppress(OSError):
-        lines = (await reader.read()).splitlines()
+        while (answer := await reply(reader)) != (0, {}):
+            found.append(answer)
+            if len(found) >= sent.count(b"HTTP/1.1"):
+                break
     writer.close()
     with contextlib.suppress(OSError):
         await writer.wait_closed()
-    return [json.loads(line) for line in lines]
-
-
-async def test_a_request_is_answered_by_its_handler_whether_it_waits_or_not(tmp_path: Path):
-    async with serve(tmp_path, STAND, HANDLERS):
-        for do in ("echo", "slow_echo"):
-            answer = await asyncio.to_thread(ask, tmp_path, {"do": do, "text": "ü\n°"})
-            assert answer == {"text": "ü\n°"}
-        with pytest.raises(SessionError, match="the session is not in the mood"):
-            await asyncio.to_thread(ask, tmp_path, {"do": "refuse"})
+    return found
 
 
 @pytest.mark.parametrize(
-    ("sent", "sentence"),
+    "sent",
     [
-        (b"\x00\xff\xfe\n", "expected a JSON object"),
-        (b"GET / HTTP/1.1\r\n", "expected a JSON object"),
-        (b"[1, 2]\n", "expected a JSON object"),
-        (b"\n", "expected a JSON object"),
-        (b"[" * 60_000 + b"\n", "expected a JSON object"),
-        (b"9" * 60_000 + b"\n", "expected a JSON object"),
-        (b'{"do": "explode"}\n', '"do" is one of echo, slow_echo, refuse'),
-        (b'{"do": ["echo"]}\n', '"do" is one of'),
-        (b"{}\n", '"do" is one of'),
-        (b'{"do": "echo"}', "broke off before the end of its line; nothing was done"),
-        (b"x" * (LINE_LIMIT_BYTES + 10), "at most 65536 bytes"),
-        (b"x" * (4 * LINE_LIMIT_BYTES) + b"\n", "at most 65536 bytes"),
+        b"\x00\xff\xfe\r\n\r\n",
+        b'{"do": "status"}\r\n\r\n',
+        b"GET\r\n\r\n",
+        b"GET /healthz HTTP/1\r\n\r\n",
+        b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 70_000,
+        b"GET /" + b"x" * 70_000,
+        b"POST /api/v1/run/pause HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\n",
+        b"POST /api/v1/run/pause HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n",
     ],
 )
-async def test_garbage_is_answered_with_a_sentence_and_hurts_nobody(tmp_path: Path, sent: bytes, sentence: str):
-    async with serve(tmp_path, STAND, HANDLERS):
-        got = await answers(tmp_path, sent)
-        if got:  # the kernel drops what it has for a sender that is cut off while it still sends
-            assert got[0]["ok"] is False
-            assert sentence in str(got[0]["error"])
-        else:
-            assert len(sent) > LINE_LIMIT_BYTES
-        assert await answers(tmp_path, b'{"do": "echo"}\n') == [{"ok": True, "text": None}]
+async def test_garbage_is_answered_with_a_sentence_and_hurts_nobody(tmp_path: Path, sent: bytes):
+    async with served(ADesk(), tmp_path) as desk:
+        for status, answer in await answers(tmp_path, sent):  # the kernel may drop what a sender is cut off with
+            assert status == 400
+            assert "no HTTP request" in str(answer["error"])
+        ((status, answer),) = await answers(tmp_path, HEALTH)
+        assert (status, answer["ok"]) == (200, True)
+        assert desk.orders == []
 
 
 async def test_requests_arrive_whole_byte_by_byte_and_many_at_once(tmp_path: Path):
-    line = b'{"do": "slow_echo", "text": 1}\n'
-    async with serve(tmp_path, STAND, HANDLERS):
-        assert await answers(tmp_path, line * 3 + b"nonsense\n" + line) == [
-            *[{"ok": True, "text": 1}] * 3,
-            {"ok": False, "error": 'expected a JSON object such as {"do": "status"}'},
-            {"ok": True, "text": 1},
-        ]
+    async with served(ADesk(), tmp_path):
+        assert [status for status, _ in await answers(tmp_path, HEALTH * 3 + STOP + HEALTH)] == [200] * 5
         reader, writer = await connect(tmp_path)
-        for byte in line:
+        for byte in STOP:
             writer.write(bytes([byte]))
             await writer.drain()
             await asyncio.sleep(0)
-        assert json.loads(await reader.readline()) == {"ok": True, "text": 1}
+        assert (await reply(reader))[1]["verb"] == "stop"
         writer.close()
         await writer.wait_closed()
 
 
 async def test_a_client_that_hangs_up_half_way_harms_nobody(tmp_path: Path):
-    async with serve(tmp_path, STAND, HANDLERS):
-        for sent in (b"", b'{"do"', b'{"do": "echo"}\n' * 1000):
+    async with served(ADesk(), tmp_path):
+        for sent in (b"", STOP[:20], HEALTH * 300):
             _, writer = await connect(tmp_path)
             writer.write(sent)
             writer.transport.abort()
-        assert await asyncio.to_thread(ask, tmp_path, {"do": "echo", "text": 1}) == {"text": 1}
+        assert (await asyncio.to_thread(ask, tmp_path, "pause"))["reasons"] == ["operator"]
 
 
 async def test_many_clients_are_served_side_by_side_and_the_most_silent_makes_room(tmp_path: Path):
-    async with serve(tmp_path, STAND, HANDLERS), contextlib.AsyncExitStack() as stack:
+    async with served(ADesk(), tmp_path), contextlib.AsyncExitStack() as stack:
         clients = []
+
+        async def is_answered(number: int) -> bool:
+            clients[number][1].write(HEALTH)
+            return (await reply(clients[number][0]))[0] == 200
+
         for number in range(MOST_CLIENTS):
             client = await connect(tmp_path)
             stack.callback(client[1].close)
-            client[1].write(json.dumps({"do": "echo", "text": number}).encode() + b"\n")
             clients.append(client)
-            assert json.loads(await client[0].readline())["text"] == number
-        clients[0][1].write(b'{"do": "echo", "text": "not silent"}\n')
-        assert json.loads(await clients[0][0].readline())["text"] == "not silent"
-        assert await asyncio.to_thread(ask, tmp_path, {"do": "echo", "text": 1}) == {"text": 1}
-        assert "you were silent longest" in json.loads(await clients[1][0].readline())["error"]
-        assert await clients[1][0].read() == b""
-        clients[0][1].write(b'{"do": "echo", "text": "still there"}\n')
-        assert json.loads(await clients[0][0].readline())["text"] == "still there"
+            assert await is_answered(number)
+        assert await is_answered(0)
+        assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
+        status, answer = await reply(clients[1][0])
+        assert (status, await clients[1][0].read()) == (503, b"")
+        assert "you were silent longest" in str(answer["error"])
+        assert await is_answered(0)
 
 
 async def test_a_request_that_ends_the_daemon_is_still_answered(tmp_path: Path):
     ended = asyncio.Event()
 
-    def end(_: Mapping[str, object]) -> dict[str, object]:
-        ended.set()
-        return {"said": "goodbye"}
+    class Ending(ADesk):
+        def stop(self, who):
+            ended.set()
+            return super().stop(who)
 
     async def daemon() -> None:
-        async with serve(tmp_path, STAND, {"stop": end}):
+        async with served(Ending(), tmp_path):
             await ended.wait()
 
     running = asyncio.create_task(daemon())
     await asyncio.sleep(0)
-    assert await answers(tmp_path, b'{"do": "stop"}\n') == [{"ok": True, "said": "goodbye"}]
+    ((status, answer),) = await answers(tmp_path, STOP)
+    assert (status, answer["verb"]) == (200, "stop")
     await running
     assert entries_of(tmp_path) == []
 
 
 async def test_ending_does_not_wait_for_a_client_that_neither_asks_nor_reads(tmp_path: Path):
     async with asyncio.timeout(5):
-        async with serve(tmp_path, STAND, HANDLERS):
+        async with served(ADesk(), tmp_path):
             reader, writer = await connect(tmp_path)
-            await answers(tmp_path, b'{"do": "echo"}\n')
+            await answers(tmp_path, HEALTH)
         assert await reader.read() == b""
     writer.close()
     await writer.wait_closed()
@@ -208,7 +182,7 @@ async def test_only_its_user_may_reach_the_socket_whatever_the_umask(tmp_path: P
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     before = os.umask(0)
     try:
-        async with serve(tmp_path, STAND, HANDLERS):
+        async with served(ADesk(), tmp_path):
             (daemon,) = [each for each in living() if each.entry.session == str(tmp_path)]
             modes = [
                 stat.S_IMODE(path.stat().st_mode) for path in (daemon.socket.parent, *daemon.socket.parent.iterdir())
@@ -223,8 +197,8 @@ async def test_paths_longer_than_the_kernel_takes_are_served(tmp_path: Path, mon
     session.mkdir(parents=True)
     runtime.mkdir(parents=True)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    async with serve(session, STAND, HANDLERS):
-        assert await asyncio.to_thread(ask, session, {"do": "echo", "text": 1}) == {"text": 1}
+    async with served(ADesk(), session):
+        assert await asyncio.to_thread(_answers, session)
         assert await asyncio.to_thread(running_sessions, session.parent) == [session]
     assert list(session.iterdir()) == []
     assert list((runtime / "thermostand").iterdir()) == []
@@ -241,7 +215,7 @@ async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tm
     old.mkdir(parents=True)
     new.parent.mkdir()
     (tmp_path / "link").symlink_to(old.parent)
-    async with serve(old, STAND, HANDLERS):
+    async with served(ADesk(), old):
         await told_its_folder(old)
 
         async def reached() -> list[object]:
@@ -263,7 +237,7 @@ async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tm
 
 def _answers(session: Path) -> bool:
     try:
-        return ask(session, {"do": "echo", "text": 1}) == {"text": 1}
+        return ask(session, "stop")["verb"] == "stop"
     except SessionError:
         return False
 
@@ -272,15 +246,15 @@ async def test_two_daemons_with_one_name_are_told_apart_by_the_folder(tmp_path: 
     """The first one's session was renamed, and the next run took its name."""
     session, away = tmp_path / "night", tmp_path / "renamed"
     session.mkdir()
-    async with serve(session, STAND, {"who": lambda _: {"is": "first"}}):
+    async with served(ADesk("first"), session):
         await told_its_folder(session)
         session.rename(away)
         session.mkdir()
-        async with serve(session, STAND, {"who": lambda _: {"is": "second"}}):
+        async with served(ADesk("second"), session):
             while len([entry for entry in entries_of(session) if entry.identity]) < 2:
                 await asyncio.sleep(0.01)
-            assert await asyncio.to_thread(ask, away, {"do": "who"}) == {"is": "first"}
-            assert await asyncio.to_thread(ask, session, {"do": "who"}) == {"is": "second"}
+            assert (await asyncio.to_thread(server_of(away).state)).reasons == ("first",)
+            assert (await asyncio.to_thread(server_of(session).state)).reasons == ("second",)
 
 
 async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -288,10 +262,10 @@ async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeyp
     runtime = tmp_path / "runtime"
     runtime.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    async with serve(tmp_path, STAND, HANDLERS), asyncio.timeout(30):
+    async with served(ADesk(), tmp_path), asyncio.timeout(30):
         shutil.rmtree(runtime / "thermostand")
         with pytest.raises(SessionError, match="no daemon is running"):
-            await asyncio.to_thread(ask, tmp_path, {"do": "echo"})
+            await asyncio.to_thread(ask, tmp_path, "stop")
         while not await asyncio.to_thread(_answers, tmp_path):
             await asyncio.sleep(0.05)
     assert list((runtime / "thermostand").iterdir()) == []
@@ -300,10 +274,10 @@ async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeyp
 DAEMON = """
 import asyncio, sys
 from pathlib import Path
-from stand.serving.control import serve
+from tests.stand.a_desk import ADesk, served
 
 async def run():
-    async with serve(Path(sys.argv[1]), "a stand", {"echo": lambda request: {}}):
+    async with served(ADesk(), Path(sys.argv[1])):
         print("ready", flush=True)
         await asyncio.Event().wait()
 
@@ -335,18 +309,18 @@ async def test_what_a_killed_daemon_left_is_nobodys_and_is_removed(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     runtime_folder = tmp_path / "thermostand"
     process = daemon(tmp_path)
-    assert ask(tmp_path, {"do": "echo"}) == {}
+    assert _answers(tmp_path)
     (entry,) = entries_of(tmp_path)
     assert (entry.session, entry.pid, entry.stand) == (str(tmp_path), process.pid, "a stand")
     process.kill()
     process.wait()
     assert len(list(runtime_folder.iterdir())) == 2
     with pytest.raises(SessionError, match="no daemon is running this session"):
-        ask(tmp_path, {"do": "echo"})
+        ask(tmp_path, "stop")
     assert list(runtime_folder.iterdir()) == []
     assert running_sessions(tmp_path.parent) == []
-    async with serve(tmp_path, STAND, HANDLERS):
-        assert await asyncio.to_thread(ask, tmp_path, {"do": "echo", "text": 1}) == {"text": 1}
+    async with served(ADesk(), tmp_path):
+        assert await asyncio.to_thread(_answers, tmp_path)
 
 
 def test_a_daemon_that_hangs_is_told_from_one_that_is_not_there(
@@ -354,19 +328,19 @@ def test_a_daemon_that_hangs_is_told_from_one_that_is_not_there(
 ):
     daemon(tmp_path).send_signal(signal.SIGSTOP)
     with pytest.raises(SessionError, match=r"has not answered within 0\.2 s; it may hang"):
-        ask(tmp_path, {"do": "echo"}, timeout_s=0.2)
+        ask(tmp_path, "stop", timeout_s=0.2)
 
 
 async def test_a_runtime_folder_of_somebody_else_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "thermostand").symlink_to(tmp_path)
     with pytest.raises(SessionError, match="is not a folder of this user; set XDG_RUNTIME_DIR"):
-        async with serve(tmp_path, STAND, HANDLERS):
+        async with served(ADesk(), tmp_path):
             pass
     (tmp_path / "thermostand").unlink()
     (tmp_path / "thermostand").write_text("mine")
     with pytest.raises(SessionError, match="cannot be made"):
-        async with serve(tmp_path, STAND, HANDLERS):
+        async with served(ADesk(), tmp_path):
             pass
     (tmp_path / "thermostand").unlink()
     (tmp_path / "thermostand").mkdir(mode=0o755)
@@ -387,22 +361,23 @@ def test_without_a_folder_of_the_login_the_systems_is_used(tmp_path: Path, monke
 def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentence(tmp_path: Path):
     for session in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(SessionError, match="no daemon is running this session"):
-            ask(session, {"do": "status"})
+            ask(session, "stop")
 
 
 @pytest.mark.parametrize(
     ("said", "sentence"),
     [
         (b"", "ended before it answered"),
-        (b'{"ok": true', "ended before it answered"),
+        (b"HTTP/1.1 200 OK\r\ncontent-length: 100\r\n\r\n{", "sent an unknown reply"),
         (b"hello\n", "sent an unknown reply"),
-        (b'{"ok": 1}\n', "sent an unknown reply"),
-        (b'{"ok": true, "status": {"recipe": 3}}\n', "sent an unknown status"),
+        (b"HTTP/1.1 200 OK\r\n\r\n<html>", "sent an unknown reply"),
+        (b'HTTP/1.1 200 OK\r\n\r\n{"stand": 3}', "sent an unknown reply"),
+        (b"HTTP/1.1 409 Conflict\r\n\r\n[]", "sent an unknown reply"),
     ],
 )
 async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: bytes, sentence: str):
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readline()
+        await reader.readuntil(b"\r\n\r\n")
         writer.write(said)
         writer.close()
 
@@ -416,18 +391,17 @@ async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: byt
 
 
 async def test_an_operator_holds_releases_clears_and_stops_the_run(tmp_path: Path):
-    gate, stopped = gate_held_by("interlock"), asyncio.Event()
-    async with serve(tmp_path, STAND, handlers(gate, stopped.set, lambda: STATUS)):
+    async with served(ADesk("interlock", run=STATUS), tmp_path) as desk:
 
         async def do(what: str) -> dict[str, object]:
-            return await asyncio.to_thread(ask, tmp_path, {"do": what})
+            return await asyncio.to_thread(ask, tmp_path, what)
 
-        assert await do("pause") == {"reasons": ["interlock", "operator"], "moving": []}
-        assert await do("continue") == {"reasons": ["interlock"]}  # no reason takes another's place
-        assert await do("clear") == {"reasons": []}
+        assert (await do("pause"))["reasons"] == ["interlock", "operator"]
+        assert (await do("continue"))["reasons"] == ["interlock"]  # no reason takes another's place
+        assert (await do("clear"))["reasons"] == []
         with pytest.raises(SessionError, match="nothing to clear"):
             await do("clear")
         assert await asyncio.to_thread(ask_status, tmp_path) == STATUS
-        assert not stopped.is_set()
-        assert await do("stop") == {}
-        assert stopped.is_set()
+        assert [verb for _, verb, _ in desk.orders] == ["pause", "continue", "clear"]
+        await do("stop")
+        assert [verb for _, verb, _ in desk.orders][-1] == "stop"

@@ -1,0 +1,52 @@
+"""Which stand a command is for: the daemon that runs a session here, or one at an address."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from foundation.errors import ConfigError, SessionError
+from stand.serving.client import Server, running_sessions, server_at, server_of
+
+DirectoryArgument = Annotated[
+    Path | None,
+    typer.Argument(metavar="[DIR]", help="A session, or a folder of sessions; else recording.directory of --config."),
+]
+ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
+UrlOption = Annotated[
+    str, typer.Option("--url", help="A stand's address, http://HOST:PORT, instead of its socket here.")
+]
+TokenOption = Annotated[Path | None, typer.Option("--token-file", help="The file with the token for --url.")]
+
+
+def reached(
+    directory: Path | None, config: str, url: str = "", token_file: Path | None = None, *, anywhere: bool = False
+) -> Server:
+    """The stand at `url`; else the daemon that runs `directory`, when that is a session, else the only running one in
+    it; ConfigError when there are several. `anywhere`: without a directory the only one on this machine will do, for
+    what can do no harm."""
+    if url:
+        return server_at(url, token_file)
+    return server_of(_running(directory, config, anywhere=anywhere))
+
+
+def _running(directory: Path | None, config: str, *, anywhere: bool) -> Path:
+    everywhere = running_sessions() if anywhere and directory is None else []
+    if len(everywhere) == 1:  # no configuration need be read: STOP is quick
+        return everywhere[0]
+    # Reading a configuration takes longer than all the rest.
+    from recording.format.inventory import inventory
+    from stand.config.stand_config import load_config, packaged
+
+    root = directory or load_config(packaged("", config)).recording.directory
+    sessions = running_sessions(root) or everywhere
+    if len(sessions) > 1:
+        raise ConfigError(f"{root}: several sessions are running, name one: {', '.join(map(str, sessions))}")
+    if sessions:
+        return sessions[0]
+    if inventory(root):
+        raise SessionError(f"{root}: no daemon is running this session")
+    raise SessionError(f"{root}: no daemon is running a session there")

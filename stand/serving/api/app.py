@@ -1,0 +1,104 @@
+"""The application: every route of the HTTP interface, and how what goes wrong is answered."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+
+from foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
+from stand.serving.api.access import Access, App, Gatekeeper
+from stand.serving.api.bridge import Bridge, NoAnswer
+from stand.serving.api.commands import commands
+from stand.serving.api.pace import Pace
+from stand.serving.api.reads import reads
+from stand.serving.api.recorded import recorded
+from stand.serving.api.stream import Stream, json_of
+from stand.serving.desk import Conflict, Missing
+
+if TYPE_CHECKING:
+    from stand.serving.api.server import Interface
+
+# What was raised -> the answer's status; the first that fits.
+_STATUS: tuple[tuple[type[Exception], int], ...] = (
+    (Missing, 404),
+    (Conflict, 409),
+    (StandTripped, 409),
+    (ConfigError, 422),
+    (DeviceError, 502),
+    (SessionError, 409),
+    (StandError, 409),
+    (NoAnswer, 504),
+)
+_DESCRIPTION = (
+    "Reads and operates a thermal test stand. Instants are ns since the epoch on the stand's clock; a state's "
+    'utc_offset_ns makes them UTC. Whatever is refused is answered with {"error": sentence}.'
+)
+
+
+def make_app(
+    bridge: Bridge,
+    stream: Stream,
+    access: Access,
+    pace: Pace,
+    interface: Interface,
+    failed: Callable[[Exception], None],
+) -> App:
+    """The ASGI application behind the one check of who may ask. `failed` is told of what should not happen."""
+    app = FastAPI(
+        title="thermostand",
+        version=importlib.metadata.version("thermostand"),
+        description=_DESCRIPTION,
+        docs_url=None,  # pages of another site
+        redoc_url=None,
+        redirect_slashes=False,
+        responses={403: _ERROR, 401: _ERROR, 422: _ERROR},
+    )
+    app.include_router(reads(bridge, stream, access))
+    app.include_router(commands(bridge))
+    app.include_router(recorded(bridge, interface.sessions))
+    for room in interface.rooms:
+        app.include_router(room(bridge))
+    for kind, status in _STATUS:
+        app.add_exception_handler(kind, _answer_with(status))
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _refused)
+    return Gatekeeper(cast("App", app), access, pace, failed)
+
+
+_ERROR: dict[str, Any] = {
+    "description": "What is wrong, in a sentence",
+    "content": {
+        "application/json": {
+            "schema": {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
+        }
+    },
+}
+
+
+def _answer_with(status: int) -> Callable[[Request, Exception], Response]:
+    return lambda _, error: _error(status, str(error))
+
+
+def _refused(_: Request, error: Exception) -> Response:
+    refused = cast("HTTPException", error)
+    return _error(refused.status_code, str(refused.detail), refused.headers)
+
+
+def _invalid(_: Request, error: Exception) -> Response:
+    """Where, and what is wrong there; not what was sent, which may be secret or long."""
+    faults = cast("RequestValidationError", error).errors()
+    sentences: list[str] = []
+    for fault in faults[:5]:
+        where = ".".join(str(part) for part in fault["loc"] if part not in ("body", "query", "path", "header"))
+        sentences.append(f"{where or 'the body'}: {fault['msg']}")
+    return _error(422, "; ".join(sentences) or "the request is not understood")
+
+
+def _error(status: int, sentence: str, headers: Mapping[str, str] | None = None) -> Response:
+    text = sentence.encode("utf-8", "replace").decode()
+    return Response(json_of({"error": text}), status, dict(headers or {}), "application/json")

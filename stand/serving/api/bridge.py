@@ -1,0 +1,233 @@
+"""Between the control loop, which nobody may delay, and the thread that serves clients.
+
+What clients read is a snapshot that the control loop makes and swaps in as a whole. What passes the hub is numbered and
+queued here, the oldest being dropped when nobody takes it. What clients order is called on the control loop, one short
+call each, and is answered through a future with a time-out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import inspect
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TypeVar
+
+from foundation.clock import Clock, WallClock, utc_offset_ns
+from foundation.hub import Hub
+from foundation.items import Event, Item, StepMark
+from foundation.readings import Frame
+from foundation.tasks import failure_text
+from stand.serving.desk import COMMAND, Desk, Done, PlanStep, StandState, Who
+
+_REFRESH_S = 0.5
+_SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
+_FRESH_S = 0.3  # so long one who asks for the state waits for a new one
+_QUEUE = 20_000  # items, which are some MB; the thread takes them four times a second at the least
+_PLAN_AGE_S = 5.0  # what a plan has earned and expects changes slowly; a step that begins or ends is told at once
+_STOPPED_S = 0.1  # so long one stop answers for others: they are the same, and a flood must not fill the recording
+COMMAND_LIMIT_S = 5.0
+_FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01
+
+Result = TypeVar("Result")
+
+
+class NoAnswer(Exception):
+    """The control loop has not answered in time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The stand as it was at `at_s` (time.monotonic)."""
+
+    state: StandState
+    at_s: float
+
+    @property
+    def age_s(self) -> float:
+        """How long ago that was."""
+        return time.monotonic() - self.at_s
+
+
+class Bridge:
+    """Made, opened and closed on the control loop; `fresh`, `take`, `ask`, `command`, `stop` and `plan` are for the
+    other side.
+
+    The numbers of the stream go up from one daemon to the next, too: they begin at the time of its start.
+    """
+
+    def __init__(self, desk: Desk, hub: Hub, clock: Clock) -> None:
+        self.failure = ""  # why there is no new snapshot
+        self._desk = desk
+        self._hub = hub
+        self._clock = clock
+        self._loop = asyncio.get_running_loop()
+        self._items: deque[tuple[int, int, Item]] = deque(maxlen=_QUEUE)
+        self._seq = first_seq()
+        self._command_seq = 0
+        self._plan: tuple[PlanStep, ...] | None = None
+        self._plan_at_s = 0.0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._stopping: asyncio.Future[Done] | None = None  # on the other side
+        self._stopped: tuple[float, Done] | None = None
+        self._refreshing: asyncio.Future[None] | None = None
+        self._next: asyncio.TimerHandle | None = None
+        self._is_open = True
+        self.snapshot = Snapshot(desk.state(), time.monotonic())
+        self._refresh()
+        hub.subscribe(self._follow)
+
+    def close(self) -> None:
+        """Nothing is followed any more, and orders are not taken."""
+        self._is_open = False
+        self._hub.unsubscribe(self._follow)
+        if self._next is not None:
+            self._next.cancel()
+
+    def _follow(self, item: Item) -> None:
+        if not self._is_open or isinstance(item, Frame):
+            return
+        self._seq += 1
+        self._items.append((self._seq, utc_offset_ns(self._clock), item))
+        if isinstance(item, Event | StepMark):
+            self._plan = None
+            if isinstance(item, Event) and item.kind == COMMAND:
+                self._command_seq = self._seq
+            self._refresh_within(max(0.0, self.snapshot.at_s + _SOONEST_S - time.monotonic()))
+
+    def _refresh_within(self, wait_s: float) -> None:
+        due_s = self._loop.time() + wait_s
+        if self._next is None or self._next.when() > due_s:
+            if self._next is not None:
+                self._next.cancel()
+            self._next = self._loop.call_at(due_s, self._refresh)
+
+    def _refresh(self) -> None:
+        """Swap in what is now; what cannot be told leaves the last one, which grows old."""
+        if not self._is_open:
+            return
+        try:
+            state = self._desk.state().model_copy(update={"seq": self._seq})
+            self.snapshot, self.failure = Snapshot(state, time.monotonic()), ""
+        except Exception as error:  # noqa: BLE001 - clients are told; the run goes on without them
+            self.failure = failure_text(error)
+        self._next = None
+        self._refresh_within(_REFRESH_S)
+
+    # From here on: called by the thread that serves clients, in its own loop.
+
+    def take(self) -> list[tuple[int, int, Item]]:
+        """What has been published since, with its number and the offset to UTC then."""
+        taken: list[tuple[int, int, Item]] = []
+        with suppress(IndexError):
+            while True:
+                taken.append(self._items.popleft())
+        return taken
+
+    async def ask(self, call: Callable[[Desk], Result | Awaitable[Result]], limit_s: float = COMMAND_LIMIT_S) -> Result:
+        """What `call` gives on the control loop, or what it raises. NoAnswer when that takes longer than `limit_s`:
+        it may still be done."""
+        answer: concurrent.futures.Future[Result] = concurrent.futures.Future()
+        self._hand_over(lambda: self._called(call, answer))
+        try:
+            return await asyncio.wait_for(asyncio.wrap_future(answer), limit_s)
+        except TimeoutError:
+            raise NoAnswer(f"the stand has not answered within {limit_s:g} s; it may still do what was asked") from None
+
+    async def command(self, call: Callable[[Desk], Done | Awaitable[Done]]) -> Done:
+        """As `ask`, with the number of the command's event."""
+
+        async def numbered(desk: Desk) -> Done:
+            before = self._command_seq
+            done = call(desk)
+            done = await done if inspect.isawaitable(done) else done
+            self._refresh_within(0.0)
+            return done.model_copy(update={"seq": self._command_seq}) if self._command_seq > before else done
+
+        return await self.ask(numbered)
+
+    async def stop(self, who: Who) -> Done:
+        """Stop, before anything else that waits to be called. Stops that come while one is under way, or within
+        0.1 s, are the same one."""
+        if self._stopped is not None and time.monotonic() < self._stopped[0] + _STOPPED_S:
+            return self._stopped[1]
+        if self._stopping is None:
+            self._stopping = asyncio.ensure_future(self.ask(lambda desk: desk.stop(who)))
+            self._stopping.add_done_callback(self._has_stopped)
+        return await asyncio.shield(self._stopping)
+
+    async def fresh(self) -> Snapshot:
+        """The stand as it is now; the last snapshot when the control loop has no time for another one."""
+        if self._refreshing is None:
+            self._refreshing = asyncio.ensure_future(self.ask(lambda _: self._refresh(), _FRESH_S))
+            self._refreshing.add_done_callback(self._has_refreshed)
+        with suppress(NoAnswer):
+            await asyncio.shield(self._refreshing)
+        return self.snapshot
+
+    async def plan(self) -> tuple[PlanStep, ...]:
+        """The plan in force, at most some seconds old; made in a thread of its own, as it may be long."""
+        plan = self._plan
+        if plan is None or time.monotonic() > self._plan_at_s + _PLAN_AGE_S:
+            self._plan_at_s = time.monotonic()
+            plan = self._plan = await asyncio.to_thread(self._desk.plan)
+        return plan
+
+    def _has_refreshed(self, refreshing: asyncio.Future[None]) -> None:
+        self._refreshing = None
+        if not refreshing.cancelled():
+            refreshing.exception()
+
+    def _has_stopped(self, stopping: asyncio.Future[Done]) -> None:
+        self._stopping = None
+        if not stopping.cancelled() and stopping.exception() is None:
+            self._stopped = time.monotonic(), stopping.result()
+
+    def _hand_over(self, call: Callable[[], None]) -> None:
+        try:
+            self._loop.call_soon_threadsafe(call)
+        except RuntimeError:  # it is closed
+            raise NoAnswer("the daemon has ended") from None
+
+    def _called(
+        self, call: Callable[[Desk], Result | Awaitable[Result]], answer: concurrent.futures.Future[Result]
+    ) -> None:
+        """On the control loop."""
+        if not self._is_open:
+            answer.set_exception(NoAnswer("the daemon is ending"))
+            return
+        try:
+            result = call(self._desk)
+        except Exception as error:  # noqa: BLE001 - it belongs to who asked
+            _give(answer, error)
+            return
+        if inspect.isawaitable(result):
+            task = asyncio.ensure_future(self._completed(result, answer))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        else:
+            _give(answer, result)
+
+    async def _completed(self, result: Awaitable[Result], answer: concurrent.futures.Future[Result]) -> None:
+        try:
+            _give(answer, await result)
+        except Exception as error:  # noqa: BLE001 - it belongs to who asked
+            _give(answer, error)
+
+
+def _give(answer: concurrent.futures.Future[Result], result: Result | Exception) -> None:
+    if answer.cancelled() or not answer.set_running_or_notify_cancel():
+        return
+    if isinstance(result, Exception):
+        answer.set_exception(result)
+    else:
+        answer.set_result(result)
+
+
+def first_seq() -> int:
+    """A number that no daemon before this one has reached: its stream has fewer than 1000 items a second."""
+    return (WallClock().now_ns() - _FIRST_NS) // 1_000_000

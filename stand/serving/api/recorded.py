@@ -1,0 +1,159 @@
+"""What lies on the disk: recipes and sessions. Read in threads of their own, one at a time, as a disk may hang."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from fastapi import APIRouter, Response
+from fastapi import Path as FromPath
+from pydantic import BaseModel
+
+from recording.format.inventory import inventory
+from recording.reading.glance import Glance, glance
+from stand.config.recipe import Recipe
+from stand.config.stand_config import packaged
+from stand.serving.api.bridge import Bridge, NoAnswer
+from stand.serving.desk import Missing
+
+REPORT = "report.html"
+# A report is a page of its own with styles and drawings in it: nothing in it may run, or ask this stand anything.
+REPORT_CSP = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
+_DISK_LIMIT_S = 20.0
+
+SessionName = Annotated[str, FromPath(max_length=255)]
+Result = TypeVar("Result")
+
+
+class RecipeEntry(BaseModel):
+    """An installed recipe and its text."""
+
+    name: str
+    text: str
+
+
+class SessionEntry(BaseModel):
+    """A recorded session. begin_ns, end_ns: of its first and last message, None when it holds none. run: how it ended;
+    files: whether they are sound; has_report: whether there is one to be read."""
+
+    name: str
+    recipe: str
+    operator: str
+    simulated: bool
+    begin_ns: int | None
+    end_ns: int | None
+    frames: int
+    bytes: int
+    run: str
+    files: str
+    troubles: list[str]
+    missing: list[str]
+    has_report: bool
+
+
+class Disk:
+    """One question to the disk at a time."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+
+    async def ask(self, question: Callable[[], Result]) -> Result:
+        """Its answer; NoAnswer when the disk does not give it in time."""
+        try:
+            async with asyncio.timeout(_DISK_LIMIT_S):
+                async with self._lock:
+                    return await asyncio.shield(asyncio.to_thread(question))
+        except TimeoutError:
+            raise NoAnswer(f"the disk has not answered within {_DISK_LIMIT_S:g} s") from None
+
+
+def session_in(folder: Path, name: str) -> Path:
+    """The session of this name in the folder of sessions; Missing when there is none, whatever the name tries."""
+    path = folder / name
+    is_name = (
+        bool(name) and name not in (".", "..") and "/" not in name and "\0" not in name and not name.startswith(".")
+    )
+    try:
+        if is_name and not path.is_symlink() and inventory(path):
+            return path
+    except (OSError, ValueError):
+        pass
+    raise Missing("there is no session of that name")
+
+
+def recorded(_: Bridge, folder: Path) -> APIRouter:
+    """The routes."""
+    router, disk = APIRouter(prefix="/api/v1"), Disk()
+
+    @router.get("/recipes", response_model=list[RecipeEntry])
+    async def recipes() -> list[RecipeEntry]:
+        """The installed recipes."""
+        return await disk.ask(_recipes)
+
+    @router.get("/recipes/schema")
+    async def schema() -> dict[str, Any]:
+        """The JSON Schema of a recipe."""
+        return Recipe.model_json_schema()
+
+    @router.get("/sessions", response_model=list[SessionEntry])
+    async def sessions() -> list[SessionEntry]:
+        """The recorded sessions, the oldest first."""
+        return await disk.ask(lambda: _sessions(folder))
+
+    @router.get("/sessions/{name}", response_model=SessionEntry)
+    async def session(name: SessionName) -> SessionEntry:
+        """One session."""
+        return await disk.ask(lambda: _entry(glance(session_in(folder, name))))
+
+    @router.get(
+        "/sessions/{name}/report.html", response_class=Response, responses={200: {"content": {"text/html": {}}}}
+    )
+    async def report(name: SessionName) -> Response:
+        """Its report."""
+        text = await disk.ask(lambda: _report(session_in(folder, name)))
+        headers = {"content-security-policy": REPORT_CSP}
+        return Response(text, headers=headers, media_type="text/html; charset=utf-8")
+
+    return router
+
+
+def _recipes() -> list[RecipeEntry]:
+    here = packaged("recipes", "thermal-cycle").parent
+    return [RecipeEntry(name=path.stem, text=path.read_text("utf-8")) for path in sorted(here.glob("*.yaml"))]
+
+
+def _sessions(folder: Path) -> list[SessionEntry]:
+    try:
+        names = sorted(entry.name for entry in os.scandir(folder) if entry.is_dir(follow_symlinks=False))
+    except OSError:
+        return []
+    found = [_entry(glance(folder / name)) for name in names if not name.startswith(".") and inventory(folder / name)]
+    return sorted(found, key=lambda entry: (entry.begin_ns or 0, entry.name))
+
+
+def _entry(seen: Glance) -> SessionEntry:
+    return SessionEntry(
+        name=seen.path.name.encode("utf-8", "replace").decode(),
+        recipe=seen.metadata.get("recipe", ""),
+        operator=seen.metadata.get("operator", ""),
+        simulated=seen.simulated,
+        begin_ns=seen.begin_ns,
+        end_ns=seen.end_ns,
+        frames=seen.frames,
+        bytes=seen.size_bytes,
+        run=str(seen.run),
+        files=str(seen.state),
+        troubles=list(seen.troubles),
+        missing=list(seen.missing),
+        has_report=(seen.path / REPORT).is_file(),
+    )
+
+
+def _report(session: Path) -> bytes:
+    path = session / REPORT
+    if not path.is_file() or path.is_symlink():
+        raise Missing("this session has no report; `compensate report` makes one")
+    return path.read_bytes()

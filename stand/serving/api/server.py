@@ -1,0 +1,187 @@
+"""The thread that serves a stand's clients: `serve` on the control loop, everything else in the thread's own loop."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import threading
+from collections.abc import AsyncGenerator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from foundation.clock import Clock
+from foundation.errors import ConfigError, SessionError, StandError
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.tasks import failure_text
+from stand.serving.api.bridge import Bridge
+from stand.serving.desk import Desk
+from stand.serving.presence import Entry, Presence
+
+_LOOK_S = 1.0
+_CLOSE_LIMIT_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """How a stand is reached besides its Unix socket.
+
+    host, port: to listen at by TCP; no port, no TCP. tokens: by name. hosts: names of this stand besides this machine's
+    own. sessions: the folder of recorded sessions. rooms: makes what else is served (history, frames, the page) in the
+    thread, as routers, by the bridge.
+    """
+
+    sessions: Path
+    host: str = "127.0.0.1"
+    port: int | None = None
+    tokens: dict[str, str] = field(default_factory=dict[str, str], repr=False)
+    hosts: tuple[str, ...] = ()
+    rooms: Sequence[Callable[[Bridge], Any]] = ()
+
+    def check(self) -> None:
+        """ConfigError when everybody on the network could operate the stand."""
+        from stand.serving.api.access import is_loopback
+
+        if self.port is not None and not self.tokens and not is_loopback(self.host):
+            raise ConfigError(
+                f"--host {self.host}: others on the network could operate this stand; make a token with "
+                "`stand token add NAME`, or listen at 127.0.0.1"
+            )
+
+
+@asynccontextmanager
+async def serve(
+    desk: Desk, hub: Hub, clock: Clock, session: Path, stand: str, interface: Interface
+) -> AsyncGenerator[Presence]:
+    """Answer for the daemon that runs `session` on the stand of this name while inside.
+
+    SessionError when the runtime folder cannot be used, ConfigError when it cannot listen at the port. A socket or
+    entry that somebody removes is made again within some seconds.
+    """
+    interface.check()
+    presence = Presence(Entry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
+    doors = {"socket": presence.appear()}
+    try:
+        if interface.port is not None:
+            doors["tcp"] = _tcp(interface.host, interface.port)
+        bridge = Bridge(desk, hub, clock)
+    except BaseException:
+        for door in doors.values():
+            door.close()
+        presence.disappear()
+        raise
+    thread = _Thread(bridge, doors, presence, interface, _reporter(hub, clock))
+    try:
+        thread.start()
+        presence.identify()
+        yield presence
+    finally:
+        bridge.close()
+        with clock.hold():  # a client that does not read must not be where virtual time goes on
+            await asyncio.to_thread(thread.end)
+        presence.disappear()
+
+
+def _tcp(host: str, port: int) -> socket.socket:
+    from stand.serving.api.listening import listening_at
+
+    try:
+        return listening_at(host, port)
+    except OSError as error:
+        raise ConfigError(f"--port {port}: cannot listen at {host} ({error.strerror or error})") from error
+
+
+def _reporter(hub: Hub, clock: Clock) -> Callable[[str, str], None]:
+    """A function for any thread: a warning of this kind, once for each text."""
+    loop, told = asyncio.get_running_loop(), set[str]()
+
+    def report(kind: str, text: str) -> None:
+        if text not in told and len(told) < 100:
+            told.add(text)
+            with suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(lambda: hub.publish(Event(clock.now_ns(), "warning", kind, text)))
+
+    return report
+
+
+class _Thread:
+    def __init__(
+        self,
+        bridge: Bridge,
+        doors: dict[str, socket.socket],
+        presence: Presence,
+        interface: Interface,
+        report: Callable[[str, str], None],
+    ) -> None:
+        self._bridge = bridge
+        self._doors = doors
+        self._presence = presence
+        self._interface = interface
+        self._report = report
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ended: asyncio.Event | None = None
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="interface", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def end(self) -> None:
+        """Wait for it; it ends by itself when the process does, whatever keeps it."""
+        self._is_over.set()
+        loop, ended = self._loop, self._ended
+        if loop is not None and ended is not None:
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(ended.set)
+        self._thread.join(_CLOSE_LIMIT_S)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._main())
+        except Exception as error:  # noqa: BLE001 - the run goes on without it
+            self._report("no_control", f"the run cannot be queried or paused: {failure_text(error)}")
+        finally:
+            for door in self._doors.values():
+                door.close()
+
+    async def _main(self) -> None:
+        # Imported here: nothing else of the program needs them, and they take half a second.
+        from stand.serving.api.access import Access
+        from stand.serving.api.app import make_app
+        from stand.serving.api.listening import Listening
+        from stand.serving.api.pace import Pace
+        from stand.serving.api.stream import Stream
+
+        pace, stream = Pace(), Stream(self._bridge)
+        access = Access(self._interface.tokens, self._interface.hosts)
+        app = make_app(self._bridge, stream, access, pace, self._interface, self._failed)
+        listening = Listening(app, pace)
+        self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
+        if self._is_over.is_set():
+            self._ended.set()
+        for door, each in self._doors.items():
+            listening.listen(door, each)
+        working = [asyncio.create_task(stream.run()), asyncio.create_task(self._look_after(listening))]
+        try:
+            await self._ended.wait()
+        finally:
+            for task in working:
+                task.cancel()
+            await asyncio.gather(*working, return_exceptions=True)
+            await listening.close()
+
+    async def _look_after(self, listening: Any) -> None:
+        """A logout removes $XDG_RUNTIME_DIR with the socket that is in it."""
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            listening.look_after()
+            if not self._presence.is_there():
+                with suppress(SessionError, StandError):  # tried again the next time
+                    self._doors["socket"] = self._presence.appear()
+                    listening.listen("socket", self._doors["socket"])
+
+    def _failed(self, error: Exception) -> None:
+        self._report("interface_failed", f"the interface has failed: {failure_text(error)}")

@@ -1,0 +1,213 @@
+"""The stream of a stand: numbered messages, replayed from a ring, to viewers of which none can keep the others waiting.
+
+    {"seq": 28312345, "type": "event", "data": {"kind": "held", "level": "warning", "text": ..., "data": {...}, ...}}
+
+`reading` is a batch of one device, `state` the whole stand (its seq is that of the last message before it), and `gone`
+says which numbers are not given any more, or were too many for this viewer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from typing import Literal
+
+from pydantic_core import to_json
+
+from foundation.items import Batch, Event, Item, StepMark
+from foundation.readings import Frame, Quality, Reading
+from stand.serving.api.bridge import Bridge, Snapshot
+from stand.serving.desk import StandState
+
+EVENTS = 5_000  # kept for those who reconnect: days
+READINGS = 3_000  # batches: some minutes; the page's history has the rest
+_QUEUE = 512  # messages that a viewer may be behind
+_BETWEEN_STATES = 32  # messages at most, for one that is behind
+_BUSY_S, _IDLE_S = 0.05, 0.25  # between looks for what is new, with and without viewers
+MOST_VIEWERS = 24
+
+Kind = Literal["state", "event", "reading", "gone"]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A numbered item of the stream."""
+
+    seq: int
+    type: Kind
+    data: Mapping[str, object]
+
+    def json(self) -> str:
+        """As it is sent."""
+        return json_of({"seq": self.seq, "type": self.type, "data": self.data})
+
+
+def json_of(value: object) -> str:
+    """JSON of any value, NaN and infinities as null."""
+    return to_json(value, inf_nan_mode="null", fallback=_plain).decode()
+
+
+def _plain(value: object) -> object:
+    return dict(value) if isinstance(value, Mapping) else str(value)  # pyright: ignore[reportUnknownVariableType]
+
+
+def message_of(seq: int, utc_offset_ns: int, item: Item) -> Message:
+    """An item as the stream gives it: a step of the plan that began or ended is an event of kind `step`."""
+    stamp = {"time_ns": item.time_ns, "utc_offset_ns": utc_offset_ns}
+    match item:
+        case Event(_, level, kind, text, data):
+            return Message(seq, "event", {**stamp, "level": level, "kind": kind, "text": text, "data": dict(data)})
+        case StepMark(_, step_id, index, kind, state, parameters):
+            data = {"step_id": step_id, "index": index, "step": kind, "state": state, "parameters": parameters}
+            text = f"step {index + 1} ({kind}) {state}"
+            return Message(seq, "event", {**stamp, "level": "info", "kind": "step", "text": text, "data": data})
+        case Batch(device, _, readings):
+            values = {reading.channel: reading_of(reading) for reading in readings}
+            return Message(seq, "reading", {**stamp, "device": device, "readings": values})
+        case Frame():
+            raise ValueError("frames are no items of the stream")
+
+
+def reading_of(reading: Reading) -> dict[str, object]:
+    """The fields of desk.ReadingState."""
+    value = None if reading.quality is Quality.BAD else reading.value
+    fields = {"value": value, "unit": reading.unit, "quality": reading.quality, "time_ns": reading.time_ns}
+    return {**fields, "reason": reading.reason, "cause": reading.cause}
+
+
+class Viewer:
+    """One client: what it has not been sent yet, a replay to begin with. Of states only the last one counts."""
+
+    def __init__(self, replay: Iterable[Message] = ()) -> None:
+        self.drops = 0
+        self._waiting = deque(replay)
+        self._most = _QUEUE + len(self._waiting)
+        self._lost: tuple[int, int] | None = None
+        self._state = ""
+        self._since_state = 0
+        self._something = asyncio.Event()
+
+    def give(self, message: Message) -> None:
+        """Queue a message, instead of the oldest one when there are too many."""
+        if len(self._waiting) >= self._most:
+            oldest = self._waiting.popleft()
+            self.drops += 1
+            self._lost = (oldest.seq if self._lost is None else self._lost[0], oldest.seq)
+        self._waiting.append(message)
+        self._something.set()
+
+    def tell(self, state: str) -> None:
+        """The state, as it is now."""
+        self._state = state
+        self._something.set()
+
+    async def next(self) -> str:
+        """The next message; waits for one."""
+        while not (self._lost or self._waiting or self._state):
+            self._something.clear()
+            await self._something.wait()
+        if self._state and (not self._waiting or self._since_state >= _BETWEEN_STATES):
+            state, self._state, self._since_state = self._state, "", 0
+            return state
+        self._since_state += 1
+        if self._lost is not None:
+            (first, last), self._lost = self._lost, None
+            return Message(last, "gone", {"first": first, "last": last, "drops": self.drops}).json()
+        return self._waiting.popleft().json()
+
+
+class Stream:
+    """Takes what the control loop has published and gives it to every viewer; runs until cancelled."""
+
+    def __init__(self, bridge: Bridge) -> None:
+        self.drops = 0  # items that were dropped before this thread took them
+        self._bridge = bridge
+        self._events: deque[Message] = deque(maxlen=EVENTS)
+        self._readings: deque[Message] = deque(maxlen=READINGS)
+        self._first = self._seq = bridge.snapshot.state.seq
+        self._gone_events = self._gone_readings = self._seq  # the last numbers that are in no ring any more
+        self._viewers: set[Viewer] = set()
+        self._told: Snapshot | None = None
+
+    @property
+    def viewers(self) -> int:
+        """How many there are."""
+        return len(self._viewers)
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        while True:
+            self.pump()
+            await asyncio.sleep(_BUSY_S if self._viewers else _IDLE_S)
+
+    def pump(self) -> None:
+        """What is new since the last time."""
+        for seq, utc_offset_ns, item in self._bridge.take():
+            self.drops += seq - self._seq - 1
+            self._seq = seq
+            message = message_of(seq, utc_offset_ns, item)
+            self._keep(message)
+            for viewer in self._viewers:
+                viewer.give(message)
+        snapshot = self._bridge.snapshot
+        if snapshot is not self._told and self._viewers:
+            self._told, text = snapshot, state_json(snapshot, self.drops)
+            for viewer in self._viewers:
+                viewer.tell(text)
+
+    def join(self, after: int | None) -> Viewer:
+        """A new viewer: with all that there is after a number, or from now on, and then the state."""
+        self.pump()
+        missing = None if after is None else self.missing(after)
+        viewer = Viewer(() if after is None else (*((missing,) if missing else ()), *self.after(after)))
+        viewer.tell(state_json(self._bridge.snapshot, self.drops))
+        self._viewers.add(viewer)
+        return viewer
+
+    def leave(self, viewer: Viewer) -> None:
+        """It is not there any more."""
+        self._viewers.discard(viewer)
+
+    def events(self, after: int, limit: int) -> list[Message]:
+        """The events after a number, at most so many."""
+        self.pump()
+        return list(islice((each for each in self._events if each.seq > after), limit))
+
+    def missing(self, after: int) -> Message | None:
+        """What a viewer that has seen all up to `after` cannot be given any more."""
+        first, last = after + 1, max(self._gone_events, self._gone_readings)
+        if after > self._seq:  # of another stream
+            first, last = self._first + 1, self._first
+        elif last < first:
+            return None
+        types = [
+            kind
+            for kind, gone in (("event", self._gone_events), ("reading", self._gone_readings))
+            if gone >= first or after > self._seq
+        ]
+        return Message(last, "gone", {"first": first, "last": last, "types": types, "drops": self.drops})
+
+    def after(self, after: int) -> Iterator[Message]:
+        """What is kept of both rings, in order; all of it for a number of another stream."""
+        after = after if after <= self._seq else self._first
+        kept = sorted((*self._events, *self._readings), key=lambda message: message.seq)
+        return (message for message in kept if message.seq > after)
+
+    def _keep(self, message: Message) -> None:
+        if message.type == "event":
+            if len(self._events) == EVENTS:
+                self._gone_events = self._events[0].seq
+            self._events.append(message)
+        else:
+            if len(self._readings) == READINGS:
+                self._gone_readings = self._readings[0].seq
+            self._readings.append(message)
+
+
+def state_json(snapshot: Snapshot, drops: int) -> str:
+    """The message of a state."""
+    state: StandState = snapshot.state.model_copy(update={"drops": drops})
+    return f'{{"seq":{state.seq},"type":"state","data":{state.model_dump_json()}}}'

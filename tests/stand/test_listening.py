@@ -1,0 +1,215 @@
+"""A daemon's interface that is flooded, and one of a process that has no descriptor left."""
+
+import asyncio
+import contextlib
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from stand.serving.api.listening import MOST_CLIENTS
+from stand.serving.api.pace import Pace
+from stand.serving.client import ask, server_of
+from stand.serving.presence import address_in, living, opened_folder
+from tests.stand.a_desk import ADesk, served
+
+STATE = b"GET /api/v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
+LOOKS, PERIOD_S = 60, 0.02
+
+
+def connected(session: Path) -> socket.socket:
+    """A client that has not said anything yet."""
+    (daemon,) = [each for each in living() if each.entry.session == str(session)]
+    client = socket.socket(socket.AF_UNIX)
+    try:
+        with opened_folder(daemon.socket.parent) as folder:
+            client.connect(address_in(folder, daemon.socket.name))
+    except OSError:
+        client.close()
+        raise
+    return client
+
+
+FLOOD = """
+import socket, sys, threading
+from contextlib import suppress
+
+def ask():
+    while True:
+        with suppress(OSError), socket.socket(socket.AF_UNIX) as client:
+            client.settimeout(10.0)
+            client.connect(sys.argv[1])
+            while True:
+                client.sendall(sys.argv[2].encode().decode("unicode_escape").encode())
+                if not client.recv(65536):
+                    break
+
+for _ in range(int(sys.argv[3])):
+    threading.Thread(target=ask, daemon=True).start()
+threading.Event().wait()
+"""
+
+
+@contextlib.contextmanager
+def flood(session: Path, count: int, request: bytes = STATE) -> Iterator[None]:
+    """Clients of another process that ask as fast as they are answered, and come back when they are shut out."""
+    (daemon,) = [each for each in living() if each.entry.session == str(session)]
+    text = request.decode().encode("unicode_escape").decode()
+    process = subprocess.Popen([sys.executable, "-c", FLOOD, str(daemon.socket), text, str(count)])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+async def lateness_s() -> list[float]:
+    """How late this loop, on which a guard would look, comes to what is due."""
+    late_s, due_s = [], time.monotonic()
+    for _ in range(LOOKS):
+        due_s = max(due_s + PERIOD_S, time.monotonic())
+        await asyncio.sleep(due_s - time.monotonic())
+        late_s.append(time.monotonic() - due_s)
+    return sorted(late_s)
+
+
+async def test_a_flood_of_clients_makes_neither_the_control_loop_late_nor_shuts_out_a_stop(tmp_path: Path):
+    """The daemon's thread has a budget of processor time; that of the whole process is compared with it, so that a busy
+    machine changes nothing. What the control loop is late is the median: others have this machine, too."""
+    async with served(ADesk(), tmp_path) as desk:
+        await asyncio.to_thread(ask, tmp_path, "stop")  # everything is imported
+        with flood(tmp_path, 2 * MOST_CLIENTS):
+            await asyncio.sleep(1.0)
+            began_s, used_s = time.monotonic(), time.process_time()
+            late_s = await lateness_s()
+            for _ in range(3):
+                assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
+                assert (await asyncio.to_thread(server_of(tmp_path).state)).stand == "a stand"
+            share = (time.process_time() - used_s) / (time.monotonic() - began_s)
+    assert late_s[len(late_s) // 2] < 0.01
+    assert share < 0.8
+    assert {verb for _, verb, _ in desk.orders} == {"stop"}
+
+
+async def test_a_flood_of_stops_is_one_stop_each_time(tmp_path: Path):
+    stop = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    async with served(ADesk(), tmp_path) as desk:
+        await asyncio.to_thread(ask, tmp_path, "stop")
+        began_s = time.monotonic()
+        with flood(tmp_path, 8, stop):
+            await asyncio.sleep(1.0)
+        elapsed_s = time.monotonic() - began_s
+    assert 2 <= len(desk.orders) <= 2 + 10 * elapsed_s  # 0.1 s apart: the recording is not filled with them
+
+
+@pytest.mark.parametrize("silence", [b"", b"POST /api/v1/run/st"])
+async def test_silent_clients_shut_nobody_out(tmp_path: Path, silence: bytes):
+    async with served(ADesk(), tmp_path), contextlib.AsyncExitStack() as stack:
+        for _ in range(3 * MOST_CLIENTS):
+            client = stack.enter_context(await asyncio.to_thread(connected, tmp_path))
+            with contextlib.suppress(BrokenPipeError):  # it had to make room already
+                client.sendall(silence)
+        for _ in range(2 * MOST_CLIENTS):
+            assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
+
+
+async def test_a_client_that_asks_and_never_reads_is_not_waited_for(tmp_path: Path):
+    async with served(ADesk(), tmp_path), contextlib.AsyncExitStack() as stack:
+        for _ in range(8):
+            greedy = stack.enter_context(await asyncio.to_thread(connected, tmp_path))
+            greedy.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                greedy.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n" * 200)
+        assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
+        assert (await asyncio.to_thread(server_of(tmp_path).state)).stand == "a stand"
+
+
+DAEMON = """
+import asyncio, os, resource, sys
+from pathlib import Path
+from stand.serving.desk import Done
+from tests.stand.a_desk import ADesk, served
+
+class Desk(ADesk):
+    def stop(self, who):
+        ended.set()
+        return super().stop(who)
+
+    def pause(self, who, when="now"):
+        self.moving = (used(),)
+        return super().pause(who, when)
+
+def used():
+    try:
+        os.close(os.open("/dev/null", os.O_RDONLY))
+    except OSError as error:
+        return error.strerror
+    return "one left"
+
+async def run():
+    global ended
+    ended = asyncio.Event()
+    async with served(Desk(), Path(sys.argv[1])):
+        print("ready", flush=True)
+        await asyncio.to_thread(sys.stdin.readline)
+        for _ in range(5):  # those of a client that has just left are free a moment later
+            await asyncio.sleep(0.1)
+            try:
+                while True:
+                    os.open("/dev/null", os.O_RDONLY)
+            except OSError:
+                pass
+        print("no descriptor left", flush=True)
+        await ended.wait()
+
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+asyncio.run(run())
+print("ended", flush=True)
+"""
+
+
+def test_a_daemon_without_a_descriptor_left_still_answers(tmp_path: Path):
+    with contextlib.ExitStack() as stack:
+        command = [sys.executable, "-c", DAEMON, tmp_path]
+        daemon = stack.enter_context(
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        )
+        stack.callback(daemon.kill)
+        assert daemon.stdout is not None
+        assert daemon.stdin is not None
+        assert daemon.stdout.readline() == "ready\n"
+        assert ask(tmp_path, "continue", timeout_s=30.0)["verb"] == "continue"
+        daemon.stdin.write("\n")
+        daemon.stdin.flush()
+        assert daemon.stdout.readline() == "no descriptor left\n"
+        for _ in range(3):
+            assert ask(tmp_path, "pause")["moving"] == ["Too many open files"]
+        silent = [stack.enter_context(connected(tmp_path)) for _ in range(20)]  # more than there are spares
+        for _ in range(10):
+            assert ask(tmp_path, "pause")["moving"]
+        silent[0].settimeout(5.0)
+        with silent[0].makefile("rb") as answers:
+            assert b"no descriptor left" in answers.read()
+        assert ask(tmp_path, "stop")["verb"] == "stop"
+        assert daemon.stdout.readline() == "ended\n"
+
+
+def test_the_budget_is_earned_with_time_and_spent_with_work():
+    now_s, used_s = [0.0], [0.0]
+    pace = Pace(share=0.25, thread_s=lambda: used_s[0], now_s=lambda: now_s[0])
+    assert pace.spent() == 0.0
+    used_s[0] += 1.5  # 0.5 s of which were there
+    assert pace.spent() == pytest.approx(4.0)
+    now_s[0] += 3.0
+    assert pace.spent() == pytest.approx(1.0)
+    now_s[0] += 1.0
+    assert pace.spent() == 0.0
+    now_s[0] += 1000.0  # who rests for long has no more for it
+    used_s[0] += 0.5
+    assert pace.spent() == 0.0
+    used_s[0] += 0.75
+    assert pace.spent() == pytest.approx(1.0)
