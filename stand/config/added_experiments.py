@@ -15,11 +15,11 @@ from itertools import islice
 from typing import cast, get_type_hints
 
 from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from experiments.sequence import MOST_STEPS
 from experiments.steps import Step, kind_of
-from foundation.documents import OUR_WORDS
+from foundation.document_faults import words
 
 GROUP = "thermostand.experiments"
 _AT_LEAST = {"frames": 1, "interval_s": 1e-6, "exposure_s": 1e-6}
@@ -89,17 +89,13 @@ def _within(name: str, error: ValidationError) -> ValidationError:
     """The faults of an entry's parameters, with the entry's key in front of their places."""
     faults = [
         InitErrorDetails(
-            type=PydanticCustomError("parameter", "{text}", {"text": _words(fault)}),
+            type=PydanticCustomError("parameter", "{text}", {"text": words(fault)}),
             loc=(name, *fault["loc"]),
             input=fault["input"],
         )
         for fault in error.errors()
     ]
     return ValidationError.from_exception_data(name, faults)
-
-
-def _words(fault: ErrorDetails) -> str:
-    return OUR_WORDS.get(fault["type"], fault["msg"].removeprefix("Value error, "))
 
 
 def _package(point: EntryPoint) -> str:

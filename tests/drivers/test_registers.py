@@ -70,7 +70,7 @@ def test_the_replies_of_an_e5cc_poll_differ_in_length_so_that_a_shifted_one_show
         ("bad_if: [broken]", "bad_if: [brokn]", "points.pv.bad_if: no bit brokn"),
         ("bit: stop", "bit: stopp", "commands.stop.confirm: no bit stopp in point status"),
         ("point: status", "point: statu", "commands.stop.confirm: no bit stop in point statu"),
-        ("value: 0x0101", "value: 0x10101", "commands.stop.value: Input should be less than or equal to 65535"),
+        ("value: 0x0101", "value: 0x10101", "commands.stop.value: must be less than or equal to 65535"),
         ("safe_state: [stop]", "safe_state: [halt]", "no command halt"),
         ("17: stop", "32: stop", "points.status: a uint32 has no bits"),
         ("17: stop", "17: broken", "bit broken is named twice"),

@@ -56,7 +56,7 @@ def test_the_example_is_planned_as_those_of_the_house_are():
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [
-        ("staircase: {stairs: 0}", "own.yaml: experiments.0.staircase.stairs: Input should be greater than or equal"),
+        ("staircase: {stairs: 0}", "own.yaml: experiments.0.staircase.stairs: must be greater than or equal"),
         ("staircase: {stars: 3}", "own.yaml: experiments.0.staircase.stars: unknown key; correct its name, or take it"),
         ("staircase: {stair_K: 30}", "own.yaml: experiments.0.staircase: a set-point of 84 degC; give -10 to 70 degC"),
         ("stairs: {}", "there is no experiment 'stairs'; did you mean staircase? There are warm_up,"),

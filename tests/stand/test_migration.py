@@ -158,7 +158,7 @@ def test_a_link_stays_one(tmp_path: Path):
     [
         (
             OLDER.replace("exposure_s: 0.2", "exposure_s: 0"),
-            "cameras.camera.exposure_s: Input should be greater than 0",
+            "cameras.camera.exposure_s: must be greater than 0",
         ),
         ("name: x\ncamera: [", "not YAML"),
         ("name: night\nexperiments: []\n", "unknown key"),

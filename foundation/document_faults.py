@@ -1,0 +1,223 @@
+"""What is wrong with a document, in terms of its YAML: the line, the key, the value as it was written, what to type."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import types
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+Place = Sequence[int | str]  # keys and numbers of entries, from the top
+
+_LONGEST_VALUE = 200  # characters of a faulty value that a message shows
+_MOST_FAULTS = 20  # that a message names
+_ADVICE: Mapping[str, str] = {  # by what PyYAML says
+    "found character '\\t'": "; indent with spaces, not with tabs",
+    "mapping values are not allowed": "; text with a colon and a space in it needs quotes, and keys of one section "
+    "begin in one column",
+    "could not find expected ':'": "; a key has a colon and a space behind it",
+    "expected <block end>": "; keys of one section begin in one column",
+    "unexpected end of stream": "; a quotation mark is not closed",
+    "expected ',' or": "; a bracket is not closed, or a comma is missing",
+}
+_NUMBERS = ("float_type", "float_parsing", "int_type", "int_parsing")
+_WORDS: Mapping[str, str] = {
+    "missing": "is missing; give it",
+    "too_short": "is empty or too short; give more entries",
+    "tuple_type": "give a list: each entry behind a dash, or all in [ ]",
+    "list_type": "give a list: each entry behind a dash, or all in [ ]",
+    "dict_type": "give keys and values, as in `key: value`",
+    "model_type": "give keys and values, as in `key: value`",
+    "bool_type": "give true or false",
+    "bool_parsing": "give true or false",
+    "int_from_float": "give a whole number",
+    "path_type": "give a path, in quotes where it looks like a number",
+    "timezone_aware": "needs its time zone; end it with Z, as in 2026-01-01T18:00:00Z",
+}
+_PATTERNS: Mapping[str, str] = {
+    r"^[a-z][a-z0-9_]{0,30}$": "begins with a lower-case letter, then lower-case letters, digits and _, at most 31",
+    r"^[a-z0-9][a-z0-9-]*$": "consists of lower-case letters, digits and dashes",
+    r"^[^\x00-\x1f\x7f-\x9f]*$": "must be one line of characters that can be shown",
+}
+_UNITS: Mapping[str, Mapping[str, float]] = {  # by the end of a key: what may be written for it, and how large that is
+    "s": {"s": 1, "sec": 1, "ms": 1e-3, "us": 1e-6, "min": 60, "h": 3600, "d": 86400},
+    "h": {"h": 1, "min": 1 / 60, "s": 1 / 3600, "d": 24},
+    "mm": {"mm": 1, "cm": 10, "m": 1000, "um": 1e-3},
+    "deg": {"deg": 1, "°": 1},
+    "degC": {"degC": 1, "°C": 1, "C": 1},
+    "K": {"K": 1},
+    "W": {"W": 1, "kW": 1000},
+    "GB": {"GB": 1, "MB": 1e-3, "TB": 1000},
+    "percent": {"%": 1, "percent": 1},
+}
+_WITH_UNIT = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:e[-+]?\d+)?)\s*([a-zA-Z°%]*)\s*")
+
+
+def sentences(where: str, error: ValidationError, model: type[BaseModel], root: yaml.Node | None) -> str:
+    """All faults of a document of this model, in one line; `root`: the YAML they are in."""
+    faults = _causes(error.errors())
+    more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
+    listed: set[tuple[int | str, ...]] = set()  # places whose keys were listed
+    told: list[str] = []
+    for fault in faults[:_MOST_FAULTS]:
+        advice = ""
+        if fault["type"] == "extra_forbidden":
+            advice = _about_key(fault["loc"], model, listed)
+            listed.add(fault["loc"][:-1])
+        told.append(_sentence(where, fault, root, advice))
+    return "; ".join(told) + more
+
+
+def yaml_fault(error: yaml.YAMLError | ValueError) -> str:
+    """Why a text is no YAML, where, and what to look for."""
+    if isinstance(error, yaml.MarkedYAMLError):
+        mark = error.problem_mark or error.context_mark
+        problem = " ".join((error.problem or error.context or "").split())
+        at = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
+        advice = next((text for words, text in _ADVICE.items() if words in problem), "")
+        return f"{problem}{at}{advice}"
+    if isinstance(error, yaml.reader.ReaderError):
+        return f"the character number {error.position + 1} must not be in a text"
+    return " ".join(str(error).split())
+
+
+def words(fault: ErrorDetails, written: str | None = None) -> str:
+    """What is wrong with a value, and what to type; written: the value as it stands in the file, where that is
+    known."""
+    kind, place = fault["type"], fault["loc"]
+    if kind == "extra_forbidden":
+        return "unknown key; correct its name, or take it out"
+    if kind in _NUMBERS:
+        return _number(place, fault["input"], whole=kind.startswith("int"))
+    if kind == "string_type":
+        is_plain = written and not isinstance(fault["input"], dict | list)
+        return f"give text, in quotes: '{written[:_LONGEST_VALUE]}'" if written and is_plain else "give text"
+    if (ours := _WORDS.get(kind)) is not None:
+        return ours
+    if kind == "string_pattern_mismatch" and (text := _PATTERNS.get(fault.get("ctx", {}).get("pattern", ""), "")):
+        return text
+    said = fault["msg"].removeprefix("Value error, ")
+    text = re.sub(r"^(Input|String|Value|Tuple|List|Dictionary) should ", "must ", said)
+    if kind == "literal_error" and isinstance(fault["input"], str):
+        text += _nearest(fault["input"], re.findall(r"'([^']*)'", text))
+    return text
+
+
+def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Without the faults that only follow from another one: a list is too short when its only entry is wrong."""
+    places = [fault["loc"] for fault in faults]
+    return [
+        fault
+        for fault in faults
+        if fault["type"] != "too_short"
+        or not any(place[: len(fault["loc"])] == fault["loc"] and place != fault["loc"] for place in places)
+    ]
+
+
+def _sentence(where: str, fault: ErrorDetails, root: yaml.Node | None, advice: str) -> str:
+    """One fault as `file: path: what is wrong (got value, line N)`."""
+    place = fault["loc"]
+    line, node = _found(root, place)
+    written = node.value if isinstance(node, yaml.ScalarNode) else None
+    text = words(fault, written) + advice
+    if not place:  # about the whole: the sentence names what it is about
+        return f"{where}: {text}"
+    value, told = fault["input"], list[str]()
+    if isinstance(node, yaml.ScalarNode) and value is None and not node.value:
+        told.append("nothing stands behind the key")
+    elif not isinstance(value, dict | list) and value is not None and fault["type"] != "extra_forbidden":
+        told.append(f"got {_shown(value)}")
+    if line is not None:
+        told.append(f"line {line}")
+    path = ".".join(str(part) for part in place if part != "[key]")
+    return f"{where}: {path}: {text}" + (f" ({', '.join(told)})" if told else "")
+
+
+def _found(root: yaml.Node | None, place: Place) -> tuple[int | None, yaml.Node | None]:
+    """The line, from 1, of the key or entry at this place, or of what it is in when it is not there itself; and its
+    value, None when it is not there."""
+    line, node = None, root
+    for part in place:
+        inner: yaml.Node | None = None
+        if isinstance(node, yaml.MappingNode):
+            for key, value in node.value:
+                if isinstance(key, yaml.ScalarNode) and key.value == str(part):
+                    line, inner = key.start_mark.line + 1, value
+        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+            inner = node.value[part]
+            line = node.value[part].start_mark.line + 1
+        if inner is None:
+            return line, None
+        node = inner
+    return line, node
+
+
+def _number(place: Place, value: object, *, whole: bool) -> str:
+    """What to type instead of this value."""
+    key = next((part for part in reversed(place) if isinstance(part, str)), "")
+    unit = next((end for end in _UNITS if key.endswith(f"_{end}")), "")
+    text = f"give a {'whole ' if whole else ''}number" + (f" in {unit}, without the unit" if unit else "")
+    match = _WITH_UNIT.fullmatch(value) if isinstance(value, str) else None
+    if match is None:
+        return text
+    size = {"": 1.0, **_UNITS.get(unit, {})}.get(match[2])
+    return text if size is None else f"{text}: {float(match[1].replace(',', '.')) * size:.12g}"
+
+
+def _about_key(place: tuple[int | str, ...], model: type[BaseModel], listed: set[tuple[int | str, ...]]) -> str:
+    """The key that may be meant, or those there are at this place unless they were listed before."""
+    known = sorted({name for each in _models_at(model, place[:-1]) for name in each.model_fields})
+    if near := _nearest(str(place[-1]), known):
+        return near
+    return f"; known here: {', '.join(known)}" if known and place[:-1] not in listed else ""
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), 1, 0.6)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _models_at(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
+    """The models that what stands at this place may be."""
+    options: list[Any] = [model]
+    for part in place:
+        options = [inner for option in options for inner in _inside(option, part)]
+    return [
+        each for option in options for each in _plain(option) if isinstance(each, type) and issubclass(each, BaseModel)
+    ]
+
+
+def _inside(annotation: Any, part: int | str) -> Iterator[Any]:
+    """The types of the entry `part` of values of this type."""
+    for option in _plain(annotation):
+        if isinstance(option, type) and issubclass(option, BaseModel):
+            field = option.model_fields.get(str(part))
+            if field is not None:
+                yield field.annotation
+        elif get_origin(option) is dict:
+            yield get_args(option)[1]
+        elif get_origin(option) in (tuple, list):
+            yield from (each for each in get_args(option) if each is not Ellipsis)
+
+
+def _plain(annotation: Any) -> list[Any]:
+    """The types of a union, without what is annotated to them."""
+    if get_origin(annotation) is Annotated:
+        return _plain(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return [each for option in get_args(annotation) for each in _plain(option)]
+    return [annotation]
+
+
+def _shown(value: object) -> str:
+    """The value as it was given, shortened to what a reader needs to find it."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        return "a huge integer"
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."

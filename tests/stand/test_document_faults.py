@@ -1,0 +1,105 @@
+"""What a user is told of a file that cannot be used: the file, the line, the key, the value, and what to type."""
+
+from pathlib import Path
+
+import pytest
+
+from foundation.documents import parse_document
+from foundation.errors import ConfigError
+from stand.config.recipe import Recipe
+from stand.config.stand_config import StandConfig, packaged
+
+STAND = packaged("", "laboratory").read_text(encoding="utf-8")
+
+
+def refusal(old: str, new: str) -> str:
+    assert STAND.count(old) == 1, old
+    with pytest.raises(ConfigError) as refused:
+        parse_document(STAND.replace(old, new), StandConfig, "mine.yaml")
+    return str(refused.value)
+
+
+def line_of(text: str) -> int:
+    return STAND[: STAND.index(text)].count("\n") + 1
+
+
+EXPOSURE = next(line for line in STAND.splitlines() if line.strip().startswith("exposure_s:"))
+
+
+@pytest.mark.parametrize(
+    ("value", "sentence"),
+    [
+        ("100 ms", "give a number in s, without the unit: 0.1 (got '100 ms', line {})"),
+        ("0,1", "give a number in s, without the unit: 0.1 (got '0,1', line {})"),
+        ("fast", "give a number in s, without the unit (got 'fast', line {})"),
+        ("", "give a number in s, without the unit (nothing stands behind the key, line {})"),
+        ("[1]", "give a number in s, without the unit (line {})"),
+        ("-1", "must be greater than 0 (got -1, line {})"),
+    ],
+)
+def test_a_wrong_number_is_told_with_its_line_and_what_to_type(value: str, sentence: str):
+    told = refusal(EXPOSURE, f"{EXPOSURE.partition(':')[0]}: {value}")
+    assert told == f"mine.yaml: cameras.camera.exposure_s: {sentence.format(line_of(EXPOSURE))}"
+
+
+@pytest.mark.parametrize(
+    ("key", "sentence"),
+    [
+        ("exposre_s", "exposre_s: unknown key; correct its name, or take it out; did you mean exposure_s?"),
+        ("colour", "colour: unknown key; correct its name, or take it out; known here: address,"),
+    ],
+)
+def test_an_unknown_key_is_told_with_the_one_that_may_be_meant_or_those_there_are(key: str, sentence: str):
+    indent = EXPOSURE[: len(EXPOSURE) - len(EXPOSURE.lstrip())]
+    told = refusal(EXPOSURE, f"{EXPOSURE}\n{indent}{key}: 1")
+    assert told.startswith(f"mine.yaml: cameras.camera.{sentence}")
+    assert told.endswith(f"(line {line_of(EXPOSURE) + 1})")
+
+
+def test_keys_of_a_list_s_entries_are_known_too():
+    with pytest.raises(ConfigError, match=r"r\.yaml: experiments\.0\.thermal_cycle\.dwel_s: unknown.*did you mean dwell_s\?"):
+        parse_document("name: r\nexperiments:\n  - thermal_cycle: {dwel_s: 3}\n", Recipe, "r.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            "name: 00351210",
+            "00351210 is 119432 in YAML, a number to base 8; put it in quotes, '00351210', or write 351210",
+        ),
+        ("name: 1:30", "1:30 is 90 in YAML, a number to base 60; put it in quotes, '1:30'"),
+        (
+            "name: 2026-01-01",
+            "r.yaml: name: give text, in quotes: '2026-01-01' (got datetime.date(2026, 1, 1), line 1)",
+        ),
+        (
+            "name: night\nexperiments: 5",
+            "experiments: give a list: each entry behind a dash, or all in [ ] (got 5, line 2)",
+        ),
+        ("name: night\nexperiments:\n\t- warm_up: {}", "(line 3, column 1); indent with spaces, not with tabs"),
+        ("name: night: 2", "mapping values are not allowed here (line 1, column 12); text with a colon"),
+        ("name: [a", "(line 1, column 9); a bracket is not closed"),
+        ("name: 'a", "(line 1, column 9); a quotation mark is not closed"),
+        ("name: a\x07", "the character number 8 must not be in a text"),
+    ],
+)
+def test_what_yaml_reads_otherwise_than_it_was_meant_is_told(text: str, sentence: str):
+    with pytest.raises(ConfigError) as refused:
+        parse_document(text, Recipe, "r.yaml")
+    assert str(refused.value).startswith("r.yaml: ")
+    assert sentence in str(refused.value)
+    assert "unicode string" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(Path(packaged("", "simulated")).parent.rglob("*.yaml")), ids=lambda path: path.stem
+)
+def test_no_installed_file_has_a_number_to_another_base(path: Path):
+    parse_any(path.read_text(encoding="utf-8"))
+
+
+def parse_any(text: str) -> None:
+    from foundation.documents import yaml_data
+
+    yaml_data(text, "installed.yaml")
