@@ -108,22 +108,11 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     if missing := notifier.missing():
         raise ConfigError(missing)
     bus = Bus("bus", config.bus, clock)
+    regulator, relays, thermometers = bus_units(config, bus, clock)
     devices = Devices(
-        regulator=Regulator(
-            "regulator",
-            bus,
-            _register_map(config.regulator),
-            clock,
-        ),
-        relays=Relays(
-            "relays",
-            bus,
-            _register_map(config.relays),
-            {str(name): number for name, number in config.relays.channels.items()},
-        ),
-        thermometers=Thermometers(
-            "thermometers", bus, _register_map(config.thermometer_module), config.thermometers, clock
-        ),
+        regulator=regulator,
+        relays=relays,
+        thermometers=thermometers,
         axes={name: Axis(name, axis, clock) for name, axis in config.axes.items()},
         flap=_flap(config, clock),
         cameras={name: make_camera(name, camera, clock) for name, camera in config.cameras.items()},
@@ -139,8 +128,20 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     return Assembly(config, hub, clock, bus, devices, Stand(devices, chamber, supply, hub, clock), notifier)
 
 
-def _register_map(unit: OnBus) -> RegisterMap:
-    return load_register_map(packaged("registers", unit.registers)).at_unit(unit.unit)
+def bus_units(config: StandConfig, bus: Bus, clock: Clock) -> tuple[Regulator, Relays, Thermometers]:
+    """The units on the bus; ConfigError when a register map is missing or wrong, or that of another kind of unit."""
+
+    def register_map(key: str, unit: OnBus) -> RegisterMap:
+        path = packaged("registers", unit.registers, key=f"{key}.registers")
+        return load_register_map(path).at_unit(unit.unit)
+
+    channels = {str(name): number for name, number in config.relays.channels.items()}
+    module = register_map("thermometer_module", config.thermometer_module)
+    return (
+        Regulator("regulator", bus, register_map("regulator", config.regulator), clock),
+        Relays("relays", bus, register_map("relays", config.relays), channels),
+        Thermometers("thermometers", bus, module, config.thermometers, clock),
+    )
 
 
 class _BackendModule(Protocol):

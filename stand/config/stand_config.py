@@ -4,6 +4,7 @@ addresses differ. A wrong key, unit or range is a ConfigError that names the fil
 
 from __future__ import annotations
 
+import difflib
 import importlib.resources
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -41,6 +42,8 @@ def _of_this_century(start: datetime) -> datetime:
     return start
 
 
+Folder = Literal["", "registers", "recipes", "targets"]
+MAPPED = ("regulator", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
 _GUARDED = {"air", "granite_inside"}  # thermometers without which nothing is heated
 _DEVICES = ("bus", "regulator", "relays", "thermometers", "flap", "stand", "control")  # names that are taken
@@ -198,21 +201,43 @@ class StandConfig(Document):
 
 
 def load_config(path: Path) -> StandConfig:
-    """The configuration file, checked."""
-    return load_document(path, StandConfig)
+    """The configuration file, checked. Register maps that lie beside it are named by their whole path."""
+    config = load_document(path, StandConfig)
+    units: dict[str, OnBus] = {name: getattr(config, name) for name in MAPPED}
+    return config.model_copy(
+        update={
+            name: unit.model_copy(update={"registers": _beside(path, unit.registers)}) for name, unit in units.items()
+        }
+    )
 
 
-def packaged(folder: Literal["", "registers", "recipes", "targets"], name: str) -> Path:
-    """The file `name` of the installed configs/`folder`, or `name` itself when that is a path that exists.
+def _beside(path: Path, name: str) -> str:
+    """The whole path of the file of this name beside the configuration at `path`; the name where there is none."""
+    file = path.parent / name
+    try:
+        is_another = file.is_file() and not (Path(name).is_file() and file.samefile(name))
+    except OSError:  # such as a name longer than the file system takes, which is reported when it is looked up
+        return name
+    return str(file.absolute()) if is_another else name
+
+
+def packaged(folder: Folder, name: str, beside: Path | None = None, key: str = "") -> Path:
+    """The file `name` of the installed configs/`folder`, or `name` itself when that is a path that exists; first of all
+    beside the file that names it, under `key`.
 
     Raises ConfigError that lists what there is.
     """
     root = Path(str(importlib.resources.files("configs"))) / folder
     known = sorted(path.stem for path in root.glob("*.yaml"))
-    for candidate in (Path(name), root / name, root / f"{name}.yaml"):
+    named_by = (f"{beside}: " if beside else "") + (f"{key}: " if key else "")
+    for candidate in (beside.parent / name if beside else Path(name), Path(name), root / name, root / f"{name}.yaml"):
         try:
             if candidate.is_file():
                 return candidate
         except OSError as error:  # such as a name longer than the file system takes
-            raise ConfigError(f"{name}: cannot be looked up ({error.strerror})") from error
-    raise ConfigError(f"{name}: no such file, and not one of those installed: {', '.join(known)}")
+            raise ConfigError(f"{named_by}{name}: cannot be looked up ({error.strerror})") from error
+    near = difflib.get_close_matches(name, known, 1, 0.6)
+    meant = f"did you mean {near[0]}? " if near else ""
+    raise ConfigError(
+        f"{named_by}{name}: no such file, and not one of those installed; {meant}there are {', '.join(known)}"
+    )

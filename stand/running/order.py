@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from drivers.wires.registers import load_register_map
+from drivers.wires.bus import Bus
 from experiments.sequence import checked
 from experiments.steps import PlannedStep
 from experiments.written import PlanError, Written
+from foundation.clock import WallClock
 from foundation.documents import parse_document, read_document
 from foundation.errors import ConfigError
 from markers.target import Target
+from stand.assembly import bus_units
 from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
 from stand.estimating.estimate import price
 
-_MAPPED = ("regulator", "relays", "thermometer_module")  # the devices of a stand that have a register map
 _REGISTERS = "registers-{}.yaml"  # its name in a session
 
 
@@ -46,21 +47,27 @@ def load_order(recipe: str, config: str) -> Order:
     """The files (or installed names), read and checked as far as can be without the stand: ConfigError
     names what is wrong in which of them."""
     paths = {"config.yaml": packaged("", config), "recipe.yaml": packaged("recipes", recipe)}
-    paths["target.yaml"] = packaged("targets", load_config(paths["config.yaml"]).target)
+    stand = load_config(paths["config.yaml"])
+    paths["target.yaml"] = packaged("targets", stand.target, paths["config.yaml"], "target")
     texts = {name: read_document(path) for name, path in paths.items()}
     order = parse_order(texts, {name: str(path) for name, path in paths.items()})
-    order = with_register_maps(order)
+    try:
+        order = with_register_maps(replace(order, config=stand))
+    except ConfigError as error:
+        raise ConfigError(f"{paths['config.yaml']}: {error}") from error
     price(order.recipe.plan(), order.config)
     return order
 
 
 def with_register_maps(order: Order) -> Order:
-    """The order with the register maps as they are now; ConfigError when one is wrong."""
+    """The order with the register maps as they are now; ConfigError when one is wrong, or that of another kind of
+    unit."""
     texts: dict[str, str] = {}
-    for name in _MAPPED:
-        path = packaged("registers", getattr(order.config, name).registers)
-        load_register_map(path)
+    for name in MAPPED:
+        path = packaged("registers", getattr(order.config, name).registers, key=f"{name}.registers")
         texts[_REGISTERS.format(name)] = read_document(path)
+    clock = WallClock()
+    bus_units(order.config, Bus("bus", order.config.bus, clock), clock)
     return replace(order, register_texts=texts)
 
 
@@ -84,7 +91,7 @@ def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:
         texts["config.yaml"],
         texts["recipe.yaml"],
         texts["target.yaml"],
-        register_texts={name: texts[name] for name in map(_REGISTERS.format, _MAPPED) if name in texts},
+        register_texts={name: texts[name] for name in map(_REGISTERS.format, MAPPED) if name in texts},
     )
     parse_document(order.target_text, Target, names["target.yaml"])
     return order

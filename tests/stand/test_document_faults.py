@@ -8,6 +8,7 @@ from foundation.documents import parse_document
 from foundation.errors import ConfigError
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, packaged
+from stand.running.order import load_order
 
 STAND = packaged("", "laboratory").read_text(encoding="utf-8")
 
@@ -57,7 +58,9 @@ def test_an_unknown_key_is_told_with_the_one_that_may_be_meant_or_those_there_ar
 
 
 def test_keys_of_a_list_s_entries_are_known_too():
-    with pytest.raises(ConfigError, match=r"r\.yaml: experiments\.0\.thermal_cycle\.dwel_s: unknown.*did you mean dwell_s\?"):
+    with pytest.raises(
+        ConfigError, match=r"r\.yaml: experiments\.0\.thermal_cycle\.dwel_s: unknown.*did you mean dwell_s\?"
+    ):
         parse_document("name: r\nexperiments:\n  - thermal_cycle: {dwel_s: 3}\n", Recipe, "r.yaml")
 
 
@@ -103,3 +106,51 @@ def parse_any(text: str) -> None:
     from foundation.documents import yaml_data
 
     yaml_data(text, "installed.yaml")
+
+
+@pytest.mark.parametrize(
+    ("key", "old", "sentence"),
+    [
+        (
+            "target: paper9x6",
+            "target: paper-9x6",
+            "{}: target: paper9x6: no such file, and not one of those installed; did you",
+        ),
+        (
+            "registers: e5cc,",
+            "registers: omron-e5cc,",
+            "{}: regulator.registers: e5cc: no such file, and not one of those",
+        ),
+        (
+            "registers: icpdas-m7015,",
+            "registers: omron-e5cc,",
+            "{}: regulator: register map M-7015 lacks pv, sp, run",
+        ),
+    ],
+)
+def test_a_file_that_is_named_wrongly_is_told_with_the_file_and_key_that_name_it(
+    tmp_path: Path, key: str, old: str, sentence: str
+):
+    """When a night is planned, not when it is run."""
+    file = tmp_path / "mine.yaml"
+    text = packaged("", "simulated").read_text(encoding="utf-8")
+    assert text.count(old) == 1, old
+    file.write_text(text.replace(old, key))
+    with pytest.raises(ConfigError) as refused:
+        load_order("demo", str(file))
+    assert str(refused.value).startswith(sentence.format(file))
+
+
+def test_files_beside_the_one_that_names_them_are_found_from_anywhere(tmp_path: Path):
+    text = packaged("", "simulated").read_text(encoding="utf-8")
+    (tmp_path / "maps").mkdir()
+    registers = packaged("registers", "omron-e5cc").read_text(encoding="utf-8")
+    (tmp_path / "maps" / "ours.yaml").write_text(registers.replace("E5CC", "OURS"))
+    (tmp_path / "board.yaml").write_text(packaged("targets", "paper-9x6").read_text(encoding="utf-8") + "# ours\n")
+    file = tmp_path / "mine.yaml"
+    file.write_text(text.replace("omron-e5cc", "maps/ours.yaml").replace("target: paper-9x6", "target: board.yaml"))
+    order = load_order("demo", str(file))
+    assert order.target_text.endswith("# ours\n")
+    assert order.config.regulator.registers == str(tmp_path / "maps" / "ours.yaml")
+    assert "OURS" in order.register_texts["registers-regulator.yaml"]
+    assert "maps/ours.yaml" in order.config_text

@@ -81,7 +81,7 @@ def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(
     [
         (
             ["plan", "no-such-recipe"],
-            "no-such-recipe: no such file, and not one of those installed: calibration, demo,",
+            "no-such-recipe: no such file, and not one of those installed; there are calibration, demo,",
         ),
         (["plan", "demo", "--config", "nowhere.yaml"], "nowhere.yaml: no such file"),
         (["run", "demo", "--seed", "3"], "--seed belongs to --virtual-time"),
