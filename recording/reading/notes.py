@@ -63,10 +63,13 @@ def read_notes(directory: Path) -> Notes:
         fd = os.open(directory / NOTES_NAME, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
         return Notes()
-    with os.fdopen(fd, "rb") as file:
-        if not stat.S_ISREG(os.fstat(fd).st_mode):
-            return Notes()
-        found = lines_of(file.read(LIMIT_BYTES)).sound
+    try:
+        data = os.read(fd, LIMIT_BYTES) if stat.S_ISREG(os.fstat(fd).st_mode) else b""
+    except OSError:
+        return Notes()
+    finally:
+        os.close(fd)
+    found = lines_of(data).sound
     return _folded(entry for line in found if (entry := _entry(line)) is not None)
 
 

@@ -25,6 +25,7 @@ app = lazy_app(
         "stop": Lazy(_CONTROL, "Make the stand safe and end the run, as Ctrl-C does."),
         "config": Lazy("stand.commands.config_cli", "Configuration files: JSON Schemas for editors, older versions."),
         "queue": Lazy("stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
+        "alert": Lazy("stand.commands.alert_cli", "Alerts to people elsewhere: test them."),
         "session": Lazy(
             "stand.commands.session_commands",
             "Recorded sessions: list, look at, verify, salvage, replay, export, trim.",

@@ -24,6 +24,7 @@ from experiments.parameters import Chamber_degC
 from foundation.addresses import TcpAddress
 from foundation.documents import Document, load_document
 from foundation.errors import ConfigError
+from stand.config.alerts import AlertsConfig
 from stand.config.guard import GuardConfig
 from stand.config.looks import ChamberConfig
 from stand.config.older_forms import CAMERA, renewed
@@ -123,6 +124,7 @@ class StandConfig(Document):
     guard: GuardConfig = GuardConfig()
     compressor: CompressorConfig = CompressorConfig()
     recording: RecordingConfig = RecordingConfig()
+    alerts: AlertsConfig = AlertsConfig()
     simulation: SimulationConfig | None = None
 
     @model_validator(mode="before")

@@ -40,6 +40,7 @@ from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.serving.api.server import Interface, serve
+from stand.serving.eta_slip import EtaSlip
 
 # The recorder's events that hold a run, and those that let it continue.
 _HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
@@ -180,6 +181,10 @@ class Guest:
         board = StatusBoard(name, steps, kept, gate, self.stop, lambda: house.latched, recorder, clock)
         assembly.hub.subscribe(board)
         leaving.callback(assembly.hub.unsubscribe, board)
+        if not isinstance(clock, VirtualClock):  # there nobody waits for the end
+            slip = EtaSlip(assembly.hub, clock, board.left_s, partial(utc_offset_ns, clock))
+            assembly.hub.subscribe(slip)
+            leaving.callback(assembly.hub.unsubscribe, slip)
         return board
 
     async def _answer(self, board: StatusBoard, executor: Executor) -> None:

@@ -30,6 +30,7 @@ from stand.running.order import Order
 from stand.running.resume import Interruption
 from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory
 from stand.running.stop import Interrupted, Stop
+from stand.serving.alerts import alerting
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
 __all__ = ["Interrupted", "resume", "run_in", "run_real", "run_virtual"]
@@ -148,7 +149,8 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
         await _announce(job, assembly)
         assembly.notifier.start()
         try:
-            async with _telling_failure(assembly, directory, stop):
+            told = alerting(assembly.config.name, assembly.config.alerts, hub, clock)
+            async with told, _telling_failure(assembly, directory, stop):
                 async with opened(assembly, time, stop, is_for_one=True) as house:
                     recorder = await _stay(job, directory, house, early, stop, house.disk)
                 _check_outcome(directory, recorder, assembly)

@@ -111,6 +111,10 @@ class StatusBoard:
             fault="" if fault is None else fault.text,
         )
 
+    def left_s(self, now_ns: int) -> float:
+        """How long the run still takes, from now on."""
+        return self._eta.left_s(now_ns)
+
     def _fault(self) -> Fault | None:
         """What has tripped; an operator who stops the run is no fault."""
         fault = self._stop.fault or self._held()

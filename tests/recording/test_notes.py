@@ -58,6 +58,9 @@ def test_links_and_pipes_are_no_notes(tmp_path: Path):
     with pytest.raises(SessionError, match="could not be kept"):
         add_note(tmp_path, "x", "eva", 1)
     (tmp_path / NOTES_NAME).unlink()
+    (tmp_path / NOTES_NAME).mkdir()
+    assert read_notes(tmp_path) == Notes()
+    (tmp_path / NOTES_NAME).rmdir()
     os.mkfifo(tmp_path / NOTES_NAME)
     assert read_notes(tmp_path) == Notes()
     with pytest.raises(SessionError, match="is no file of notes"):

@@ -1,0 +1,52 @@
+"""`stand alert`: whether those who are to be told are reached."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from foundation.errors import ConfigError, StandError
+from foundation.exit_codes import one_line_errors
+from foundation.usage import OneLineUsage, one_line
+
+app = typer.Typer(cls=OneLineUsage, no_args_is_help=True, add_completion=False)
+_LIMIT_S = 20.0
+
+
+@app.callback()
+def alert() -> None:
+    """Alerts to people elsewhere.
+
+    Example: stand alert test --config my-stand.yaml
+    """
+
+
+@app.command("test")
+def try_them(
+    config: Annotated[str, typer.Option(help="The stand's file, or an installed configuration.")] = "simulated",
+) -> None:
+    """Send a test message to each receiver, and give the sign of life once.
+
+    Example: stand alert test --config my-stand.yaml
+    """
+    from stand.config.alerts import load_secrets
+    from stand.config.stand_config import load_config, packaged
+    from stand.serving.alerts import check_alerts
+    from stand.serving.alerts_process import deliver, ping
+
+    with one_line_errors():
+        stand = load_config(packaged("", config))
+        if stand.alerts.secrets is None:
+            raise ConfigError(f"{config}: has no alerts.secrets; name a file with `urls:` there (docs/safety.md)")
+        check_alerts(stand.alerts)
+        found = load_secrets(stand.alerts.secrets)
+        text = "This is a test: alerts of this stand arrive here."
+        failures = deliver(stand.alerts.secrets, f"{stand.name}: test", text, _LIMIT_S)
+        failures += [failure] if (failure := ping(stand.alerts.secrets, _LIMIT_S)) else []
+        for failure in failures:
+            typer.echo(one_line(failure), err=True)
+        if failures:
+            raise StandError(f"{len(failures)} of {len(found.urls) + bool(found.alive_url)} were not reached")
+        alive = ", and the sign of life was taken" if found.alive_url else "; no alive_url is given"
+        typer.echo(f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}")

@@ -1,0 +1,167 @@
+"""Alerts of a stand to people elsewhere, and the sign of life to a service that raises the alarm when it stays away.
+
+The hub's subscriber only puts events into a queue. A thread judges them and asks a process of its own to send; another
+one gives the sign of life. A receiver that hangs delays later messages, and nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import queue
+from collections import deque
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from threading import Event as Flag
+from threading import Thread
+
+from foundation.clock import Clock, VirtualClock, boot_time_ns, seconds_ns
+from foundation.errors import ConfigError
+from foundation.helper import Helper
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from foundation.tasks import cancelled, cause_of, failure_text
+from stand.config.alerts import AlertsConfig, load_secrets
+from stand.serving.alert_book import RUN_FAILED, AlertBook, Message, sign_of
+from stand.serving.alerts_process import MISSING, MODULE, deliver, ping
+
+_LIMIT_S = 20.0  # for a receiver
+_LOOK_S = 0.5
+_BEAT_S = 1.0
+_LATE_NS = seconds_ns(15.0)  # an event loop that has not come round for so long is not well
+_AGAIN_S = (15.0, 60.0, 300.0, 1200.0)  # after a try that failed: networks come back
+_MOST_WAITING = 100
+_FAREWELL_S = 5.0  # real seconds for what is to be told at the end
+_TELL, _ALIVE = "tell", "alive"
+
+
+def check_alerts(config: AlertsConfig) -> None:
+    """ConfigError when alerts are asked for that could not be sent."""
+    if config.secrets is None:
+        return
+    load_secrets(config.secrets)
+    if importlib.util.find_spec("apprise") is None:
+        raise ConfigError(f"alerts.secrets: {MISSING}, or take the line out")
+
+
+@asynccontextmanager
+async def alerting(
+    name: str, config: AlertsConfig, hub: Hub, clock: Clock, is_well: Callable[[], bool] = lambda: True
+) -> AsyncGenerator[None]:
+    """Alerts of the stand `name` while inside, none in virtual time or without alerts.secrets. is_well: whether the
+    sign of life may be given, asked each second on the loop; what this knows of by itself (a hold, a lost device, a
+    loop that stands still) counts besides. ConfigError as check_alerts."""
+    if config.secrets is None or isinstance(clock, VirtualClock):
+        yield
+        return
+    await asyncio.to_thread(check_alerts, config)
+    alerts = Alerts(name, config, config.secrets, asyncio.get_running_loop(), hub, clock)
+    hub.subscribe(alerts)
+    beating = asyncio.create_task(alerts.beat(is_well))
+    try:
+        yield
+    except Exception as raised:
+        alerts(Event(clock.now_ns(), "error", RUN_FAILED, failure_text(cause_of(raised))))
+        raise
+    finally:
+        hub.unsubscribe(alerts)
+        await cancelled([beating])
+        await asyncio.to_thread(alerts.close)
+
+
+class Alerts:
+    """A subscriber of the hub."""
+
+    def __init__(
+        self, name: str, config: AlertsConfig, secrets: Path, loop: asyncio.AbstractEventLoop, hub: Hub, clock: Clock
+    ) -> None:
+        self._config, self._secrets = config, secrets
+        self._loop, self._hub, self._clock = loop, hub, clock
+        self._book = AlertBook(name, config.causes, seconds_ns(config.grace_s), config.most_per_h)
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._waiting: deque[tuple[int, int, Message]] = deque()  # when to try, how often it was tried
+        self._ending = Flag()
+        self._beat_ns = 0
+        self._helpers: dict[str, Helper] = {}
+        self._failed: set[str] = set()
+        works = {_TELL: self._tell_on, _ALIVE: self._ping_on}
+        self._threads = {each: Thread(target=work, name=f"alerts-{each}", daemon=True) for each, work in works.items()}
+        for thread in self._threads.values():
+            thread.start()
+
+    def __call__(self, item: Item) -> None:
+        """Take note of an event; returns at once."""
+        if isinstance(item, Event) and sign_of(item) is not None:
+            self._events.put(item)
+
+    async def beat(self, is_well: Callable[[], bool]) -> None:
+        """The loop comes round, until cancelled."""
+        while True:
+            self._beat_ns = boot_time_ns() if is_well() else 0
+            await asyncio.sleep(_BEAT_S)
+
+    def close(self) -> None:
+        """Tell what is due, as far as that goes in a few seconds; blocking."""
+        self._ending.set()
+        self._threads[_TELL].join(_FAREWELL_S)
+        for helper in tuple(self._helpers.values()):
+            helper.close()
+
+    def _tell_on(self) -> None:
+        """The thread that tells. At the end everything is tried once more at once."""
+        while True:
+            is_last = self._ending.wait(_LOOK_S)
+            now_ns = self._clock.now_ns()
+            found = list(self._book.due(now_ns))
+            with suppress(queue.Empty):
+                while True:
+                    found += self._book.receive(self._events.get_nowait(), now_ns)
+            self._waiting.extend((0, 0, message) for message in found)
+            while len(self._waiting) > _MOST_WAITING:
+                self._waiting.popleft()
+            for _ in range(len(self._waiting)):
+                self._try(*self._waiting.popleft(), is_last=is_last)
+            if is_last:
+                return
+
+    def _try(self, at_ns: int, tried: int, message: Message, *, is_last: bool) -> None:
+        if boot_time_ns() < at_ns and not is_last:
+            self._waiting.append((at_ns, tried, message))
+            return
+        failures = self._ask(_TELL, deliver, self._secrets, message.title, message.text, _LIMIT_S)
+        if not failures:
+            self._failed.clear()
+        elif tried < len(_AGAIN_S):
+            self._waiting.append((boot_time_ns() + seconds_ns(_AGAIN_S[tried]), tried + 1, message))
+        for failure in failures:
+            self._warn(str(failure))
+
+    def _ping_on(self) -> None:
+        """The thread that gives the sign of life."""
+        due_ns = 0
+        while not self._ending.wait(_LOOK_S):
+            now_ns = boot_time_ns()
+            if now_ns >= due_ns and now_ns - self._beat_ns < _LATE_NS and self._book.is_well:
+                due_ns = now_ns + seconds_ns(self._config.alive_every_s)
+                for failure in self._ask(_ALIVE, ping, self._secrets, _LIMIT_S):
+                    self._warn(str(failure))
+
+    def _ask(self, line: str, function: Callable[..., object], *args: object) -> list[object]:
+        """In a process of its own, which is started again when it has ended; what failed."""
+        try:
+            if line not in self._helpers or self._helpers[line].ended:
+                self._helpers[line] = Helper(MODULE, (line,), "the process that sends alerts has ended")
+            found = self._helpers[line].line(line).run(function, *args)
+        except OSError as error:
+            found = str(error)
+        return [found] if isinstance(found, str) and found else found if isinstance(found, list) else []
+
+    def _warn(self, failure: str) -> None:
+        """An event on the loop, once until a message has got through."""
+        if failure in self._failed:
+            return
+        self._failed.add(failure)
+        event = Event(self._clock.now_ns(), "warning", "alert_failed", f"an alert was not delivered: {failure}")
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._hub.publish, event)

@@ -1,0 +1,109 @@
+"""The process that sends alerts for a daemon: `python -m stand.serving.alerts_process DAEMON FD ...`.
+
+A receiver that hangs hangs this process's thread, never the daemon. The secrets are read here, for each message anew,
+and nothing that is returned holds any of them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+import sys
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from threading import Thread
+
+from foundation.errors import ConfigError
+from foundation.helper_process import serve
+from stand.config.alerts import load_secrets
+
+MODULE = "stand.serving.alerts_process"
+_LEFT_NAME = "stand-alert-left"  # of a process whose daemon has gone
+MISSING = "alerts need Apprise: pip install 'thermostand[alerts]'"
+
+
+def deliver(secrets: Path, title: str, text: str, limit_s: float) -> list[str]:
+    """Send to every address; of each that did not take it within limit_s a sentence. Nobody waits for them together:
+    each has the whole time."""
+    try:
+        urls = load_secrets(secrets).urls
+    except ConfigError as error:
+        return [str(error)]
+    if importlib.util.find_spec("apprise") is None:
+        return [MISSING]
+    _load()
+    names = [f"receiver {number} of {len(urls)} ({_scheme(url)})" for number, url in enumerate(urls, 1)]
+    works = [_Work(lambda url=url: _send(url, title, text)) for url in urls]
+    return [f"{name} {failure}" for name, work in zip(names, works, strict=True) if (failure := work.result(limit_s))]
+
+
+def ping(secrets: Path, limit_s: float) -> str:
+    """Call the dead-man's address; why that failed, "" when it did not, or there is none."""
+    try:
+        url = load_secrets(secrets).alive_url
+    except ConfigError as error:
+        return str(error)
+    return f"alive_url {failure}" if url and (failure := _Work(lambda: _called(url, limit_s)).result(limit_s)) else ""
+
+
+def _scheme(url: str) -> str:
+    scheme = url.partition("://")[0]
+    return scheme if scheme.isalnum() and len(scheme) <= 20 and scheme != url else "no address"
+
+
+def _load() -> None:
+    """Apprise, whose log would hold addresses: it goes nowhere."""
+    importlib.import_module("apprise")  # takes longer than most receivers do
+    log = logging.getLogger("apprise")
+    log.propagate = False
+    log.handlers = [logging.NullHandler()]
+
+
+def _send(url: str, title: str, text: str) -> str:
+    import apprise
+
+    sender = apprise.Apprise()
+    if not sender.add(url):
+        return "has an address that Apprise does not understand"
+    return "" if sender.notify(body=text, title=title) else "did not take the message"
+
+
+def _called(url: str, limit_s: float) -> str:
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler())
+    with opener.open(url, timeout=limit_s) as answer:
+        answer.read(1000)
+    return ""
+
+
+class _Work:
+    """A call in a thread that nobody has to wait for."""
+
+    def __init__(self, call: Callable[[], str]) -> None:
+        self._found = "did not answer in time"
+        self._call = call
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def result(self, limit_s: float) -> str:
+        """What it returned, within so long."""
+        self._thread.join(limit_s)
+        return self._found
+
+    def _run(self) -> None:
+        try:
+            self._found = self._call()
+        except Exception as error:  # noqa: BLE001 - whatever a receiver's library raises, and its text may hold a secret
+            self._found = f"failed ({type(error).__name__})"
+
+
+def main() -> None:
+    """Serve until the daemon is gone."""
+    serve([int(number) for number in sys.argv[2:]], _LEFT_NAME)
+
+
+if __name__ == "__main__":
+    import stand.serving.alerts_process  # under this name it is asked for
+
+    stand.serving.alerts_process.main()

@@ -1,0 +1,123 @@
+"""What is told of a night's events: each cause once, when it has lasted, and once more when it is over."""
+
+import pytest
+
+from foundation.clock import NS_PER_S
+from foundation.items import Event
+from stand.serving.alert_book import AlertBook, sign_of
+
+CAUSES = (
+    "trip", "hold", "device_lost", "disk", "prompt", "run_started", "run_finished", "run_aborted", "queue_empty",
+    "eta_slipped",
+)  # fmt: skip
+
+
+def event(kind, at_s=0.0, level="warning", text="why", **data):
+    return Event(round(at_s * NS_PER_S), level, kind, text, data)
+
+
+def book(**changes):
+    return AlertBook(**{"name": "lab", "causes": CAUSES, "grace_ns": 60 * NS_PER_S, "most_per_h": 20, **changes})
+
+
+def told(found, *events, until_s=0):
+    """(title, text) of all messages of these events, and of those that are due second by second up to then."""
+    messages = []
+    for each in events:
+        messages += found.due(each.time_ns) + found.receive(each, each.time_ns)
+    last_s = max((each.time_ns for each in events), default=0) // NS_PER_S
+    for second in range(last_s, until_s + 1):
+        messages += found.due(second * NS_PER_S)
+    return [(message.title.removeprefix("lab: "), message.text) for message in messages]
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "cause", "phase"),
+    [
+        ("guard.over_temperature", {"action": "abort"}, "trip", "raised"),
+        ("guard.sensor_stale", {"action": "hold"}, "hold", "lasting"),
+        ("guard.sensors_disagree", {"action": "warn"}, None, None),
+        ("released", {"reason": "interlock"}, "hold", "over"),
+        ("released", {"reason": "operator"}, None, None),
+        ("hold_ended", {}, "hold", "over"),
+        ("device_lost", {"device": "regulator"}, "device_lost", "lasting"),
+        ("device_back", {"device": "regulator"}, "device_lost", "over"),
+        ("frames_stopped", {}, "disk", "lasting"),
+        ("disk_nearly_full", {}, "disk", "raised"),
+        ("prompt", {}, "prompt", "raised"),
+        ("run.start", {}, "run_started", "raised"),
+        ("run.end", {"status": "complete"}, "run_finished", "raised"),
+        ("run.end", {"status": "tripped"}, "run_aborted", "raised"),
+        ("queue_empty", {}, "queue_empty", "raised"),
+        ("eta_slipped", {}, "eta_slipped", "raised"),
+        ("home_residual", {}, None, None),
+    ],
+)
+def test_what_an_event_means(kind, data, cause, phase):
+    sign = sign_of(event(kind, **data))
+    assert (cause, phase) == (None, None) if sign is None else (sign.cause, sign.phase) == (cause, phase)
+
+
+def test_a_prompt_that_nobody_is_there_for_is_not_told():
+    assert sign_of(event("prompt", level="info")) is None
+
+
+def test_what_is_over_within_the_grace_time_is_not_told():
+    found = book()
+    assert (
+        told(found, event("device_lost", 0, device="flap"), event("device_back", 59, device="flap"), until_s=300) == []
+    )
+
+
+def test_what_lasts_is_told_once_and_when_it_is_over():
+    found = book()
+    lost = [event("device_lost", second, device="flap") for second in (0, 70, 80)]
+    assert told(found, *lost, until_s=200) == [("a device is lost", "why")]
+    assert not found.is_well
+    assert told(found, event("device_back", 300, text="answers", device="flap")) == [
+        ("ok again", "answers (it was: why)")
+    ]
+    assert found.is_well
+    assert told(found, event("device_lost", 400, device="flap"), until_s=500) == [("a device is lost", "why")]
+
+
+def test_two_devices_are_two_causes():
+    found = book(grace_ns=0)
+    assert len(told(found, event("device_lost", 0, device="a"), event("device_lost", 0, device="b"), until_s=1)) == 2
+
+
+def test_a_trip_and_the_end_it_makes_are_told_at_once():
+    found = book()
+    trip = event("guard.over_temperature", 1, "error", "air is hot", action="abort")
+    end = event("run.end", 2, "error", "aborted: air is hot", status="tripped")
+    assert told(found, trip, trip, end, until_s=300) == [
+        ("TRIPPED", "air is hot"),
+        ("a run has ended before its plan was done", "aborted: air is hot"),
+    ]
+
+
+def test_a_hold_that_an_operator_cleared_is_over():
+    found = book()
+    hold = event("guard.device_fault", 0, "error", "set-point changed", action="hold")
+    assert told(found, hold, until_s=60) == [("held", "set-point changed")]
+    assert [title for title, _ in told(found, event("released", 90, reason="interlock"))] == ["ok again"]
+
+
+def test_a_run_that_fails_before_it_begins_is_told_and_one_that_ended_not_twice():
+    found = book()
+    assert len(told(found, event("run_failed", 0))) == 1
+    assert len(told(found, event("run.end", 1, status="failed"), event("run_failed", 1))) == 1
+
+
+def test_in_an_hour_only_so_many_are_told_but_every_trip():
+    found = book(most_per_h=3, grace_ns=0)
+    prompts = [event("prompt", second, text=str(second)) for second in range(10)]
+    assert [text for _, text in told(found, *prompts)] == ["0", "1", "2"]
+    trip = event("guard.over_temperature", 20, action="abort")
+    assert told(found, trip) == [("TRIPPED", "why\n7 messages before this one were left out")]
+    assert [text for _, text in told(found, event("prompt", 3700, text="later"))] == ["later"]
+
+
+def test_only_what_is_wanted_is_told():
+    found = book(causes=("trip",))
+    assert told(found, event("run.start", 0), event("guard.x", 1, action="abort")) == [("TRIPPED", "why")]
