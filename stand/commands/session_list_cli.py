@@ -32,6 +32,7 @@ def list_sessions(
     tag: Annotated[
         list[str] | None, typer.Option("--tag", help="Only those with this tag; with each, when repeated.")
     ] = None,
+    not_archived: Annotated[bool, typer.Option("--not-archived", help="Only those without a copy elsewhere.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, how the
@@ -42,6 +43,7 @@ def list_sessions(
     with one_line_errors():
         wanted = set(map(check_tag, tag or ()))
         seen = [entry for entry in _entries(check_folder(directory)) if wanted <= set(entry.tags)]
+        seen = [entry for entry in seen if not (not_archived and entry.archived)]
         if as_json:
             typer.echo(json.dumps([entry_json(entry) for entry in seen], indent=2))
         elif not seen:

@@ -75,10 +75,12 @@ class RecordingConfig(Document):
 
     roi keeps the markers' surroundings and a whole frame every `whole_every_s`. With less than `stop_frames_below_GB`
     free no frame is recorded, with less than `alert_below_percent` of the disk there is a warning. What is published is
-    on the disk within `durable_within_s`, or the stand is made safe.
+    on the disk within `durable_within_s`, or the stand is made safe. archive_directory: where `stand session archive`
+    copies finished sessions to, another disk.
     """
 
     directory: Annotated[Path, AfterValidator(_printable)] = Path("sessions")
+    archive_directory: Annotated[Path, AfterValidator(_printable)] | None = None
     frame_encoding: Literal["png", "raw", "roi"] = "png"
     whole_every_s: float = Field(default=60.0, gt=0, le=86400)
     telemetry_commit_s: float = Field(default=1.0, gt=0, le=1)

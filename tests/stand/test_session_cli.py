@@ -50,7 +50,9 @@ def flip(path: Path, marker: bytes, behind: int) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("command", ["list", "note", "tag", "info", "verify", "salvage", "replay", "export", "trim"])
+@pytest.mark.parametrize(
+    "command", ["list", "note", "tag", "archive", "info", "verify", "salvage", "replay", "export", "trim"]
+)
 def test_every_command_explains_itself_with_an_example(command: str):
     assert f"Example: stand session {command}" in " ".join(ask(command, "--help").stdout.split())
 

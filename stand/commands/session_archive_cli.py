@@ -1,0 +1,120 @@
+"""`stand session archive`: finished sessions copied to another disk, read back, and deleted by a rule when asked."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from foundation.clock import WallClock
+from foundation.errors import ConfigError, SessionError
+from foundation.exit_codes import FAILED, one_line_errors
+from foundation.progress import late_progress
+from foundation.usage import OneLineUsage, one_line
+from recording.exporting.archive import Rule, archive, delete, unfit
+from recording.format.inventory import inventory
+from recording.reading.catalogue import Entry, catalogue, look_at
+from stand.commands.session_args import check_folder
+from stand.commands.session_list_cli import user_name
+from stand.commands.session_table import size
+from stand.config.stand_config import load_config, packaged
+
+app = typer.Typer(cls=OneLineUsage, no_args_is_help=True, add_completion=False)
+_NICENESS = 15  # whatever a stand does on this computer goes first
+
+
+@app.callback()
+def archiving() -> None:
+    """Copies of sessions."""
+
+
+@app.command("archive")
+def archive_sessions(
+    directory: Annotated[
+        Path | None, typer.Argument(metavar="[DIR]", help="A session, or where the sessions are.")
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the copies go; else recording.archive_directory.")
+    ] = None,
+    config: Annotated[str, typer.Option(help="The stand's file, or an installed configuration.")] = "simulated",
+    delete_after: Annotated[
+        float | None,
+        typer.Option("--delete-after", metavar="DAYS", min=0, help="Then delete those that ended so long ago."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Delete; without it what would be deleted is only shown.")] = False,
+) -> None:
+    """Copy finished sessions to another disk and read the copies back. One that was interrupted goes on where it was;
+    a session that is being recorded is not touched.
+
+    Example: stand session archive /data/sessions --to /mnt/nas/sessions --delete-after 30
+    """
+    with one_line_errors():
+        recording = load_config(packaged("", config)).recording
+        place, out = directory or recording.directory, to or recording.archive_directory
+        if out is None:
+            raise ConfigError("where to? give --to DIR, or recording.archive_directory in the stand's file")
+        if out.resolve().is_relative_to(check_folder(place).resolve()):
+            raise ConfigError(f"{out}: lies inside of {place}; the copies belong on another disk")
+        with suppress(OSError):
+            os.nice(_NICENESS)
+        failed = _copy(_entries(place), out)
+        if delete_after is not None:
+            failed += _delete(_entries(place), Rule(delete_after), yes=yes)
+        if failed:
+            raise typer.Exit(FAILED)
+
+
+def _entries(place: Path) -> list[Entry]:
+    return [look_at(place)] if inventory(place) else catalogue(place)
+
+
+def _copy(entries: Sequence[Entry], out: Path) -> int:
+    """How many could not be copied; those that must wait are told."""
+    waiting = [(entry, reason) for entry in entries if not entry.archived and (reason := unfit(entry))]
+    for entry, reason in waiting:
+        typer.echo(one_line(f"{entry.name}: not yet: {reason}"), err=True)
+    due = [entry for entry in entries if not entry.archived and not unfit(entry)]
+    if out.exists() and any(entry.path.stat().st_dev == out.stat().st_dev for entry in due):
+        typer.echo(one_line(f"warning: {out}: is on the disk that the sessions are on"), err=True)
+    failed = done = 0
+    with late_progress("archive", 2 * sum(entry.size_bytes for entry in due)) as report:
+        for entry in due:
+
+            def count(size_bytes: int, name: str = entry.name) -> None:
+                nonlocal done
+                done += size_bytes
+                report(done, one_line(name))
+
+            try:
+                copy = archive(entry, out, user_name(), WallClock().now_ns(), count)
+                typer.echo(one_line(f"{entry.name}: copied to {copy} and read back ({size(entry.size_bytes)})"))
+            except SessionError as error:
+                typer.echo(one_line(f"error: {error}"), err=True)
+                failed += 1
+    if not due:
+        typer.echo(f"nothing to copy: {sum(bool(entry.archived) for entry in entries)} of {len(entries)} have a copy")
+    return failed
+
+
+def _delete(entries: Sequence[Entry], rule: Rule, *, yes: bool) -> int:
+    """The rule and what it applies to; deleted only with `yes`. How many could not be deleted."""
+    typer.echo(f"{rule}:")
+    due = [entry for entry in entries if rule.applies(entry, WallClock().now_ns())]
+    failed = 0
+    for entry in due:
+        if not yes:
+            typer.echo(one_line(f"  {entry.path} ({size(entry.size_bytes)}), copy in {entry.archived}"))
+            continue
+        try:
+            delete(entry)
+            typer.echo(one_line(f"  {entry.path}: deleted ({size(entry.size_bytes)}); its copy is {entry.archived}"))
+        except SessionError as error:
+            typer.echo(one_line(f"error: {error}"), err=True)
+            failed += 1
+    total = size(sum(entry.size_bytes for entry in due))
+    typer.echo("  none" if not due else f"{len(due)} sessions, {total}" + ("" if yes else "; --yes deletes them"))
+    return failed

@@ -1,0 +1,182 @@
+"""Copies of sessions: whole, read back, resumable; what is deleted has one, and what is in use is never touched."""
+
+import asyncio
+import fcntl
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from foundation.errors import SessionError
+from recording.exporting import archive as module
+from recording.exporting.archive import MANIFEST, Rule, archive, check_copy, delete, unfit
+from recording.reading.catalogue import look_at
+from recording.reading.notes import add_note, add_tags, read_notes
+from recording.repair.verify import verify
+from tests.recording.runs import record_run
+
+DAY_NS = 86_400 * 10**9
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return asyncio.run(record_run(tmp_path_factory.mktemp("nights") / "night"))
+
+
+@pytest.fixture
+def session(night: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(night, tmp_path / "sessions" / "night"))
+
+
+@pytest.fixture
+def nas(tmp_path: Path) -> Path:
+    return tmp_path / "nas"
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in directory.rglob("*")
+        if path.is_file() and path.name != MANIFEST
+    }
+
+
+def test_a_copy_is_the_session_and_is_known(session: Path, nas: Path):
+    add_note(session, "windy", "eva", 1)
+    assert look_at(session).archived == ""
+    done: list[int] = []
+    copy = archive(look_at(session), nas, "eva", 5, done.append)
+    assert copy == nas / "night"
+    assert contents(copy) == contents(session)
+    assert sum(done) >= 2 * look_at(session).size_bytes
+    assert verify(copy).is_sound
+    assert look_at(session).archived == str(copy)
+    check_copy(copy, look_at(session).contents)
+    assert (read_notes(session).archived[0].time_ns, list(nas.iterdir())) == (5, [copy])
+
+
+def test_a_session_that_grew_since_is_not_archived_any_more_and_its_copy_is_not_overwritten(session: Path, nas: Path):
+    archive(look_at(session), nas, "eva", 5)
+    with (session / "journal.jsonl").open("ab") as file:
+        file.write(b"00000000 {}\n")
+    assert look_at(session).archived == ""
+    with pytest.raises(SessionError, match="is there already and is another session, or an older state"):
+        archive(look_at(session), nas, "eva", 6)
+
+
+def test_notes_given_later_leave_it_archived(session: Path, nas: Path):
+    archive(look_at(session), nas, "eva", 5)
+    add_tags(session, ["paper"], "eva", 6)
+    assert look_at(session).archived
+
+
+def test_an_interrupted_copy_goes_on_behind_its_last_file(session: Path, nas: Path, monkeypatch):
+    copied: list[str] = []
+    whole = module._copied
+
+    def cut(source: Path, target: Path, report):
+        if len(copied) == 4:
+            raise KeyboardInterrupt
+        copied.append(source.name)
+        return whole(source, target, report)
+
+    monkeypatch.setattr(module, "_copied", cut)
+    with pytest.raises(KeyboardInterrupt):
+        archive(look_at(session), nas, "eva", 5)
+    monkeypatch.setattr(module, "_copied", whole)
+    assert not (nas / "night").exists()
+    first = {path: path.stat().st_ino for path in (nas / "night.part").rglob("*.mcap")}
+    assert first
+    (nas / "night.part" / "frames" / ".0003.mcap.copying").write_bytes(b"torn")
+    copy = archive(look_at(session), nas, "eva", 6)
+    assert contents(copy) == contents(session)
+    assert {path.stat().st_ino for path in copy.rglob("*.mcap")} >= set(first.values())
+
+
+def test_what_reads_back_differently_is_no_copy_and_the_next_try_mends_it(session: Path, nas: Path):
+    part = nas / "night.part" / "frames"
+    part.mkdir(parents=True)
+    data = bytearray((session / "frames" / "0001.mcap").read_bytes())
+    data[100] ^= 1
+    (part / "0001.mcap").write_bytes(data)
+    with pytest.raises(SessionError, match="reads back differently"):
+        archive(look_at(session), nas, "eva", 5)
+    assert look_at(session).archived == ""
+    assert contents(archive(look_at(session), nas, "eva", 6)) == contents(session)
+
+
+def test_what_is_recorded_unfinished_or_may_be_resumed_is_not_copied(session: Path, nas: Path):
+    entry = look_at(session)
+    for run in ("running", "interrupted"):
+        with pytest.raises(SessionError, match=f"its run is {run} and may be resumed"):
+            archive(replace(entry, run=run), nas, "eva", 5)
+    shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0009.mcap.part")
+    assert "is being recorded, or was never finished" in unfit(look_at(session))
+    assert not nas.exists()
+
+
+def test_a_full_disk_is_told_before_anything_is_copied(session: Path, nas: Path, monkeypatch):
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 9, 1))
+    with pytest.raises(SessionError, match=r"has 0.0 GB free, and night needs 0.1 GB"):
+        archive(look_at(session), nas, "eva", 5)
+
+
+def test_the_rule_says_what_may_be_deleted(session: Path, nas: Path):
+    end_ns = look_at(session).end_utc_ns
+    rule = Rule(30)
+    assert not rule.applies(look_at(session), end_ns + 40 * DAY_NS)
+    archive(look_at(session), nas, "eva", 5)
+    entry = look_at(session)
+    assert [rule.applies(entry, end_ns + days * DAY_NS) for days in (0, 29, 30, 31)] == [False, False, True, True]
+    assert not rule.applies(replace(entry, files="damaged"), end_ns + 40 * DAY_NS)
+    assert not rule.applies(replace(entry, tags=("keep",)), end_ns + 40 * DAY_NS)
+    assert str(rule).startswith("deleted are sound sessions that ended at least 30 days ago, have a copy")
+
+
+def test_what_has_a_copy_is_deleted(session: Path, nas: Path):
+    copy = archive(look_at(session), nas, "eva", 5)
+    before = contents(session)
+    delete(look_at(session))
+    assert list(session.parent.iterdir()) == []
+    assert contents(copy) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda session, copy: (copy / "frames/0001.mcap").write_bytes(b"x"), "is not a complete copy"),
+        (lambda session, copy: (copy / MANIFEST).unlink(), "is not a complete copy"),
+        (lambda session, copy: shutil.rmtree(copy), "is not a complete copy"),
+        (lambda session, copy: (session / "frames/0004.mcap").unlink(), "has changed since it was copied; it is kept"),
+    ],
+)
+def test_without_a_whole_copy_nothing_is_deleted(session: Path, nas: Path, change, reason: str):
+    copy = archive(look_at(session), nas, "eva", 5)
+    entry = look_at(session)
+    change(session, copy)
+    before = contents(session)
+    with pytest.raises(SessionError, match=reason):
+        delete(entry)
+    assert contents(session) == before
+
+
+def test_a_flipped_bit_of_the_copy_is_found_before_anything_is_deleted(session: Path, nas: Path):
+    copy = archive(look_at(session), nas, "eva", 5)
+    data = bytearray((copy / "frames/0001.mcap").read_bytes())
+    data[-100] ^= 1
+    (copy / "frames/0001.mcap").write_bytes(data)
+    with pytest.raises(SessionError, match="reads back differently"):
+        delete(look_at(session))
+    assert session.is_dir()
+    assert (copy / "frames/0001.mcap").exists()
+
+
+def test_a_session_that_a_daemon_has_open_is_not_deleted(session: Path, nas: Path):
+    archive(look_at(session), nas, "eva", 5)
+    entry = look_at(session)
+    with (session / "journal.jsonl").open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(SessionError, match="a daemon has this session open; it is kept"):
+            delete(entry)
+    assert session.is_dir()
