@@ -8,6 +8,8 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
+from compensation.drift.bump import Bump
+from compensation.drift.bumps import around_bumps, find_bumps
 from compensation.drift.candidates import NO_MATTER_PX, Candidate
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_fit import check_degree, fit_paper
@@ -29,8 +31,26 @@ def fit(observations: Observations, degree: int | None = None, form: Form | None
     sessions without the telemetry that the thermal form needs have the paper's. degree: of the paper's form, which it
     implies. The model has the form that was not taken as `other`, where the sessions support it. SessionError when
     they cannot support what was asked for, or a degree was given for thermal.
+
+    It is fitted around steps that no thermal state explains (`facts.bumps`): frames on the other side of one count as
+    if the camera had not been moved, and are as uncertain as the step is.
     """
     check_request(degree, form)
+    bumps = find_bumps(observations)
+    return _around(bumps, _fitted(around_bumps(observations, bumps), degree, form))
+
+
+def _around(bumps: tuple[Bump, ...], model: DriftModel) -> DriftModel:
+    """The model, and its other form, with the bumps that it was fitted around."""
+    match model:
+        case PaperModel() | ThermalModel():
+            other = None if model.other is None else _around(bumps, model.other)
+            return replace(model, facts=replace(model.facts, bumps=bumps), other=other)
+        case _:
+            return model
+
+
+def _fitted(observations: Observations, degree: int | None, form: Form | None) -> DriftModel:
     if form == "thermal":
         _check_histories(observations)
         thermal = fit_thermal(observations)

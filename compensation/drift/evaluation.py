@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.drift.bumps import around_bumps
 from compensation.drift.displacements import Displacements, displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_fit import degrees_for, left_out, scaling_of
@@ -74,6 +75,7 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
     """Score the model on the VALIDATION frames; a session without any is scored by leaving out one temperature at a
     time, each time with a new fit of the same terms. SessionError when the frames are of another camera or target."""
     _check_same(model, observations)
+    observations = around_bumps(observations, model.facts.bumps)
     frames = observations.of(Role.VALIDATION)
     states = frame_states(observations, model.memory)
     if frames.any():

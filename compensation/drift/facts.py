@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compensation.drift.bump import Bump
 from compensation.drift.candidates import Pair
 from compensation.drift.displacements import Displacements, reference_centres
 from compensation.drift.hull import convex_hull, is_area
@@ -21,7 +22,8 @@ class ModelFacts:
     """image_size: (width, height), px. camera_range_degC: the calibrated interval of the camera's temperature. hull_px
     (H, 2): convex hull of the training markers. reference_degC: the camera's temperature at the reference,
     reference_chamber_degC the set-point. reference_centres_px (N, 2): of the first session with reference frames, NaN
-    for a marker never seen. software_version: what it was fitted by."""
+    for a marker never seen. software_version: what it was fitted by. bumps: steps of the image that it was
+    fitted around."""
 
     image_size: tuple[int, int]
     camera_range_degC: Pair
@@ -33,6 +35,7 @@ class ModelFacts:
     camera_serial: str
     session_ids: tuple[str, ...]
     software_version: str
+    bumps: tuple[Bump, ...] = ()
 
 
 def facts_of(

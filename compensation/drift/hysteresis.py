@@ -14,6 +14,7 @@ from itertools import combinations, groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.drift.bumps import around_bumps
 from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.training import frame_states
@@ -81,6 +82,8 @@ class _Visit:
 
 def hysteresis(observations: Observations, model: DriftModel | None = None) -> tuple[Hysteresis, ...]:
     """Of each session that has reference frames; after compensation with `model`, before it without."""
+    if model is not None:
+        observations = around_bumps(observations, model.facts.bumps)
     found: list[Hysteresis] = []
     for index, facts in enumerate(observations.sessions):
         own = observations.of(*_CYCLE) & (observations.session == index)

@@ -1,6 +1,7 @@
 """Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null.
 
-A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form.
+A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form, those
+before version 4 know of no bumps.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 
+from compensation.drift.bump import Bump
 from compensation.drift.candidates import Candidate, Pair
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.facts import ModelFacts
@@ -27,7 +29,7 @@ from foundation.errors import SessionError
 from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 Positive = Annotated[int, Field(gt=0)]
 Rows = tuple[tuple[float, ...], ...]
@@ -37,7 +39,7 @@ class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Literal[2, 3] = SCHEMA_VERSION
+    schema_version: Literal[2, 3, 4] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]
@@ -50,6 +52,7 @@ class _File(Document):
     hull_px: Annotated[tuple[Pair, ...], Field(min_length=3)]
     discrepancy_px: Pair
     candidates: tuple[Candidate, ...]
+    bumps: tuple[Bump, ...] = ()
 
 
 class PaperFile(_File):
@@ -142,6 +145,7 @@ def _document(model: DriftModel) -> PaperFile | ThermalFile:
         "hull_px": facts.hull_px.tolist(),
         "discrepancy_px": model.discrepancy_px.tolist(),
         "candidates": model.candidates,
+        "bumps": facts.bumps,
         "other": None if model.other is None else _document(model.other),
     }
     match model:
@@ -239,6 +243,7 @@ def _facts(file: PaperFile | ThermalFile) -> ModelFacts:
         camera_serial=file.camera_serial,
         session_ids=file.session_ids,
         software_version=file.software_version,
+        bumps=file.bumps,
     )
 
 

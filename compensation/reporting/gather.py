@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from compensation.drift.bumps import around_bumps, find_bumps
 from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
@@ -20,6 +21,7 @@ from compensation.observations import Float, Mask, Observations
 from compensation.reporting.extras import Extras
 from compensation.reporting.numbers import (
     FORMAT,
+    BumpNumbers,
     HysteresisNumbers,
     ModelNumbers,
     Numbers,
@@ -65,9 +67,18 @@ def numbers_of(
         model=None if model is None else _model(model),
         budgets=dict(extras.budgets),
         positions=extras.positions,
+        bumps=tuple(_bumps(observations, model)),
         validation=None if validation is None else json.loads(validation_json(validation)),
         paper={"before_px": PAPER_BEFORE_PX, "after_px": PAPER_AFTER_PX, "warm_up_px": PAPER_WARM_UP_PX},
     )
+
+
+def _bumps(observations: Observations, model: DriftModel | None) -> Iterator[BumpNumbers]:
+    utc = {facts.session_id: facts.utc for facts in observations.sessions}
+    for bump in find_bumps(observations) if model is None else model.facts.bumps:
+        if bump.session_id in utc:
+            at = [_instant(utc[bump.session_id].utc_ns(ns)) for ns in (bump.after_ns, bump.before_ns)]
+            yield BumpNumbers(bump.session_id, at[0], at[1], bump.motions_px, bump.sigma_px, bump.marker, bump.text)
 
 
 def _session(observations: Observations, index: int) -> SessionNumbers:
@@ -144,6 +155,7 @@ def _left_px(observations: Observations, one: WarmUp, model: DriftModel) -> Pair
     """NaN for a camera that stood differently at the reference, and where the model has no answer."""
     frames = np.zeros(len(observations.frame), bool)
     frames[one.track.frames] = True
+    observations = around_bumps(observations, model.facts.bumps)
     if not one.track.shares_reference:
         return math.nan, math.nan
     rows = displacements(observations, frames)

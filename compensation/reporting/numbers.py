@@ -106,6 +106,20 @@ class HysteresisNumbers:
 
 
 @dataclass(frozen=True, slots=True)
+class BumpNumbers:
+    """A step of the image that no thermal state explains, between the frames at `after` and `before`. motions_px,
+    sigma_px (4,): as in compensation/drift/bump.py. marker: the one that moved alone, from 0."""
+
+    session_id: str
+    after: str
+    before: str
+    motions_px: tuple[float, ...]
+    sigma_px: tuple[float, ...]
+    marker: int | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class ModelNumbers:
     """candidates: every form tried, with its errors at temperatures left out."""
 
@@ -142,6 +156,7 @@ class Numbers:
     model: ModelNumbers | None
     budgets: dict[str, Budget]
     positions: TablePositions
+    bumps: tuple[BumpNumbers, ...]
     validation: object
     paper: dict[str, Pair]
 

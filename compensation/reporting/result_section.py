@@ -27,12 +27,31 @@ def result_section(numbers: Numbers, validation: Validation | None = None) -> It
         )
     else:
         yield from _gain(numbers, numbers.score)
+    yield from _bumps(numbers)
     if validation is not None:
         yield Paragraph(
             "In space, the mean absolute deviation of the target from its place at the reference temperature:"
         )
         yield gains_table(validation, ours(numbers))
     yield Paragraph(PAPER, aside=True)
+
+
+def _bumps(numbers: Numbers) -> Iterator[Part]:
+    if not numbers.bumps:
+        return
+    several = f"{len(numbers.bumps)} times the image" if len(numbers.bumps) > 1 else "Once the image"
+    around = (
+        "" if numbers.model is None else " The model was fitted around this; its figures are as if it had not been."
+    )
+    yield Paragraph(
+        f"{several} moved in a step that no temperature explains: something was touched, or a fixing slipped.{around}"
+    )
+    rows = [(one.session_id, _clock(one.after), _clock(one.before), one.text) for one in numbers.bumps]
+    yield Table(("session", "after, UTC", "before, UTC", "what moved"), rows)
+
+
+def _clock(instant: str) -> str:
+    return instant[:19].replace("T", " ")
 
 
 def ours(numbers: Numbers) -> str:

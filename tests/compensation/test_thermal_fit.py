@@ -165,7 +165,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
         np.testing.assert_equal(getattr(loaded.facts, name), getattr(thermal.facts, name), err_msg=name)
     assert loaded.valid.__repr__() == thermal.valid.__repr__()
     data = json.loads((tmp_path / "model.json").read_text())
-    assert (data["form"], data["schema_version"]) == ("thermal", 3)
+    assert (data["form"], data["schema_version"]) == ("thermal", 4)
     (tmp_path / "model.json").write_text(json.dumps({**data, "reference_features": [0.0]}))
     with pytest.raises(SessionError, match="reference_features: shape"):
         load_model(tmp_path / "model.json")

@@ -1,0 +1,106 @@
+"""Steps in a night: found where they are, with their size, and fitted around; none in nights without any."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensation.drift.bumps import find_bumps
+from compensation.drift.choosing import fit
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.evaluation import evaluate
+from compensation.drift.model_file import load_model, save_model
+from compensation.drift.training import frame_states
+from compensation.observations import Mask, Observations
+from experiments.steps import Role
+
+from .drawn_cameras import Camera, drawn_camera
+from .drawn_nights import START_NS, Bump, Night, full_night, night
+
+AT_H = 13.0
+SHIFT_PX = np.array([0.03, -0.04])
+
+
+def bumped(camera: Camera, seed: int = 0, at_h: float = AT_H) -> Night:
+    return night(camera, full_night(), seed, bumps=[Bump(at_h, SHIFT_PX)])
+
+
+def left_mpx(model: DriftModel, made: Night) -> float:
+    """RMS of what the model leaves of the truth without the bump at held-out temperatures."""
+    observed, truth = made.observed, made.truth_px
+    states = frame_states(observed, model.memory)
+    place_px = truth[observed.of(Role.REFERENCE)].mean(axis=0)
+    frames = np.flatnonzero(observed.of(Role.VALIDATION)).tolist()
+    left = [place_px - model.correct(truth[k], states.where(np.array([k]))) for k in frames]
+    return 1e3 * float(np.sqrt(np.mean(np.square(left))))
+
+
+def hours(ns: int) -> float:
+    return (ns - START_NS) / 3.6e12
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bump_of_a_twentieth_of_a_pixel_is_found_when_and_how_far(seed: int) -> None:
+    (found,) = find_bumps(bumped(drawn_camera(seed)).observed)
+    assert hours(found.after_ns) < AT_H < hours(found.before_ns)
+    assert hours(found.before_ns) - hours(found.after_ns) < 0.8
+    assert found.marker is None
+    off = np.abs(np.array(found.motions_px[:2]) - SHIFT_PX)
+    assert (off < 4 * np.array(found.sigma_px[:2]) + 0.002).all()
+    assert off.max() < 0.01
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_clean_night_has_none(seed: int) -> None:
+    effects = ("creep", "coarse_sensor") if seed % 2 else ("sag", "far_air")
+    assert find_bumps(night(drawn_camera(seed, *effects), full_night(), seed).observed) == ()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_fit_goes_around_a_bump(seed: int) -> None:
+    camera = drawn_camera(seed)
+    clean, made = night(camera, full_night(), seed), bumped(camera, seed)
+    models = [fit(one.observed, form="thermal") for one in (clean, made)]
+    left = [left_mpx(model, one) for model, one in zip(models, (clean, made), strict=True)]
+    assert left[1] < 1.5 * left[0] + 0.5
+    scored = [evaluate(model, one.observed).rms_after_px for model, one in zip(models, (clean, made), strict=True)]
+    assert np.hypot(*scored[1]) < 1.5 * np.hypot(*scored[0])
+
+
+def test_a_bump_before_the_reference_moves_the_warm_up_not_the_night() -> None:
+    camera = drawn_camera(2)
+    made = night(camera, full_night(), bumps=[Bump(4.6, np.array([0.2, 0.1]))])
+    model = fit(made.observed, form="thermal")
+    assert len(model.facts.bumps) == 1
+    assert left_mpx(model, made) < 1.5 * left_mpx(fit(night(camera, full_night()).observed, form="thermal"), made) + 0.5
+
+
+def test_one_marker_that_moves_is_named() -> None:
+    shift = np.zeros((54, 2))
+    shift[17] = SHIFT_PX
+    (found,) = find_bumps(night(drawn_camera(1), full_night(), bumps=[Bump(AT_H, shift)]).observed)
+    assert found.marker == 17
+    assert np.array(found.motions_px[:2]) == pytest.approx(SHIFT_PX, abs=0.008)
+
+
+def test_bumps_stand_in_the_model_file(tmp_path: Path) -> None:
+    model = fit(bumped(drawn_camera(0)).observed)
+    assert len(model.facts.bumps) == 1
+    save_model(model, tmp_path / "model.json")
+    again = load_model(tmp_path / "model.json")
+    assert again.facts.bumps == model.facts.bumps
+    assert again.other is not None
+    assert again.other.facts.bumps == model.facts.bumps
+
+
+def test_a_few_frames_are_too_few_to_tell() -> None:
+    made = bumped(drawn_camera(0)).observed
+    few = made.time_ns < made.time_ns[60]
+    assert find_bumps(_only(made, few)) == ()
+
+
+def _only(made: Observations, keep: Mask) -> Observations:
+    return replace(made, reasons=tuple("" if kept else "left out" for kept in keep.tolist()))
