@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from markers.band import NARROW_SIGMA, WIDE_EXCESS, WIDE_SIGMA, excess_px2, is_doubtful
 from markers.bootstrap import Candidates, disc_sizes_px, find_candidates
 from markers.edge_fit import EdgeFit, Flag, fit_edges
 from markers.edge_model import B0, F0, M11, M12, M22, SIGMA, EdgeState
@@ -26,6 +27,7 @@ from markers.grid import DetectionError, Identified, expected_px, fit_homography
 from markers.light import under_common_light
 from markers.noise import Image, Noise
 from markers.refit import refit_edges
+from markers.sandwich import variance_growth
 from markers.target import Target
 
 __all__ = [
@@ -59,7 +61,10 @@ class Detection:
 
     centres_px: (N, 2) float64 (x, y), NaN without a centre. covariance_px2: (N, 2, 2), NaN likewise. flags: (N,) uint8
     of Flag, 0 when nothing is wrong. chi: (N,), residual over expected noise; 1 is right, NaN without a centre.
-    homography: (3, 3), target mm -> px. state: the fitted edges, the start of the next frame.
+    homography: (3, 3), target mm -> px. state: the fitted edges, the start of the next frame. growth: (2,), by what the
+    variances along x and y exceed, or fall below, those of residuals that are independent of each other (sandwich.py).
+    excess_px2: (2,), what misfit of ground and disc adds to them, px^2. band_sigma: half width of the band of pixels
+    fitted, in blurs (band.py). The next frame keeps the last two.
     """
 
     centres_px: Float
@@ -68,6 +73,9 @@ class Detection:
     chi: Float
     homography: Float
     state: EdgeState
+    growth: Float
+    excess_px2: Float
+    band_sigma: float
 
     @property
     def found(self) -> int:
@@ -99,9 +107,9 @@ def detect(
             raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
         if _still_there(grey, previous):
             with suppress(DetectionError):
-                tracked = _fit(grey, target, previous.state, noise)
-                if tracked is not None and _has_followed(tracked, previous):
-                    return tracked
+                tracked = _fit_in_band(grey, target, previous.state, noise, previous.band_sigma)
+                if tracked is not None and _has_followed(tracked[0], previous):
+                    return _doubted(tracked[0], previous.excess_px2)
     return _search(grey, target, None if previous is None else previous.homography, noise, watch)
 
 
@@ -115,6 +123,9 @@ def nothing_found(target: Target) -> Detection:
         chi=np.full(count, np.nan),
         homography=np.full((3, 3), np.nan),
         state=EdgeState(np.full((count, 12), np.nan), np.full(count, np.nan)),
+        growth=np.ones(2),
+        excess_px2=np.zeros(2),
+        band_sigma=WIDE_SIGMA,
     )
 
 
@@ -172,9 +183,28 @@ def _first_fit(
 
 
 def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> Detection | None:
+    """The fit in a wide band; where its residuals hang together, in a narrow one if that leaves less variance."""
+    found = _fit_in_band(grey, target, start, noise, WIDE_SIGMA)
+    if found is None:
+        return None
+    wide, fit = found
+    if not is_doubtful(fit, wide.growth, wide.flags == 0):
+        return wide
+    again = _fit_in_band(grey, target, wide.state, noise, NARROW_SIGMA)
+    if again is None:
+        return wide
+    narrow, narrow_fit = again
+    excess = excess_px2(fit, narrow_fit, wide.growth, (wide.flags == 0) & (narrow.flags == 0))
+    possible = _doubted(wide, WIDE_EXCESS * excess), _doubted(narrow, excess)
+    return min(possible, key=lambda one: float(np.nanmedian(np.trace(one.covariance_px2, axis1=1, axis2=2))))
+
+
+def _fit_in_band(
+    grey: Image, target: Target, start: EdgeState, noise: Noise | None, band_sigma: float
+) -> tuple[Detection, EdgeFit] | None:
     """The fit from `start`, judged; None when fewer markers than the target demands have a credible centre."""
     model = noise or Noise()
-    fit = fit_edges(grey, start, model, _reach(target))
+    fit = fit_edges(grey, start, model, _reach(target), band_sigma)
     good = np.isfinite(fit.chi) & _has_contrast(fit.state, target, model)
     if good.sum() < target.least_markers:
         return None
@@ -183,11 +213,21 @@ def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> 
     if good.sum() < target.least_markers:
         return None
     homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
-    detection = _judged(fit, good, homography, target, relative=noise is None)
-    return _refitted(detection, fit, grey, target, model)
+    detection = _judged(fit, good, homography, target, band_sigma, relative=noise is None)
+    return _refitted(detection, fit, grey, target, model), fit
 
 
-def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Target, relative: bool) -> Detection:
+def _doubted(detection: Detection, excess: Float) -> Detection:
+    """The detection with `excess` (2,), px^2, added to the variances of its centres. Where there is any, residuals that
+    hang together over the whole marker hide from `growth`: below 1 it is not believed."""
+    growth = np.where(excess > 0, np.maximum(detection.growth, 1), detection.growth)
+    covariance = _grown(detection.covariance_px2, growth / detection.growth) + np.diag(excess)
+    return replace(detection, covariance_px2=covariance, growth=growth, excess_px2=excess)
+
+
+def _judged(
+    fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Target, band_sigma: float, relative: bool
+) -> Detection:
     """The detection of a fit whose markers are `good` or missing; missing ones are expected where the others say."""
     chi, misfit = np.where(good, fit.chi, np.nan), np.where(good, fit.misfit, np.nan)
     usual = max(float(np.nanmedian(chi)), 1e-9)
@@ -203,9 +243,10 @@ def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Ta
     parameters = expected.parameters
     parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
     centres, covariance = under_common_light(fit, good & ~poor)
+    growth = variance_growth(fit.scatter, good & ~poor)
     return Detection(
         centres_px=np.where(good[:, None], centres, np.nan),
-        covariance_px2=np.where(good[:, None, None], covariance, np.nan),
+        covariance_px2=np.where(good[:, None, None], _grown(covariance, growth), np.nan),
         flags=flags.astype(np.uint8),
         chi=chi,
         homography=homography,
@@ -213,7 +254,15 @@ def _judged(fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Ta
             np.where(good[:, None], fit.state.parameters, parameters),
             np.where(good, fit.state.scale_px, expected.scale_px * scale),
         ),
+        growth=growth,
+        excess_px2=np.zeros(2),
+        band_sigma=band_sigma,
     )
+
+
+def _grown(covariance: Float, growth: Float) -> Float:
+    """Covariances (N, 2, 2) whose variances grow and whose correlations stay."""
+    return covariance * np.sqrt(np.outer(growth, growth))
 
 
 def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, noise: Noise) -> Detection:
@@ -226,12 +275,14 @@ def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, n
     usual = float(np.median(fit.chi[clean]))
     scaled = Noise(noise.floor_DN2 * usual**2, noise.slope_DN * usual**2)
     patience = float(np.median(fit.misfit[clean])) / usual
-    again = refit_edges(grey, implied.state, implied.spread, scaled, _reach(target)[poor], patience)
+    again = refit_edges(
+        grey, implied.state, implied.spread, scaled, _reach(target)[poor], patience, detection.band_sigma
+    )
     credible = (again.chi < _POOR_CHI) & _has_contrast(again.state, target, scaled)
     which = poor[credible]
     for whole, part in (
         (detection.centres_px, again.state.centres_px()),
-        (detection.covariance_px2, again.covariance_px2),
+        (detection.covariance_px2, _grown(again.covariance_px2, np.maximum(detection.growth, 1))),
         (detection.chi, again.chi),
         (detection.state.parameters, again.state.parameters),
         (detection.state.scale_px, again.state.scale_px),

@@ -13,23 +13,24 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from markers import edge_model, newton, pixels, sectors
+from markers import edge_model, newton, pixels, sandwich, sectors
 from markers.compiled import digest, entry
 from markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, Variance
 from markers.newton import (
-    BAND_SIGMA,
     DIVERGED,
     LEAST_BAND_PX,
     SETTLED,
     TOO_FEW,
     Work,
     inverse,
+    mean_radius,
     no_belief,
     settle,
 )
 from markers.noise import Image, Noise, full_scale_DN
 from markers.pixels import Pixels, empty_pixels
-from markers.sectors import misfit
+from markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
+from markers.sectors import misfits
 
 _SATURATED_PART = 0.1
 
@@ -60,14 +61,18 @@ _BORDER, _SATURATED, _TOO_FEW, _DIVERGED = map(int, (Flag.BORDER, Flag.SATURATED
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeFit:
     """state: what was fitted. covariance: of its parameters (N, 12, 12), noise times chi^2. chi: (N,), 1 when the noise
-    model explains the residuals; misfit: (N,), the same sector by sector (sectors.py). flags: (N,) uint8 of Flag.
-    Markers that failed keep their start values, with NaN covariance, chi and misfit.
+    model explains the residuals; misfit: (N,), the same sector by sector; levels: (N,), that of ground and disc beside
+    the outline (sectors.py). scatter: (N, 2, 2), the centre's cluster-robust variances and those of independent
+    residuals, px^2, NaN for markers that were not looked at for this (sandwich.py). flags: (N,) uint8 of Flag.
+    Markers that failed keep their start values, with NaN in the others.
     """
 
     state: EdgeState
     covariance: Float
     chi: Float
     misfit: Float
+    levels: Float
+    scatter: Float
     flags: NDArray[np.uint8]
 
     @property
@@ -76,23 +81,28 @@ class EdgeFit:
         return self.covariance[:, :2, :2]
 
 
-def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float) -> EdgeFit:
+def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float, band_sigma: float = 9.0) -> EdgeFit:
     """Fit every marker of `start`. `reach` (N,): how many radii from the centre a marker's pixels may lie, so that its
-    band ends half way to the neighbours. The image is only read. Raises ValueError for images that are not contiguous.
+    band ends half way to the neighbours. band_sigma: half width of the band, blurs. The image is only read. Raises
+    ValueError for images that are not contiguous.
     """
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
-    covariance, quality, flags = (
+    covariance, quality, scatter, flags = (
         np.empty((count, PARAMETERS, PARAMETERS)),
-        np.empty((count, 2)),
+        np.empty((count, 3)),
+        np.empty((count, 2, 2)),
         np.empty(count, np.uint8),
     )
     _fit_all(
         only_read(image), parameters, start.scale_px, np.asarray(reach, np.float64),
-        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
-        covariance, quality, flags,
+        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start, band_sigma)),
+        band_sigma,
+        covariance, quality, scatter, flags,
     )  # fmt: skip
-    return EdgeFit(EdgeState(parameters, start.scale_px), covariance, quality[:, 0], quality[:, 1], flags)
+    return EdgeFit(
+        EdgeState(parameters, start.scale_px), covariance, quality[:, 0], quality[:, 1], quality[:, 2], scatter, flags
+    )
 
 
 def only_read(image: Image) -> Image:
@@ -102,9 +112,9 @@ def only_read(image: Image) -> Image:
     return view
 
 
-def room(image: Image, start: EdgeState) -> int:
+def room(image: Image, start: EdgeState, band_sigma: float) -> int:
     """Pixels of the largest marker with its band, when it turns out half as large again and six times as blurred."""
-    side = 3 * start.half_extents_px() + 12 * np.maximum(BAND_SIGMA * start.parameters[:, SIGMA, None], LEAST_BAND_PX)
+    side = 3 * start.half_extents_px() + 12 * np.maximum(band_sigma * start.parameters[:, SIGMA, None], LEAST_BAND_PX)
     return int(min(np.nanmax(np.prod(side + 3, axis=1), initial=1), image.size))
 
 
@@ -118,22 +128,32 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
         noise: Variance,
         ceiling: int,
         pixels: Pixels,
+        band_sigma: float,
         covariance: Float,
         quality: Float,
+        scatter: Float,
         flags: NDArray[np.uint8],
     ) -> None:
         """Fit each row of `parameters` in place; chi and misfit into `quality` (N, 2)."""
         _ = sources
         work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
         belief = no_belief()
+        every = max(1, len(scale) // SAMPLED_MARKERS)
+        scatter[:] = np.nan
         for n in range(len(scale)):
             p = parameters[n].copy()
-            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)
+            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
             flags[n] = _BORDER * outcome.cut + _SATURATED * (outcome.burnt > _SATURATED_PART * outcome.seen)
             if outcome.status == SETTLED:
                 parameters[n] = p
-                covariance[n] = inverse(work) * outcome.variance
-                quality[n] = np.sqrt(outcome.variance), misfit(pixels, p)
+                unscaled = inverse(work)
+                covariance[n] = unscaled * outcome.variance
+                quality[n, 0] = np.sqrt(outcome.variance)
+                quality[n, 1], quality[n, 2] = misfits(pixels, p)
+                if n % every == 0:
+                    clusters = clusters_of(mean_radius(p, scale[n]))
+                    scatter[n] = centre_scatter(pixels, p, scale[n], noise, unscaled, clusters)
+                    scatter[n, 1] *= outcome.variance
             else:
                 covariance[n], quality[n] = np.nan, np.nan
                 flags[n] += _TOO_FEW * (outcome.status == TOO_FEW) + _DIVERGED * (outcome.status == DIVERGED)
@@ -141,4 +161,4 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
     return fit_all
 
 
-_fit_all = _compiled_fit(digest(pixels, edge_model, newton, sectors))
+_fit_all = _compiled_fit(digest(pixels, edge_model, newton, sandwich, sectors))

@@ -30,8 +30,6 @@ from markers.noise import Image
 from markers.pixels import SHARE, VALUE, Gathered, Limits, Pixels, U, V, gather
 from markers.sectors import SECTORS, Bools, set_aside
 
-BAND_SIGMA = 9.0
-"""Half width of the fitted band in blurs."""
 LEAST_BAND_PX = 3.5
 CORE_SIGMA = 5.0
 """The blurs from the outline within which a pixel helps to locate it; the density is 1e-5 of its maximum beyond."""
@@ -96,12 +94,13 @@ def settle(
     pixels: Pixels,
     work: Work,
     belief: Belief,
+    band_sigma: float,
 ) -> Outcome:
     """Fit `p` (12,) to the image in place. The pixels are gathered again when the outline has left them or turned out
     more blurred than it was thought to be, which also makes the result independent of the start."""
     start, gathered_at = p.copy(), p.copy()
     far = bool(np.isnan(p[B0]))
-    gathered = look(image, p, scale, band(p, scale, reach, far), ceiling, pixels, belief)
+    gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
     gatherings = 1
     variance = np.nan
     if far:
@@ -121,8 +120,8 @@ def settle(
         if not possible(p, noise) or strayed(start, p, scale, 1.5):
             return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
         far = math.hypot(step[CX], step[CY]) > _FAR_PX
-        if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale):
-            gathered = look(image, p, scale, band(p, scale, reach, far), ceiling, pixels, belief)
+        if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale, band_sigma):
+            gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
             gathered_at[:] = p
             gatherings += 1
             if gathered.seen < 0:
@@ -155,11 +154,11 @@ def add_belief(work: Work, p: Float, belief: Belief) -> None:
 
 
 @compiled
-def band(p: Float, scale: float, reach: float, far: bool) -> Limits:
+def band(p: Float, scale: float, reach: float, far: bool, band_sigma: float) -> Limits:
     """The limits of the pixels that are looked at, in F, along the shorter axis; the longer one has more. far: the
     outline is not known well enough to say what is far from it, so that all belong to the core."""
     least = mean_radius(p, scale) ** 2 / long_axis(p, scale)
-    width = max(BAND_SIGMA * p[SIGMA], LEAST_BAND_PX) / least
+    width = max(band_sigma * p[SIGMA], LEAST_BAND_PX) / least
     core = width if far else min(CORE_SIGMA * p[SIGMA] / least, width)
     return Limits(max(1 - width, 0.0), max(1 - core, 0.0), 1 + core, min(1 + width, reach))
 
@@ -281,12 +280,12 @@ def strayed(start: Float, p: Float, scale: float, radii: float) -> bool:
 
 
 @compiled
-def moved_off(gathered_at: Float, p: Float, scale: float) -> bool:
+def moved_off(gathered_at: Float, p: Float, scale: float, band_sigma: float) -> bool:
     """Whether the pixels gathered for one outline are not the right ones for another."""
     before, after = half_extents(gathered_at, scale), half_extents(p, scale)
     moved = math.hypot(p[CX] - gathered_at[CX], p[CY] - gathered_at[CY])
     grown = max(abs(after[0] - before[0]), abs(after[1] - before[1]))
-    widths = max(BAND_SIGMA * gathered_at[SIGMA], LEAST_BAND_PX), max(BAND_SIGMA * p[SIGMA], LEAST_BAND_PX)
+    widths = max(band_sigma * gathered_at[SIGMA], LEAST_BAND_PX), max(band_sigma * p[SIGMA], LEAST_BAND_PX)
     return abs(widths[1] - widths[0]) > _BAND_TOLERANCE * widths[0] or moved + grown > _MOVE_TOLERANCE_SIGMA * p[SIGMA]
 
 

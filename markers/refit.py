@@ -42,17 +42,19 @@ class Refit:
     chi: Float
 
 
-def refit_edges(image: Image, start: EdgeState, spread: Float, noise: Noise, reach: Float, patience: float) -> Refit:
+def refit_edges(
+    image: Image, start: EdgeState, spread: Float, noise: Noise, reach: Float, patience: float, band_sigma: float
+) -> Refit:
     """Fit markers from the ellipses `start` that the others imply. spread: (N, 4), standard deviations of their m11,
     m12, m22 and sigma. noise: such that clean markers have chi 1. patience: how much more than noise clean markers'
-    outlines deviate from ellipses, 1 for perfect ones."""
+    outlines deviate from ellipses, 1 for perfect ones. band_sigma: half width of the band, blurs."""
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
     covariance, chi = np.empty((count, 2, 2)), np.empty(count)
     _refit_all(
         only_read(image), parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
-        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start)),
-        _GREATEST_MISFIT * max(patience, 1.0), covariance, chi,
+        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start, band_sigma)),
+        _GREATEST_MISFIT * max(patience, 1.0), band_sigma, covariance, chi,
     )  # fmt: skip
     return Refit(EdgeState(parameters, start.scale_px), covariance, chi)
 
@@ -96,6 +98,7 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
         ceiling: int,
         pixels: Pixels,
         greatest: float,
+        band_sigma: float,
         covariance: Float,
         chi: Float,
     ) -> None:
@@ -106,12 +109,12 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
             p = parameters[n].copy()
             covariance[n], chi[n] = np.nan, np.nan
             belief = Belief(np.ones(SECTORS, np.bool_), p[M11 : SIGMA + 1].copy(), weight[n])
-            look(image, p, scale[n], band(p, scale[n], reach[n], False), ceiling, pixels, belief)
+            look(image, p, scale[n], band(p, scale[n], reach[n], False, band_sigma), ceiling, pixels, belief)
             normal_equations(pixels, p, scale[n], noise, work.normal, work.right)
             drop_strangers(belief.kept, sector_misfits(pixels, p), greatest)
             searching = True
             while searching and belief.kept.sum() >= _LEAST_SECTORS:
-                outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)
+                outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
                 if outcome.status != SETTLED:
                     break
                 searching = drop_worst(belief.kept, sector_misfits(pixels, p), greatest)
@@ -121,7 +124,7 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
             drop_neighbours(belief.kept)
             if belief.kept.sum() < _LEAST_SECTORS:
                 continue
-            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief)
+            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
             if outcome.status == SETTLED:
                 moved = p[:2] - before
                 parameters[n] = p

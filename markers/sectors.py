@@ -53,11 +53,13 @@ def deviations(pixels: Pixels, p: Float) -> Float:
 
 
 @compiled
-def misfit(pixels: Pixels, p: Float) -> float:
-    """Root mean square over the sectors of the worse of their outlines and their two levels; 1 when the noise explains
-    them. Something that hides a part of the marker, or shines on it, shows here long before it shows in the residuals
-    of all pixels together."""
-    return math.sqrt(max([_mean(row * row) for row in deviations(pixels, p)]))
+def misfits(pixels: Pixels, p: Float) -> tuple[float, float]:
+    """Root mean square over the sectors of the worse of their outlines and their two levels, and of the worse level; 1
+    when the noise explains them. Something that hides a part of the marker, or shines on it, shows here long before it
+    shows in the residuals of all pixels together."""
+    outline, ground, disc = [_mean(row * row) for row in deviations(pixels, p)]
+    levels = max(ground, disc)
+    return math.sqrt(max(outline, levels)), math.sqrt(levels)
 
 
 @compiled

@@ -1,0 +1,148 @@
+"""The covariance of centres in pictures whose residuals hang together: chi^2 of the true errors is near 1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from markers.band import NARROW_SIGMA, WIDE_SIGMA
+from markers.detection import Detection, detect
+from markers.sandwich import variance_growth
+
+from .rendered import Float, photograph, render, true_centres_px
+from .test_markers import HALF, PAPER
+
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+SCENE = replace(HALF, roll_deg=7, tilt_y_deg=10, distance_mm=1100)
+FRAMES = 4
+
+
+@cache
+def clean() -> Float:
+    return render(SCENE)
+
+
+def noise_alone(seed: int) -> Image:
+    return photograph(SCENE, clean(), seed)
+
+
+def as_jpeg(quality: int) -> Callable[[int], Image]:
+    def picture(seed: int) -> Image:
+        stored = cv2.imencode(".jpg", photograph(SCENE, clean(), seed), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        return np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+    return picture
+
+
+def moved_while_exposed(length_px: float) -> Callable[[int], Image]:
+    """Along a line at 20 deg to the rows."""
+    kernel = np.zeros((31, 31))
+    for t in np.linspace(-length_px / 2, length_px / 2, 400):
+        x, y = 15 + t * np.cos(np.radians(20)), 15 + t * np.sin(np.radians(20))
+        column, row = int(x), int(y)
+        right, down = x - column, y - row
+        kernel[row : row + 2, column : column + 2] += np.outer([1 - down, down], [1 - right, right]) / 400
+    return lambda seed: photograph(SCENE, np.asarray(cv2.filter2D(clean(), -1, kernel), np.float64), seed)
+
+
+def unequal_pixels(seed: int) -> Image:
+    gains = 1 + 0.02 * np.random.default_rng(seed + 1000).standard_normal(clean().shape)
+    return photograph(SCENE, clean() * gains, seed)
+
+
+def with_gamma(seed: int) -> Image:
+    image = photograph(SCENE, clean(), seed) / 255
+    return np.round(255 * image ** (1 / 2.2)).astype(np.uint8)
+
+
+def flickering_rows(seed: int) -> Image:
+    rows = np.random.default_rng(seed + 1000).standard_normal((SCENE.size[1], 1))
+    return photograph(SCENE, clean() + 3 * rows, seed)
+
+
+def on_grained_paper(seed: int) -> Image:
+    grain = cv2.GaussianBlur(np.random.default_rng(seed + 1000).standard_normal(clean().shape), (0, 0), 5)
+    return photograph(SCENE, clean() * (1 + 0.05 * grain / grain.std()), seed)
+
+
+def errors_px(picture: Callable[[int], Image]) -> tuple[Float, Float, list[Detection]]:
+    """Errors and claimed variances (K, 2) of the unflagged markers of a few frames."""
+    found = [detect(picture(seed), PAPER) for seed in range(FRAMES)]
+    clear = np.array([one.flags == 0 for one in found])
+    assert clear.mean() > 0.85
+    errors = np.array([one.centres_px for one in found]) - true_centres_px(SCENE)
+    variances = np.array([np.diagonal(one.covariance_px2, axis1=1, axis2=2) for one in found])
+    return errors[clear], variances[clear], found
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        noise_alone,
+        as_jpeg(95),
+        as_jpeg(90),
+        as_jpeg(80),
+        moved_while_exposed(2),
+        moved_while_exposed(4),
+        unequal_pixels,
+        with_gamma,
+    ],
+    ids=["noise alone", "JPEG 95", "JPEG 90", "JPEG 80", "blurred 2 px", "blurred 4 px", "unequal pixels", "gamma 2.2"],
+)
+def test_the_claimed_variance_is_that_of_the_errors(picture: Callable[[int], Image]):
+    """The chi^2 of 432 coordinates scatters by 7 %."""
+    errors, variances, _ = errors_px(picture)
+    assert 0.8 < np.mean(errors**2 / variances) < 1.25
+
+
+def test_rows_that_flicker_make_y_uncertain_and_leave_x_as_it_is():
+    """Of the variance along y, ten times that of x, a part is missing: rows are longer than a cluster near the top and
+    the bottom of a disc."""
+    errors, variances, _ = errors_px(flickering_rows)
+    x, y = np.mean(errors**2 / variances, axis=0)
+    assert 0.8 < x < 1.25
+    assert 0.8 < y < 2
+    assert np.mean(variances[:, 1]) > 5 * np.mean(variances[:, 0])
+
+
+def test_independent_noise_is_fitted_in_a_wide_band_and_keeps_its_covariance():
+    _, _, found = errors_px(noise_alone)
+    for detection in found:
+        assert detection.band_sigma == WIDE_SIGMA
+        assert detection.growth == pytest.approx(1, abs=0.25)
+
+
+def test_grained_ground_is_fitted_in_a_narrow_band_where_that_is_better_and_frames_after_it_too():
+    errors, variances, found = errors_px(on_grained_paper)
+    assert {detection.band_sigma for detection in found} == {NARROW_SIGMA}
+    assert 0.8 < np.mean(errors**2 / variances) < 1.25
+    wide = [
+        detect(on_grained_paper(seed), PAPER, replace(one, band_sigma=WIDE_SIGMA)) for seed, one in enumerate(found)
+    ]
+    clear = np.array([(one.flags | other.flags) == 0 for one, other in zip(found, wide, strict=True)])
+    off = [np.array([one.centres_px for one in group]) - true_centres_px(SCENE) for group in (found, wide)]
+    assert np.std(off[0][clear]) < 0.7 * np.std(off[1][clear])
+    after = detect(on_grained_paper(9), PAPER, found[0])
+    assert after.band_sigma == NARROW_SIGMA
+    assert after.excess_px2.tolist() == found[0].excess_px2.tolist()
+
+
+def test_growth_within_its_chance_is_none_and_beyond_it_is_kept():
+    rng = np.random.default_rng(1)
+    independent = np.full((200, 2), 7.0)
+    robust = 7.0 * rng.chisquare(8, (200, 2)) / 8
+    clean_markers = np.ones(200, bool)
+    scatter = np.stack([robust, independent], axis=1)
+    assert variance_growth(scatter, clean_markers) == pytest.approx(1, abs=0.1)
+    scatter[:, 0, 1] *= 4
+    assert variance_growth(scatter, clean_markers) == pytest.approx([1, 4], abs=0.25)
+    scatter[50:] = np.nan
+    assert variance_growth(scatter, clean_markers)[1] == pytest.approx(4, abs=0.6)
+    assert variance_growth(scatter[:7], clean_markers[:7]).tolist() == [1, 1]
