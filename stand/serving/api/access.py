@@ -270,7 +270,7 @@ class Gatekeeper:
             await _refuse(scope, answering, denied.status, str(denied))
         except Exception as error:  # noqa: BLE001 - after a request that fails, the next must be answered
             self._failed(error)
-            await _refuse(scope, answering, 500, f"failed ({type(error).__name__}); the stand's log says more")
+            await _refuse(scope, answering, 500, f"failed ({type(error).__name__}); the stand's events say more")
         finally:
             self._pace.spent()
 

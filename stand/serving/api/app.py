@@ -65,6 +65,7 @@ def make_app(
         app.include_router(room(bridge))
     for kind, status in _STATUS:
         app.add_exception_handler(kind, _answer_with(status))
+    app.add_exception_handler(Exception, _failed)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _refused)
     return Gatekeeper(cast("App", app), access, pace, failed)
@@ -87,6 +88,11 @@ def _answer_with(status: int) -> Callable[[Request, Exception], Response]:
 def _refused(_: Request, error: Exception) -> Response:
     refused = cast("HTTPException", error)
     return _error(refused.status_code, str(refused.detail), refused.headers)
+
+
+def _failed(_: Request, error: Exception) -> Response:
+    """What should not happen; the gatekeeper is told as well."""
+    return _error(500, f"failed ({type(error).__name__}); the stand's events say more")
 
 
 def _invalid(_: Request, error: Exception) -> Response:
