@@ -105,6 +105,11 @@ class Losses:
         """Frames lost since the beginning, without those of captures that were restarted after them."""
         return sum(time_ns >= self._begins_ns.get(step_id, time_ns) for step_id, time_ns in tuple(self._lost_ns))
 
+    def of(self, step_id: str) -> int:
+        """Those of this step."""
+        begin_ns = self._begins_ns.get(step_id, 0)
+        return sum(lost == step_id and time_ns >= begin_ns for lost, time_ns in tuple(self._lost_ns))
+
     def count(self, frame: Frame, reason: str) -> None:
         """One frame lost."""
         self._lost_ns.append((frame.step_id, frame.time_ns))

@@ -40,8 +40,7 @@ from recording.writing.waiting import Waiting
 from recording.writing.writers import Fate, ImageWriter, TelemetryEncoder, TelemetryWriter
 
 NO_IMAGE = np.empty((0, 0), np.uint8)
-FINISH_WITHIN_S = 2.0  # real seconds that a disk may take for the end of a run that is stopped
-COMPLETE_WITHIN_S = 60.0  # and of one that is complete
+FINISH_WITHIN_S, COMPLETE_WITHIN_S = 2.0, 60.0  # real seconds that a disk may take for the end of a run: stopped, whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +100,10 @@ class Recorder:
         """Frames published but not in the session."""
         return self._losses.total
 
+    def lost_of(self, step_id: str) -> int:
+        """Frames of this step published but not in the session."""
+        return self._losses.of(step_id)
+
     @property
     def saved(self) -> Saved:
         """What has been acknowledged since `start`: it is on the disk and stays there."""
@@ -114,12 +117,12 @@ class Recorder:
 
     @property
     def folder_lost(self) -> str:
-        """Why the session's folder is not there any more, as a sentence; "" while it is, or is being made again."""
+        """Why the session's folder has gone, as a sentence; "" while it is there, or is being made again."""
         return self._homes.lost
 
     @property
     def writer_ended(self) -> str:
-        """Why the process that touches the disk is not there any more, as a sentence; "" while nothing is wrong."""
+        """Why the process that touches the disk has ended, as a sentence; "" while it has not."""
         return "" if self.disk is None else self.disk.ended
 
     @property
@@ -132,8 +135,8 @@ class Recorder:
         self._homes.beside.append(file)
 
     def refound(self) -> None:
-        """An operator has cleared the loss of the folder: continue in it where it is back, else in a new one at its
-        place, with continued numbers. Returns at once; nothing happens when nothing is lost."""
+        """An operator has cleared the loss of the folder: continue in it, or in a new one at its place, with continued
+        numbers. Returns at once."""
         self._homes.refind()
 
     def start(self, earlier: Iterable[Item] = ()) -> None:

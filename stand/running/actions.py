@@ -3,7 +3,7 @@
 Rows are read from the top; the first that fits decides:
 
     the plan is done                                         None
-    the capture under way has all its frames                 Complete
+    the capture under way has all its frames                 Complete, unless the disk lost some of them
     its next frame is not due yet                            Sleep
     something holds the run                                  Wait
     the soak under way has earned its time                   Complete
@@ -14,7 +14,8 @@ Rows are read from the top; the first that fits decides:
     the flap should be open and is not                       OpenAgain
     the step was not begun by this daemon                    Begin
     the step is a soak                                       Earn
-    it is a capture: without a deadline, or after a hold     Aim
+    it is a capture: the disk lost some of its frames        TakeAgain
+    ... without a deadline, or after a hold                  Aim
     ... a warm-up, and it was interrupted for long           StartCold
     ... with frames, and it was interrupted for long         TakeAgain
     ... else                                                 TakeFrame
@@ -27,7 +28,7 @@ import math
 from dataclasses import dataclass
 
 from experiments.steps import AnySoak, Capture, CloseFlap, OpenFlap, PlannedStep, PowerCamera, Prompt, Role
-from foundation.clock import seconds_ns
+from foundation.clock import NS_PER_S, seconds_ns
 from stand.running.state import Plan, RunState, SetUp
 
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
@@ -42,7 +43,8 @@ AGAIN_AFTER_S = 60.0
 class Surroundings:
     """What of the stand decides. lead_ns: how long before its instant a frame is asked for. held: whether the gate is
     closed, as after a latched fault. pv_degC: the chamber's last known temperature, NaN when it is not known.
-    lost_equilibrium: the camera's."""
+    lost_equilibrium: the camera's. frames_lost: so many frames of the capture under way did not come onto the disk, and
+    it may be taken again for that."""
 
     now_ns: int
     lead_ns: int = 0
@@ -50,6 +52,7 @@ class Surroundings:
     flap_open: bool = False
     lost_equilibrium: bool = False
     pv_degC: float = math.nan
+    frames_lost: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,10 +121,10 @@ class Aim:
 
 @dataclass(frozen=True, slots=True)
 class TakeAgain:
-    """The capture is restarted, after such an outage."""
+    """The capture is restarted; why: as a clause."""
 
     planned: PlannedStep
-    outage_ns: int
+    why: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +170,7 @@ def next_action(state: RunState, around: Surroundings) -> Action | None:
     planned = state.plan[state.index]
     is_under_way = state.under_way == planned.step_id
     step = planned.step
-    if is_under_way and isinstance(step, Capture) and state.frames.get(planned.step_id, 0) >= step.frames:
+    if is_under_way and isinstance(step, Capture) and has_all_frames(state, planned) and not around.frames_lost:
         return Complete(planned)
     if is_under_way and state.due_ns is not None and around.now_ns < state.due_ns - around.lead_ns:
         return Sleep(state.due_ns - around.lead_ns)
@@ -182,6 +185,11 @@ def next_action(state: RunState, around: Surroundings) -> Action | None:
     if isinstance(step, Capture):
         return _capturing(state, around, planned, step)
     return Earn(planned) if isinstance(step, AnySoak) else Perform(planned)
+
+
+def has_all_frames(state: RunState, planned: PlannedStep) -> bool:
+    """Whether all frames of the capture were taken."""
+    return isinstance(planned.step, Capture) and state.frames.get(planned.step_id, 0) >= planned.step.frames
 
 
 def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Action | None:
@@ -202,6 +210,8 @@ def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Ac
 
 
 def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capture: Capture) -> Action:
+    if has_all_frames(state, planned):
+        return TakeAgain(planned, f"the disk has lost {around.frames_lost} of its frames")
     if state.due_ns is None or state.readying or state.is_lost:
         return Aim(capture)
     outage_ns, has_frames = state.outage_ns(around.now_ns), state.frames.get(planned.step_id, 0) > 0
@@ -210,7 +220,7 @@ def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capt
         if is_warm_up and (again := cold_start(state)):
             return StartCold(again)
         if has_frames:
-            return TakeAgain(planned, outage_ns)
+            return TakeAgain(planned, f"it was interrupted for {outage_ns / NS_PER_S:.0f} s")
     may_settle = bool(state.set_up.soaks) and capture.role not in (Role.WARM_UP, Role.OTHER)
     return TakeFrame(planned, capture, state.due_ns, may_settle and not has_frames)
 

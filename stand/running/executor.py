@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
 from contextlib import contextmanager
 
@@ -58,6 +59,7 @@ from stand.running.actions import (
     TakeFrame,
     Wait,
     due_after_ns,
+    has_all_frames,
     next_action,
     next_due_ns,
     worth_of_soaks,
@@ -84,6 +86,7 @@ from stand.running.settling_watch import SettlingWatch
 from stand.running.state import Plan, RunState, SetUp, duration_of
 from stand.stand import Stand
 
+_TRIES = 3  # to have all frames of a capture on the disk, beyond the first
 _JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
 
 
@@ -91,7 +94,8 @@ class Executor:
     """Performs the plan of the logbook's state.
 
     `flushed` returns when all that was published is on the disk. `settling` decides when a soak may end early,
-    `offsets` gets what has settled. `allowed` raises ConfigError when this stand may not do a plan.
+    `offsets` gets what has settled. `allowed` raises ConfigError when this stand may not do a plan. `lost` says how
+    many frames of a capture are not on the disk.
     """
 
     def __init__(
@@ -104,6 +108,7 @@ class Executor:
         settling: SettlingWatch,
         offsets: OffsetWatch,
         allowed: Callable[[Plan], object] = len,
+        lost: Callable[[str], int] = lambda _: 0,
     ) -> None:
         self._stand = stand
         self._hub = hub
@@ -113,6 +118,8 @@ class Executor:
         self._settling = settling
         self._offsets = offsets
         self._allowed = allowed
+        self._lost = lost
+        self._taken_again = Counter[str]()  # captures, by id, of which the disk has lost frames
         self._changed = asyncio.Event()  # set, and replaced, when the plan was changed
         if stand.imaging.supply.equilibrium.is_lost:
             self._on_lost_equilibrium()
@@ -170,7 +177,17 @@ class Executor:
             flap_open=stand.imaging.flap_open,
             lost_equilibrium=stand.imaging.supply.equilibrium.is_lost,
             pv_degC=math.nan if pv is None else pv.value,
+            frames_lost=self._frames_lost(),
         )
+
+    def _frames_lost(self) -> int:
+        """Of the capture under way, when it has all its frames and may be taken again. A camera that has warmed up
+        cannot; a disk that loses frames each time must not hold the night for good."""
+        planned = self._state.step(self._state.under_way)
+        if planned is None or not has_all_frames(self._state, planned) or self._taken_again[planned.step_id] >= _TRIES:
+            return 0
+        is_warm_up = isinstance(planned.step, Capture) and planned.step.role is Role.WARM_UP
+        return 0 if is_warm_up else self._lost(planned.step_id)
 
     @contextmanager
     def _failing(self) -> Generator[None]:
@@ -226,8 +243,9 @@ class Executor:
                 self._mark(planned, StepState.STARTED)
             case Aim(capture):
                 await self._aim(capture)
-            case TakeAgain(planned, outage_ns):
-                await self._begin_anew((planned,), f"it was interrupted for {outage_ns / NS_PER_S:.0f} s")
+            case TakeAgain(planned, why):
+                self._taken_again[planned.step_id] += has_all_frames(self._state, planned)
+                await self._begin_anew((planned,), why)
                 await self._log.write(Step(self._clock.now_ns(), planned.step_id, "started"))
             case TakeFrame():
                 await self._take(action)
@@ -242,6 +260,8 @@ class Executor:
     async def _conclude(self, action: Action) -> None:
         """What follows when the step under way is done, or has to wait for those before it."""
         match action:
+            case Complete() if self._frames_lost():
+                pass  # by the flush: it is taken again
             case Complete(planned) | Perform(planned) if planned.step_id == self._state.under_way:
                 self._mark(planned, StepState.DONE)
                 await self._flushed()

@@ -165,7 +165,9 @@ class Guest:
         offsets = OffsetWatch(hub, clock, None if before is None else _gap(before, clock))
         leaving.callback(offsets.close)
         allowed = partial(check_plan, config=self.job.order.config)
-        executor = Executor(assembly.stand, hub, clock, log, recorder.flushed, settling, offsets, allowed)
+        executor = Executor(
+            assembly.stand, hub, clock, log, recorder.flushed, settling, offsets, allowed, recorder.lost_of
+        )
         leaving.callback(executor.close)
         return executor
 

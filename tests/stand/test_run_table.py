@@ -267,6 +267,21 @@ def test_a_capture_that_was_killed_and_stood_for_a_minute_is_taken_again():
     assert not state.is_disturbed
 
 
+def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_holds_the_run():
+    state = walk(
+        fold(PLAN, STATES["all frames"]),
+        {"now_ns": 30 * S, "flap_open": True},
+        ({"frames_lost": 1, "held": True}, Wait),
+        ({"held": False}, TakeAgain),
+        (Again(30 * S, [CAPTURE]), TakeFrame),
+        ({"frames_lost": 0}, TakeFrame),
+        (Step(30 * S, CAPTURE, "started"), TakeFrame),
+        (Taken(31 * S, CAPTURE), TakeFrame),
+        (Taken(41 * S, CAPTURE), Complete),
+    )
+    assert not state.is_disturbed
+
+
 def test_a_frame_is_settled_when_it_is_the_first_after_a_soak_and_no_warm_up():
     assert next_action(*met("next is due", "nothing")).is_settled
     assert not next_action(*met("one frame", "nothing")).is_settled

@@ -70,6 +70,9 @@ class Interrupter:
     async def ended(self) -> None:
         await asyncio.gather(*self._tasks)
 
+    def of(self, kind: str) -> list[Event]:
+        return [event for event in self.events if event.kind == kind]
+
     def times_s(self, kind: str, text: str = "") -> list[float]:
         return [event.time_ns / NS_PER_S for event in self.events if event.kind == kind and text in event.text]
 
@@ -166,6 +169,20 @@ async def test_a_camera_that_is_lost_for_long_does_not_leave_the_flap_open(tmp_p
     check_again(session, ordered)
     begin_s, end_s = interrupter.times_s("held", "camera_lost"), interrupter.times_s("released", "camera_lost")
     check_shut(interrupter, session, begin_s[0], end_s[0])
+
+
+async def test_a_disk_that_refuses_some_frames_costs_neither_the_run_nor_a_frame(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    """For so short a time that nothing is held: the capture is taken again when the disk takes frames again."""
+    ordered, out = order(RECIPE), tmp_path / "out"
+    interrupter = Interrupter(disk(4096), disk(None), 20.0)
+    session = await interrupted(ordered, out, interrupter)
+    check_again(session, ordered)
+    (dropped,) = interrupter.of("frames_dropped")
+    (restart,) = interrupter.of("capture_restarted")
+    assert dropped.time_ns < restart.time_ns
+    assert "the disk has lost" in restart.text
 
 
 async def test_a_disk_that_refuses_for_long_costs_neither_the_run_nor_a_frame(

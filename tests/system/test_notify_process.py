@@ -1,5 +1,6 @@
 """Somebody is told whatever state the daemon is in, by a small process that goes with it."""
 
+import asyncio
 import os
 import signal
 import subprocess
@@ -9,6 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+
+from foundation.clock import WallClock
+from stand.guarding.notify import Notifier
 
 LIMIT_S = 60.0  # for what takes milliseconds, on a machine that has other things to do
 
@@ -85,6 +89,19 @@ def test_a_process_that_cannot_be_replaced_is_a_sentence_and_tried_again_the_nex
     assert daemon.tell("too warm!") == "/bin/sh could not be started ([Errno 24] Too many open files)"
     assert daemon.tell("too cold") == ""
     assert (tmp_path / "told").read_text() == "too cold\n"
+
+
+async def test_a_slow_command_delays_no_other(tmp_path):
+    """The first two end only when the third has told."""
+    script = 'case "$1" in slow*) until [ -e "$0" ]; do sleep 0.05; done;; *) : > "$0";; esac'
+    notifier = Notifier(("/bin/sh", "-c", script, str(tmp_path / "third")), LIMIT_S, WallClock())
+    try:
+        slow = [asyncio.create_task(notifier.tell(text)) for text in ("slow 1", "slow 2")]
+        await asyncio.sleep(0)
+        assert await notifier.tell("third") == ""
+        assert await asyncio.gather(*slow) == ["", ""]
+    finally:
+        notifier.close()
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
