@@ -1,0 +1,90 @@
+// Devices by hand, through the same gate as a run; while a run owns the stand they take no orders.
+import { command, get, tell } from "./api.js";
+import { fill, h, number, say, unit_of, words } from "./dom.js";
+
+export class Devices {
+  constructor(place, app) {
+    this.app = app;
+    this.place = place;
+    this.answer = h("p", { class: "answer", role: "status" });
+    this.note = h("p", { class: "quiet" });
+    this.cards = h("div", { class: "stack" });
+    this.counters = h("dl", { class: "facts" });
+    fill(place, h("div", { class: "grid" }, h("div", { class: "stack" }, this.note, this.answer, this.cards),
+      h("section", { class: "panel" }, h("h2", {}, "What wears"), this.counters)));
+    this.load();
+    this.timer = setInterval(() => this.load(), 5000);
+  }
+
+  async load() {
+    if (document.hidden || this.closed || this.app.is_lost) return;
+    let devices;
+    try { devices = await get("/devices"); } catch (error) { return tell(this.answer, error.message, true); }
+    if (this.closed) return;
+    // The inputs of somebody who is filling them in stay what they are.
+    const shape = JSON.stringify(devices.map(({ refused, ...rest }) => rest));
+    if (shape !== this.shape) {
+      this.shape = shape;
+      this.parts = devices.map((device) => this.card(device));
+      fill(this.cards, this.parts.map((part) => part.card));
+    }
+    devices.forEach((device, index) => this.refuse(this.parts[index], device));
+    if (this.app.state) this.update(this.app.state);
+  }
+
+  card(device) {
+    const values = h("dl", { class: "facts" }), refused = h("p", { class: "quiet" });
+    const answer = h("p", { class: "answer", role: "status" });
+    const verbs = device.verbs.map((verb) => this.verb(device, verb, answer));
+    return { device, values, refused, verbs, card: h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, words(device.name)), h("small", {}, device.kind)), values, refused, h("div", { class: "verbs" }, verbs), answer) };
+  }
+
+  verb(device, verb, answer) {
+    const inputs = verb.arguments.map((argument) => this.input(argument));
+    return h("form", { class: "row", "data-verb": verb.verb, onsubmit: (event) => {
+      event.preventDefault();
+      const given = Object.fromEntries(inputs.map(({ name, value }) => [name, value()]).filter(([, value]) => value !== undefined));
+      command(answer, verb.text || words(verb.verb), "POST", `/devices/${encodeURIComponent(device.name)}/${encodeURIComponent(verb.verb)}`, { arguments: given });
+    } }, inputs.map(({ label }) => label), h("button", { type: "submit" }, verb.text || words(verb.verb)));
+  }
+
+  input(argument) {
+    const { name, unit, minimum, maximum, choices } = argument;
+    if (choices?.length) {
+      const select = h("select", {}, choices.map((choice) => h("option", { value: choice }, words(choice))));
+      return { name, value: () => select.value, label: h("label", {}, `${words(name)} `, select) };
+    }
+    const is_bounded = minimum !== null && minimum !== undefined;
+    const input = h("input", { type: "number", step: "any", min: minimum, max: maximum, required: true });
+    const range = is_bounded ? ` ${number(minimum, 0)} to ${number(maximum, 0)}` : "";
+    return { name, value: () => Number(input.value), label: h("label", {}, `${words(unit ? name.replace(/_[a-zA-Z]+$/, "") : name)} `, input, h("small", {}, ` ${unit_of(unit)}${range}`)) };
+  }
+
+  refuse(part, device) {
+    say(part.refused, device.refused ? `Takes no orders now: ${device.refused}` : "");
+    part.refused.hidden = !device.refused;
+    for (const verb of part.verbs) for (const control of verb.elements) control.disabled = Boolean(device.refused);
+  }
+
+  update(state) {
+    say(this.note, state.run ? "A run owns the stand: what it does is in the plan." : "Every order goes through the stand's own limits and interlocks, and is recorded.");
+    for (const { device, values } of this.parts ?? []) {
+      const rows = device.channels.filter((channel) => state.readings[channel]);
+      const key = rows.join();
+      if (values.dataset.key !== key) {
+        values.dataset.key = key;
+        fill(values, rows.map((channel) => [h("dt", {}, words(channel.split(".").slice(1).join("."))), h("dd", {}, "")]));
+      }
+      rows.forEach((channel, index) => {
+        const reading = state.readings[channel];
+        say(values.children[2 * index + 1], reading.value === null ? `no reading: ${reading.reason}` : `${number(reading.value, Number.isInteger(reading.value) ? 0 : 2)} ${unit_of(reading.unit)}`);
+      });
+    }
+    const counters = Object.entries(state.counters);
+    if (counters.length !== this.counters.children.length / 2) fill(this.counters, counters.map(([name]) => [h("dt", {}, words(name)), h("dd", {}, "")]));
+    counters.forEach(([, value], index) => say(this.counters.children[2 * index + 1], number(value, Number.isInteger(value) ? 0 : 1)));
+  }
+
+  event() {}
+  close() { this.closed = true; clearInterval(this.timer); }
+}

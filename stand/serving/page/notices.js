@@ -1,0 +1,86 @@
+// What needs somebody: a fault, a prompt, a pause, a connection that is lost. Below the header, never over STOP.
+import { command } from "./api.js";
+import { temperatures, look_of } from "./channels.js";
+import { clock, day_clock, fill, h, number, say, seconds, unit_of, words } from "./dom.js";
+
+const REASON = { operator: "paused by an operator", interlock: "a fault has tripped", recording: "the recording does not keep up", disk: "the disk" };
+export const reason = (name) => REASON[name] ?? words(name);
+
+export class Notices {
+  constructor(place, app) {
+    this.app = app;
+    this.place = place;
+    this.parts = {};
+  }
+
+  // One notice of each kind, made when there is cause and removed when there is none; never made anew while it is there.
+  set(kind, key, make) {
+    const part = this.parts[kind];
+    if (part?.key === key) return part;
+    part?.element.remove();
+    delete this.parts[kind];
+    if (!key) return null;
+    const made = { key, ...make() };
+    this.parts[kind] = made;
+    this.place.append(made.element);
+    return made;
+  }
+
+  update(state) {
+    const { fault, prompt } = state;
+    const tripped = this.set("fault", fault && `${fault.rule} ${fault.since_ns}`, () => this.fault(state));
+    tripped?.refresh(state);
+    this.set("prompt", prompt && `${prompt.step_id} ${prompt.text}`, () => this.prompt(prompt));
+    const held = state.run && !fault && !prompt && state.reasons.length ? state.reasons.join() : "";
+    this.set("held", held, () => this.held(state));
+    this.set("queue", !state.run && state.queue_halted, () => ({ element: h("section", { class: "notice warning" }, h("h2", {}, "The queue is halted"), h("p", {}, state.queue_halted)) }));
+  }
+
+  lost(text) {
+    this.set("lost", text, () => ({ element: h("section", { class: "notice error", role: "alert" }, h("h2", {}, "No connection to the stand"), h("p", {}, text)) }));
+  }
+
+  fault(state) {
+    const { fault } = state;
+    const answer = h("p", { class: "answer", role: "status" });
+    const review = h("div", { hidden: true });
+    const readings = h("dl", { class: "facts" });
+    const clear = h("button", { type: "button", class: "main", onclick: () => command(answer, "clear", "POST", "/run/clear") }, "The cause is removed: clear");
+    const open = h("button", { type: "button", "aria-expanded": "false", onclick: () => {
+      review.hidden = !review.hidden;
+      open.setAttribute("aria-expanded", String(!review.hidden));
+    } }, "Look at it and clear …");
+    const data = Object.entries(fault.data ?? {}).filter(([, value]) => typeof value !== "object");
+    fill(review, h("div", { class: "row" }, h("div", { class: "grow" }, h("h3", {}, "What tripped"),
+      h("dl", { class: "facts" }, [["rule", words(fault.rule)], ["found", fault.text], ["at", clock(seconds(fault.since_ns, state.utc_offset_ns), true)], ...data.map(([name, value]) => [words(name), String(value)])].map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]))),
+      h("div", { class: "grow" }, h("h3", {}, "Readings now"), readings)), h("div", { class: "row" }, clear));
+    const element = h("section", { class: "notice error", role: "alert" }, h("h2", {}, `Tripped: ${words(fault.rule)}`), h("p", {}, fault.text),
+      h("p", {}, `Since ${day_clock(seconds(fault.since_ns, state.utc_offset_ns))}. The stand is made safe.`), h("div", { class: "row" }, open), review, answer);
+    return { element, refresh: (now) => this.readings(readings, now) };
+  }
+
+  readings(place, state) {
+    const channels = temperatures(Object.fromEntries(Object.entries(state.readings).map(([name, { unit }]) => [name, unit])));
+    const rows = [...channels.map((channel) => [look_of(channel).name, of(state.readings[channel])]),
+      ["heater", state.heater_permitted ? "permitted" : "not permitted"], ["compressor", state.compressor_on ? "running" : "off"], ["flap", state.flap || "unknown"]];
+    if (place.children.length !== 2 * rows.length) fill(place, rows.map(([name]) => [h("dt", {}, name), h("dd", {}, "")]));
+    rows.forEach(([, text], index) => say(place.children[2 * index + 1], text));
+  }
+
+  prompt({ text }) {
+    const answer = h("p", { class: "answer", role: "status" });
+    const element = h("section", { class: "notice warning", role: "alert" }, h("h2", {}, "The run waits for you"), h("p", {}, text),
+      h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: () => command(answer, "continue", "POST", "/run/continue") }, "Done, go on")), answer);
+    return { element };
+  }
+
+  held(state) {
+    const answer = h("p", { class: "answer", role: "status" });
+    const is_mine = state.reasons.includes("operator");
+    const button = h("button", { type: "button", class: "main", onclick: () => command(answer, "continue", "POST", "/run/continue") }, "Continue");
+    return { element: h("section", { class: "notice warning" }, h("h2", {}, "The run is held"),
+      h("p", {}, `${state.reasons.map(reason).join("; ")}. The chamber keeps its set-point; nothing is lost.`), is_mine ? h("div", { class: "row" }, button) : null, answer) };
+  }
+}
+
+const of = (reading) => (reading.value === null ? `no reading: ${reading.reason}` : `${number(reading.value, 2)} ${unit_of(reading.unit)}`);

@@ -1,0 +1,183 @@
+// The plan as a time line and as a list: what is done, what is earned, what is to come and when.
+import { command, get, tell } from "./api.js";
+import { ask, clock, css, day_clock, duration, fill, h, number, say, seconds } from "./dom.js";
+
+const SIGN = { done: "✓", under_way: "▶", waiting: "·", skipped: "⤼" };
+const WORD = { done: "done", under_way: "under way", waiting: "to come", skipped: "left out" };
+const SHOWN_DONE = 3;
+const MOST_ROWS = 300;
+
+export class Plan {
+  constructor(place, app) {
+    this.app = app;
+    this.all = false;
+    this.steps = [];
+    this.answer = h("p", { class: "answer", role: "status" });
+    this.buttons = h("div", { class: "row" },
+      this.pause = h("button", { type: "button", onclick: () => this.order("pause", { when: "now" }, "pause") }, "Pause now"),
+      this.pause_step = h("button", { type: "button", onclick: () => this.order("pause", { when: "step" }, "pause when this step is done") }, "Pause after this step"),
+      this.go = h("button", { type: "button", class: "main", onclick: () => this.order("continue", undefined, "continue") }, "Continue"),
+      this.edit_button = h("button", { type: "button", onclick: () => this.edit() }, "Edit the steps to come …"),
+      this.abort = h("button", { type: "button", class: "danger", onclick: () => this.end() }, "End the run …"));
+    this.summary = h("p", {});
+    this.line = h("canvas", { class: "line", role: "img", "aria-label": "Time line of the plan" });
+    this.list = h("ol", { class: "steps" });
+    this.asks = h("div", {});
+    fill(place, h("div", { class: "stack" },
+      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Run"), this.buttons), this.summary, this.asks, this.answer, this.line,
+        h("p", { class: "quiet" }, "tall: frames are taken; low: soaks and the rest; the line is now")),
+      h("section", { class: "panel" }, h("h2", {}, "Steps"), this.list)));
+    this.resizing = new ResizeObserver(() => this.draw());
+    this.resizing.observe(this.line);
+    this.refresh();
+    this.timer = setInterval(() => this.refresh(), 5000);
+  }
+
+  async order(verb, body, text) {
+    await command(this.answer, text, "POST", `/run/${verb}`, body);
+    this.refresh();
+  }
+
+  end() {
+    ask(this.asks, "End the run? The stand is made safe; what is recorded stays, and the run can be resumed later.", "End the run",
+      () => this.order("stop", undefined, "end the run"));
+  }
+
+  // One step a line, as JSON; lines are removed, changed, moved and added.
+  edit() {
+    const first = this.steps.findIndex((step) => step.standing === "waiting" && this.steps.slice(step.index).every((later) => later.standing === "waiting"));
+    if (first < 0) return tell(this.answer, "no step is to come that was not begun", true);
+    const from_index = this.steps[first].index;
+    const text = h("textarea", { rows: 14, "aria-label": "Steps to come, one a line", spellcheck: "false", class: "wide" });
+    text.value = this.steps.slice(first).map(({ kind, parameters }) => JSON.stringify({ kind, parameters })).join("\n");
+    const done = () => fill(this.asks);
+    const replace = async () => {
+      const steps = [];
+      for (const [index, line] of text.value.split("\n").entries()) {
+        if (!line.trim()) continue;
+        try { steps.push(JSON.parse(line)); } catch (error) { return tell(this.answer, `line ${index + 1} is no JSON: ${error.message}`, true); }
+      }
+      if (await command(this.answer, "edit the plan", "PUT", "/run/plan", { from_index, steps })) { done(); this.refresh(); }
+    };
+    fill(this.asks, h("div", { class: "ask" }, h("p", {}, `Steps from number ${from_index + 1} on, one a line. The stand checks them all before it takes any.`), text,
+      h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: replace }, "Replace them"), h("button", { type: "button", onclick: done }, "Leave them"))));
+    text.focus();
+  }
+
+  async refresh() {
+    if (document.hidden || this.closed || this.app.is_lost) return;
+    try { this.steps = await get("/plan"); } catch { return; }
+    if (!this.closed) this.show();
+  }
+
+  show() {
+    const { steps } = this;
+    const done = steps.filter((step) => step.standing === "done" || step.standing === "skipped");
+    const hide = this.all ? 0 : Math.max(0, done.length - SHOWN_DONE);
+    const first = steps.findIndex((step) => step.standing === "waiting" || step.standing === "under_way");
+    const begin = this.all || first < 0 ? hide : Math.max(0, first - SHOWN_DONE);
+    const more = begin || this.all ? h("li", { class: "more" }, h("span"), h("span", { class: "index" }), h("button", { type: "button", class: "small", "aria-expanded": String(this.all), onclick: () => { this.all = !this.all; this.show(); } },
+      this.all ? "Hide steps that are done" : `${begin} steps before these`)) : null;
+    const focused = document.activeElement?.dataset?.key;
+    if (this.list.querySelector(".ask")) return; // a question is open
+    const shown = steps.slice(begin, begin + MOST_ROWS), rest = steps.length - begin - shown.length;
+    fill(this.list, more, shown.map((step) => this.row(step)), rest > 0 ? h("li", {}, h("span"), h("span"), h("span", { class: "quiet" }, `${rest} more steps`)) : null);
+    if (focused) this.list.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
+    if (!steps.length) fill(this.list, h("li", {}, h("span"), h("span"), h("span", { class: "quiet" }, "No run. Start one from the queue.")));
+    this.draw();
+    this.update(this.app.state);
+  }
+
+  row(step) {
+    const is_open = step.standing === "waiting" || step.standing === "under_way";
+    const acts = h("span", { class: "acts" });
+    const button = (name, act) => acts.append(h("button", { type: "button", class: "small", "data-key": `${step.step_id} ${name}`, "aria-label": `${name}: step ${step.index + 1}`, onclick: act }, name));
+    const row = h("li", { "data-standing": step.standing },
+      h("span", { title: WORD[step.standing] }, h("span", { "aria-hidden": "true" }, SIGN[step.standing]), h("span", { class: "unseen" }, WORD[step.standing])),
+      h("span", { class: "index number quiet" }, String(step.index + 1)),
+      h("span", {}, step.text || step.kind, progress_text(step)),
+      h("span", { class: "bar" }, step.standing === "under_way" ? bar(step) : null),
+      h("span", { class: "number quiet" }, this.when(step)), acts);
+    if (is_open && step.kind.startsWith("Soak")) {
+      button("+15 min", () => this.order("extend", { step_id: step.step_id, by_s: 900 }, "extend by 15 min"));
+    }
+    if (is_open) button("Skip", () => ask(row, `Leave out step ${step.index + 1}, ${step.text || step.kind}?`, "Leave it out", () => this.order("skip", { step_id: step.step_id }, "skip")));
+    return row;
+  }
+
+  when(step) {
+    const offset_ns = this.app.state?.utc_offset_ns ?? 0;
+    if (step.ended_ns) return `${step.standing === "skipped" ? "left out" : "done"} ${clock(seconds(step.ended_ns, offset_ns))}`;
+    if (step.standing === "done" || step.standing === "skipped") return WORD[step.standing];
+    const takes = step.duration_s >= 1 ? duration(step.duration_s) : "";
+    return step.expected_ns ? `${takes ? `${takes}, to ` : "to "}${day_clock(seconds(step.expected_ns, offset_ns))}` : takes;
+  }
+
+  update(state) {
+    if (!state) return;
+    const is_run = state.run !== null, is_held = state.reasons.length > 0;
+    this.pause.disabled = this.pause_step.disabled = !is_run || state.reasons.includes("operator");
+    this.go.disabled = !is_run || !state.reasons.includes("operator");
+    this.abort.disabled = !is_run;
+    this.edit_button.disabled = !is_run || !this.steps.length;
+    if (!is_run) return say(this.summary, "No run is under way.");
+    const run = state.run;
+    const end = run.end_ns === null ? "" : `; ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(this.steps)}`;
+    say(this.summary, `${run.recipe}, session ${run.run_id || "–"}: step ${run.step} of ${run.steps}${is_held ? `, held: ${state.reasons.map(this.app.reason).join(", ")}` : ""}${end}`);
+  }
+
+  draw() {
+    const { line, steps } = this, scale = devicePixelRatio;
+    const width = Math.floor(line.clientWidth * scale), height = Math.floor(42 * scale);
+    if (!width) return;
+    line.width = width;
+    line.height = height;
+    const context = line.getContext("2d"), total_s = steps.reduce((sum, step) => sum + step.duration_s, 0) || 1;
+    let at_s = 0;
+    for (const step of steps) {
+      const x = (at_s / total_s) * width, wide = Math.max(1, (step.duration_s / total_s) * width);
+      const is_frames = step.kind.startsWith("Capture"), is_soak = step.kind.startsWith("Soak") || step.kind === "CoolDown";
+      const part = { done: 1, skipped: 0, waiting: 0, under_way: earned(step) }[step.standing];
+      const top = is_frames ? 4 * scale : is_soak ? 12 * scale : 18 * scale, tall = height - 2 * top;
+      context.fillStyle = is_frames ? `${css("--c-air")}88` : css("--line");
+      context.fillRect(x, top, wide, tall);
+      context.fillStyle = is_frames ? css("--c-air") : css("--c-granite");
+      context.fillRect(x, top, wide * part, tall);
+      if (step.standing === "under_way") {
+        context.fillStyle = css("--ink");
+        context.fillRect(x + wide * part - scale, 0, 2 * scale, height);
+      }
+      at_s += step.duration_s;
+    }
+    const count = steps.filter((step) => step.standing === "done").length;
+    line.setAttribute("aria-label", steps.length ? `Time line of the plan: ${count} of ${steps.length} steps are done` : "Time line: there is no plan");
+  }
+
+  event(event) { if (event.kind === "step" || event.kind === "plan_changed") { clearTimeout(this.soon); this.soon = setTimeout(() => this.refresh(), 200); } }
+  close() { this.closed = true; clearInterval(this.timer); clearTimeout(this.soon); this.resizing.disconnect(); }
+}
+
+const earned = (step) => {
+  if (step.frames) return Math.min(1, step.frames_saved / step.frames);
+  return step.duration_s > 0 ? Math.min(1, step.earned_s / step.duration_s) : 0;
+};
+
+function bar(step) {
+  return h("progress", { max: 1, value: earned(step), "aria-label": `${number(earned(step) * 100, 0)} % of step ${step.index + 1}` });
+}
+
+function progress_text(step) {
+  if (step.standing !== "under_way") return "";
+  if (step.frames) return ` – ${step.frames_saved} of ${step.frames} frames`;
+  return step.earned_s > 0 ? ` – ${duration(step.earned_s)} of ${duration(step.duration_s)} earned` : "";
+}
+
+// How far the end may be off: by how much steps that are done differed from what was expected of them, for as many as
+// are to come, twice the deviation. "" before there is anything to go by.
+export function uncertainty(steps) {
+  const off = steps.filter((step) => step.standing === "done" && step.began_ns && step.ended_ns).map((step) => (step.ended_ns - step.began_ns) / 1e9 - step.duration_s);
+  const left = steps.filter((step) => step.standing === "waiting" || step.standing === "under_way").length;
+  if (off.length < 3 || !left) return "";
+  const rms_s = Math.sqrt(off.reduce((sum, each) => sum + each * each, 0) / off.length);
+  return ` ± ${duration(Math.max(60, 2 * rms_s * Math.sqrt(left)))}`;
+}

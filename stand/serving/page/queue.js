@@ -1,0 +1,131 @@
+// The queue of runs, and the form that adds one.
+import { command, get, tell } from "./api.js";
+import { ask, day_clock, duration, fill, h, seconds } from "./dom.js";
+import { RecipeForm } from "./recipe_form.js";
+
+const WORD = { waiting: "waiting", running: "running", done: "done", failed: "failed", interrupted: "interrupted" };
+const MOST_ENDED = 10;
+
+export class Queue {
+  constructor(place, app) {
+    this.app = app;
+    this.answer = h("p", { class: "answer", role: "status" });
+    this.list = h("ol", { class: "queue", "aria-label": "Runs to be done, the next one first" });
+    this.ended = h("ol", { class: "queue" });
+    this.halted = h("p", { class: "level-error" });
+    this.form_answer = h("p", { class: "answer", role: "status" });
+    this.choice = h("select", { id: "recipe", onchange: () => this.choose() });
+    this.attended = h("input", { type: "checkbox", id: "attended" });
+    this.note = h("input", { type: "text", id: "note", maxlength: 1000, size: 40 });
+    this.tags = h("input", { type: "text", id: "tags", maxlength: 300, size: 24, placeholder: "lens-a, after-service" });
+    this.details = h("details", {}, h("summary", {}, "Look at and change its parameters"));
+    this.start = h("button", { type: "submit", class: "main" }, "Add to the queue");
+    const form = h("form", { class: "fields", onsubmit: (event) => { event.preventDefault(); this.submit(); } },
+      h("div", { class: "field" }, h("label", { for: "recipe" }, "recipe"), this.choice),
+      this.about = h("p", { class: "quiet" }),
+      this.details,
+      h("div", { class: "field" }, h("label", { for: "attended" }, "somebody attends"), this.attended, h("small", {}, "the run then waits at each prompt until it is answered")),
+      h("div", { class: "field" }, h("label", { for: "tags" }, "tags"), this.tags),
+      h("div", { class: "field" }, h("label", { for: "note" }, "note"), this.note),
+      h("div", { class: "row" }, this.start), this.form_answer);
+    fill(place, h("div", { class: "grid" },
+      h("div", { class: "stack" },
+        h("section", { class: "panel" }, h("h2", {}, "Start a run"), form)),
+      h("div", { class: "stack" },
+        h("section", { class: "panel" }, h("h2", {}, "To be done"), this.halted, this.list, this.answer),
+        h("section", { class: "panel" }, h("h2", {}, "Ended"), this.ended))));
+    this.load();
+  }
+
+  async load() {
+    try {
+      const [recipes, schema] = await Promise.all([get("/recipes"), get("/recipes/schema")]);
+      if (this.closed) return;
+      this.form = new RecipeForm(schema, Object.keys(this.app.state?.axes ?? {}));
+      this.details.append(this.form.element);
+      fill(this.choice, recipes.map(({ name }) => h("option", { value: name }, name)));
+      this.choice.value = recipes.some(({ name }) => name === "overnight") ? "overnight" : recipes[0]?.name;
+      await this.choose();
+    } catch (error) { tell(this.form_answer, error.message, true); }
+  }
+
+  async choose() {
+    this.installed = this.choice.value;
+    try {
+      const recipe = await get(`/recipes/${encodeURIComponent(this.installed)}`);
+      this.about.textContent = recipe.description ?? "";
+      this.form.load(recipe);
+      this.unchanged = JSON.stringify(this.form.recipe());
+    } catch (error) { tell(this.form_answer, error.message, true); }
+  }
+
+  async submit() {
+    let order;
+    try {
+      const recipe = JSON.stringify(this.form.recipe());
+      order = recipe === this.unchanged ? { recipe: this.installed } : { recipe_text: recipe };
+    } catch (error) { return tell(this.form_answer, error.message, true); }
+    order.attended = this.attended.checked;
+    const tags = this.tags.value.split(/[\s,;]+/).filter(Boolean);
+    if (tags.length) order.tags = tags;
+    if (this.note.value) order.note = this.note.value;
+    const body = JSON.stringify(order);
+    // The same key until something is changed or the stand has answered: pressed twice, it is one run.
+    if (body !== this.sent) { this.sent = body; this.key = `page-${Date.now()}-${Math.random().toString(36).slice(2)}`; }
+    this.start.disabled = true;
+    const run = await command(this.form_answer, "checking wires, disk and limits", "POST", "/queue", order, { "idempotency-key": this.key });
+    this.start.disabled = false;
+    if (run) {
+      this.sent = null;
+      tell(this.form_answer, `run ${run.id} (${run.recipe}) is queued${run.expected_s ? `; it will take ${duration(run.expected_s)}` : ""}`);
+    }
+  }
+
+  update(state) {
+    const runs = state.queue, key = JSON.stringify([runs, state.queue_halted]);
+    if (key === this.shown || this.dragged) return;
+    if (this.list.querySelector(".ask")) return;
+    this.shown = key;
+    this.halted.textContent = state.queue_halted ? `The queue is halted: ${state.queue_halted}` : "";
+    const open = runs.filter((run) => run.state !== "done" && run.state !== "failed");
+    const movable = open.filter((run) => run.state !== "running");
+    fill(this.list, open.length ? open.map((run) => this.row(run, movable)) : h("li", {}, h("span"), h("span", { class: "quiet" }, "nothing is queued")));
+    const ended = runs.filter((run) => run.state === "done" || run.state === "failed").slice(-MOST_ENDED).reverse();
+    fill(this.ended, ended.length ? ended.map((run) => this.row(run, [])) : h("li", {}, h("span"), h("span", { class: "quiet" }, "none yet")));
+  }
+
+  row(run, movable) {
+    const at = movable.indexOf(run), offset_ns = this.app.state.utc_offset_ns;
+    const acts = h("span", { class: "row" });
+    const button = (name, label, act, disabled = false) => acts.append(h("button", { type: "button", class: "small", "aria-label": `${label}: run ${run.id}`, disabled, onclick: act }, name));
+    const row = h("li", { draggable: at >= 0 ? "true" : undefined }, h("span", { class: "number quiet" }, String(run.id)),
+      h("span", {}, h("b", {}, run.recipe), ` ${WORD[run.state]}`, run.expected_s ? `, ${duration(run.expected_s)}` : "",
+        h("br"), h("small", {}, [run.reason, run.added_by && `by ${run.added_by}`, `added ${day_clock(seconds(run.added_ns, offset_ns))}`, run.session].filter(Boolean).join(" · "))), acts);
+    if (at >= 0) {
+      button("▲", "Earlier", () => this.move(run, at), at === 0);
+      button("▼", "Later", () => this.move(run, at + 2), at === movable.length - 1);
+      button("Remove", "Remove", () => ask(row, `Take run ${run.id} (${run.recipe}) out of the queue?`, "Remove it", () => command(this.answer, "remove", "DELETE", `/queue/${run.id}`)));
+      this.drag(row, run, at);
+    }
+    if (run.state === "interrupted" && run.session) button("Resume", "Resume", () => command(this.answer, "resume", "POST", `/sessions/${encodeURIComponent(run.session)}/resume`));
+    return row;
+  }
+
+  drag(row, run, at) {
+    row.addEventListener("dragstart", (event) => { this.dragged = run; event.dataTransfer.effectAllowed = "move"; event.dataTransfer.setData("text/plain", String(run.id)); });
+    row.addEventListener("dragend", () => { this.dragged = null; });
+    row.addEventListener("dragover", (event) => { if (this.dragged) { event.preventDefault(); row.classList.add("over"); } });
+    row.addEventListener("dragleave", () => row.classList.remove("over"));
+    row.addEventListener("drop", (event) => {
+      event.preventDefault();
+      row.classList.remove("over");
+      const moved = this.dragged;
+      this.dragged = null;
+      if (moved && moved.id !== run.id) this.move(moved, at + 1);
+    });
+  }
+
+  move(run, to) { command(this.answer, `move run ${run.id}`, "POST", `/queue/${run.id}/move`, { to }); }
+  event() {}
+  close() { this.closed = true; }
+}

@@ -1,0 +1,143 @@
+// A form made from the recipe's JSON Schema. A field that is left at its default is not sent, so that the default of
+// the stand's version is what counts.
+import { fill, h, words } from "./dom.js";
+
+export class RecipeForm {
+  constructor(schema, axes) {
+    this.schema = schema;
+    this.axes = axes;
+    this.element = h("div", { class: "stack" });
+  }
+
+  resolve(schema) {
+    while (schema.$ref) schema = this.schema.$defs[schema.$ref.split("/").pop()];
+    const choices = schema.anyOf?.filter((each) => each.type !== "null");
+    return choices?.length === 1 ? { ...this.resolve(choices[0]), default: schema.default } : schema;
+  }
+
+  // The kinds of experiment that have fields of their own.
+  kinds() {
+    const { properties } = this.resolve(this.schema.properties.experiments.items);
+    return Object.keys(properties).filter((kind) => this.resolve(properties[kind]).properties);
+  }
+
+  load(recipe) {
+    this.parts = [];
+    this.steps = recipe.steps?.length ? json_field("steps, one after another", recipe.steps, "Steps of the recipe as JSON, see docs/recipes.md") : null;
+    this.name = text_field("name", recipe.name ?? "", { pattern: "[a-z0-9][a-z0-9\\-]*", maxlength: 100, required: true });
+    this.about = text_field("description", recipe.description ?? "", { maxlength: 1000 });
+    this.places = h("div", { class: "stack" });
+    this.more = h("select", { "aria-label": "Kind of experiment" }, this.kinds().map((kind) => h("option", { value: kind }, words(kind))));
+    fill(this.element, h("fieldset", {}, h("legend", {}, "Recipe"), this.name.row, this.about.row), this.places, this.steps?.row,
+      this.steps ? null : h("div", { class: "row" }, this.more, h("button", { type: "button", onclick: () => this.add(this.more.value, {}) }, "Add this experiment")));
+    for (const experiment of recipe.experiments ?? []) {
+      const [[kind, values]] = Object.entries(experiment);
+      this.add(kind, values);
+    }
+  }
+
+  add(kind, values) {
+    const items = this.resolve(this.schema.properties.experiments.items);
+    const schema = items.properties[kind] ? this.resolve(items.properties[kind]) : {};
+    const fields = schema.properties ? this.fields(schema, values) : [json_field("", values, "As JSON")];
+    const box = h("fieldset", {}, h("legend", {}, words(kind)));
+    const part = { kind, fields, is_whole: !schema.properties };
+    box.append(...fields.map((field) => field.row), h("button", { type: "button", class: "small", onclick: () => { this.parts.splice(this.parts.indexOf(part), 1); box.remove(); } }, `Remove this ${words(kind)}`));
+    this.parts.push(part);
+    this.places.append(box);
+  }
+
+  fields(schema, values) {
+    return Object.entries(schema.properties).map(([name, each]) => this.field(name, { default: each.default, ...this.resolve(each) }, values[name], schema.required?.includes(name)));
+  }
+
+  field(name, schema, value, required) {
+    const given = value ?? schema.default;
+    if (schema.enum) return choice_field(name, schema.enum, given);
+    if (schema.type === "number" || schema.type === "integer") return number_field(name, schema, given, required);
+    if (schema.type === "boolean") return flag_field(name, Boolean(given));
+    if (schema.type === "string") return text_field(name, given ?? "", { pattern: schema.pattern, maxlength: schema.maxLength, required });
+    if (schema.type === "array" && this.resolve(schema.items ?? {}).type === "number") return list_field(name, this.resolve(schema.items), given ?? [], required);
+    if (schema.type === "object" && schema.additionalProperties?.type === "number") return this.position_field(name, given ?? {});
+    return json_field(name, given ?? null, schema.description ?? "As JSON; empty or null for none");
+  }
+
+  position_field(name, values) {
+    const names = [...new Set([...this.axes, ...Object.keys(values)])];
+    const inputs = names.map((axis) => h("input", { type: "number", step: "any", value: values[axis] ?? "", "aria-label": `${words(name)}: ${axis}` }));
+    return field(name, h("span", { class: "row" }, names.flatMap((axis, index) => [h("span", {}, axis), inputs[index]])), "", () => {
+      const found = Object.fromEntries(names.map((axis, index) => [axis, inputs[index].value]).filter(([, text]) => text !== "").map(([axis, text]) => [axis, Number(text)]));
+      return Object.keys(found).length ? found : undefined;
+    });
+  }
+
+  // The recipe that the form holds; throws an Error with a sentence when a field holds nothing that can be sent.
+  recipe() {
+    const experiments = this.parts.map(({ kind, fields, is_whole }) => ({ [kind]: is_whole ? fields[0].value() : collect(fields) }));
+    const recipe = { name: this.name.value() };
+    if (this.about.value()) recipe.description = this.about.value();
+    if (experiments.length) recipe.experiments = experiments;
+    if (this.steps) recipe.steps = this.steps.value();
+    return recipe;
+  }
+}
+
+function collect(fields) {
+  return Object.fromEntries(fields.map((each) => [each.name, each.value()]).filter(([, value]) => value !== undefined));
+}
+
+let count = 0;
+
+function field(name, input, help, value) {
+  const id = `field-${(count += 1)}`;
+  const control = input.matches("input, select, textarea") ? input : null;
+  control?.setAttribute("id", id);
+  if (control && help) control.setAttribute("aria-describedby", `${id}-help`);
+  const label = control ? h("label", { for: id }, words(name)) : h("span", {}, words(name));
+  return { name, value, row: h("div", { class: "field" }, label, input, help ? h("small", { id: `${id}-help` }, help) : null) };
+}
+
+function number_field(name, schema, given, required) {
+  const least = schema.minimum ?? schema.exclusiveMinimum, most = schema.maximum ?? schema.exclusiveMaximum;
+  const input = h("input", { type: "number", step: schema.type === "integer" ? 1 : "any", min: least, max: most, required, value: given ?? "" });
+  const bounds = least !== undefined && most !== undefined ? `${least} to ${most}` : least !== undefined ? `${least} or more` : most !== undefined ? `${most} or less` : "";
+  const help = [bounds, schema.default !== undefined && schema.default !== null ? `usually ${schema.default}` : ""].filter(Boolean).join("; ");
+  return field(name, input, help, () => (input.value === "" || Number(input.value) === schema.default ? undefined : Number(input.value)));
+}
+
+function text_field(name, given, attributes) {
+  const input = h("input", { type: "text", value: given, ...attributes });
+  return field(name, input, "", () => input.value || undefined);
+}
+
+function flag_field(name, given) {
+  const input = h("input", { type: "checkbox" });
+  input.checked = given;
+  return field(name, input, "", () => input.checked);
+}
+
+function choice_field(name, choices, given) {
+  const input = h("select", {}, choices.map((each) => h("option", { value: each }, words(each))));
+  input.value = given;
+  return field(name, input, "", () => input.value);
+}
+
+function list_field(name, items, given, required) {
+  const input = h("input", { type: "text", value: given.join(", "), required, inputmode: "text", size: 40 });
+  const bounds = items.minimum !== undefined ? `, each ${items.minimum} to ${items.maximum}` : "";
+  return field(name, input, `numbers with commas between them${bounds}`, () => {
+    const texts = input.value.split(/[\s,;]+/).filter(Boolean), numbers = texts.map(Number);
+    const wrong = texts.find((_, index) => Number.isNaN(numbers[index]));
+    if (wrong !== undefined) throw new Error(`${words(name)}: ${wrong} is not a number`);
+    return numbers.length || required ? numbers : undefined;
+  });
+}
+
+function json_field(name, given, help) {
+  const input = h("textarea", { rows: given ? Math.min(14, JSON.stringify(given, null, 1).split("\n").length + 1) : 1, spellcheck: "false", "aria-label": words(name) || "as JSON" });
+  input.value = given === null || given === undefined || (Array.isArray(given) && !given.length) ? "" : JSON.stringify(given, null, 1);
+  return field(name, input, help, () => {
+    if (!input.value.trim() || input.value.trim() === "null") return undefined;
+    try { return JSON.parse(input.value); } catch (error) { throw new Error(`${words(name)}: no JSON (${error.message})`); }
+  });
+}

@@ -1,0 +1,170 @@
+// Recorded sessions, their reports, and two nights one over the other.
+import { command, get, tell } from "./api.js";
+import { look_of } from "./channels.js";
+import { bytes, css, day_clock, duration, fill, h, seconds } from "./dom.js";
+import uPlot from "./uPlot.js";
+
+const MOST_ROWS = 200;
+const COMPARED = ["thermometers.air", "camera.temperature", "camera.drift_mean"];
+
+export class Sessions {
+  constructor(place, app) {
+    this.app = app;
+    this.chosen = [];
+    this.plots = [];
+    this.answer = h("p", { class: "answer", role: "status" });
+    this.rows = h("tbody");
+    this.search = h("input", { type: "search", placeholder: "name, recipe, operator, tag", "aria-label": "Search sessions", oninput: () => this.show() });
+    this.compare_button = h("button", { type: "button", disabled: true, onclick: () => this.compare() }, "Show");
+    this.comparison = h("section", { class: "panel", hidden: true });
+    const head = ["", "session", "recipe", "began", "took", "frames", "size", "run", "files", ""].map((name) => h("th", { scope: "col" }, name || h("span", { class: "unseen" }, "actions")));
+    fill(place, h("div", { class: "stack" },
+      this.comparison,
+      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Sessions"), this.search, this.compare_button), this.answer,
+        h("div", { class: "scroll" }, h("table", {}, h("thead", {}, h("tr", {}, head)), this.rows)))));
+    this.load();
+  }
+
+  async load() {
+    try {
+      this.sessions = (await get("/sessions")).reverse();
+      if (!this.closed) this.show();
+    } catch (error) { tell(this.answer, error.message, true); }
+  }
+
+  show() {
+    const text = this.search.value.toLowerCase();
+    const matches = (each) => [each.name, each.recipe, each.operator, ...(each.tags ?? [])].join(" ").toLowerCase().includes(text);
+    const found = (this.sessions ?? []).filter(matches);
+    fill(this.rows, found.slice(0, MOST_ROWS).map((each) => this.row(each)));
+    tell(this.answer, found.length ? (found.length > MOST_ROWS ? `the latest ${MOST_ROWS} of ${found.length}` : "") : "no session is recorded here");
+    this.choose();
+  }
+
+  row(each) {
+    const box = h("input", { type: "checkbox", "aria-label": `Choose ${each.name}`, onchange: () => this.pick(each.name, box.checked) });
+    box.checked = this.chosen.includes(each.name);
+    const took = each.begin_ns && each.end_ns ? duration((each.end_ns - each.begin_ns) / 1e9) : "–";
+    const path = encodeURIComponent(each.name), actions = h("td", { class: "row" });
+    if (each.has_report) actions.append(h("a", { href: `/api/v1/sessions/${path}/report.html`, target: "_blank", rel: "noopener" }, "report"));
+    if (["interrupted", "killed", "aborted"].includes(each.run)) actions.append(h("button", { type: "button", class: "small", onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
+    actions.append(h("button", { type: "button", class: "small", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
+    const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
+    return h("tr", {}, h("td", {}, box),
+      h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)])),
+      h("td", {}, each.recipe), h("td", {}, each.begin_ns ? day_clock(seconds(each.begin_ns, each.utc_offset_ns ?? 0)) : "–"), h("td", { class: "number" }, took),
+      h("td", { class: "number" }, String(each.frames)), h("td", { class: "number" }, bytes(each.bytes ?? 0)), h("td", {}, each.run),
+      h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files), actions);
+  }
+
+  note(each, place) {
+    if (place.querySelector("form")) return;
+    const input = h("input", { type: "text", maxlength: 10000, "aria-label": `Note on ${each.name}`, size: 30 });
+    const form = h("form", { class: "row", onsubmit: async (event) => {
+      event.preventDefault();
+      if (await command(this.answer, "note", "POST", `/sessions/${encodeURIComponent(each.name)}/notes`, { text: input.value })) form.remove();
+    } }, input, h("button", { type: "submit", class: "small" }, "Keep"));
+    place.append(form);
+    input.focus();
+  }
+
+  pick(name, is_chosen) {
+    this.chosen = this.chosen.filter((each) => each !== name);
+    if (is_chosen) this.chosen.push(name);
+    if (this.chosen.length > 2) { this.chosen.shift(); this.show(); }
+    this.choose();
+  }
+
+  choose() {
+    this.compare_button.disabled = !this.chosen.length;
+    this.compare_button.textContent = this.chosen.length === 2 ? "Compare these two nights" : "Show this night";
+  }
+
+  async compare() {
+    const names = [...this.chosen];
+    tell(this.answer, `reading ${names.join(" and ")} …`);
+    try {
+      const nights = await Promise.all(names.map((name) => get(`/sessions/${encodeURIComponent(name)}/history?points=1000`)));
+      if (this.closed) return;
+      tell(this.answer, "");
+      this.draw(names, nights);
+    } catch (error) { tell(this.answer, error.message, true); return; }
+    for (const [index, name] of names.entries()) this.find_drift(name, index, names);
+  }
+
+  // Markers of a whole night take longer than its curves: they are shown when they are there.
+  async find_drift(name, index, names) {
+    const place = this.drift_answers[index];
+    try {
+      tell(place, `finding the markers of ${name} …`);
+      const drift = await get(`/sessions/${encodeURIComponent(name)}/drift`);
+      if (this.closed || this.shown_names !== names) return;
+      tell(place, drift.points.length ? "" : `${name}: no drift (${drift.trouble || "no frames for it"})`);
+      this.drift[index] = drift;
+      this.draw_drift();
+    } catch (error) { tell(place, `${name}: ${error.message}`, true); }
+  }
+
+  draw(names, nights) {
+    this.clear();
+    this.shown_names = names;
+    this.nights = nights;
+    this.drift = names.map(() => ({ points: [] }));
+    this.comparison.hidden = false;
+    const place = h("div", { class: "curve", role: "img", "aria-label": `Temperatures of ${names.join(" and ")} over the hours since their beginnings` });
+    const drift = h("div", { class: "curve", role: "img", "aria-label": `Mean drift of ${names.join(" and ")}` });
+    this.drift_answers = names.map(() => h("p", { class: "answer quiet", role: "status" }));
+    const key = names.map((name, index) => h("p", {}, `${index ? "dashed" : "solid"}: `, h("b", {}, name)));
+    fill(this.comparison, h("div", { class: "head" }, h("h2", {}, names.length > 1 ? "Two nights, hours since their beginnings" : "One night, hours since its beginning"),
+      h("button", { type: "button", class: "small", onclick: () => { this.clear(); this.comparison.hidden = true; } }, "Close")), key,
+      h("p", { class: "curve-name" }, "Air and camera, °C"), place, h("p", { class: "curve-name" }, "Mean drift, px"), drift, this.drift_answers);
+    this.drift_place = drift;
+    const series = nights.flatMap((night, index) => COMPARED.slice(0, 2).filter((channel) => night.low[channel]).map((channel) => ({
+      name: `${look_of(channel).name}, ${names[index]}`, colour: look_of(channel).colour, dash: index ? [6, 4] : [],
+      x: hours(night), y: night.high[channel] ?? night.low[channel] })));
+    this.plots.push(new Lines(place, 280, series));
+    this.draw_drift();
+    this.comparison.scrollIntoView({ block: "start" });
+  }
+
+  draw_drift() {
+    this.drift_plot?.destroy();
+    const series = this.drift.map((drift, index) => ({
+      name: this.shown_names[index], colour: index ? "--c-worst" : "--c-mean", dash: index ? [6, 4] : [],
+      x: drift.points.map((point) => (point.time_ns - this.nights[index].from_ns) / 3600e9), y: drift.points.map((point) => point.mean_px) }));
+    this.drift_plot = series.some((each) => each.x.length) ? new Lines(this.drift_place, 200, series) : null;
+  }
+
+  clear() {
+    for (const plot of this.plots) plot.destroy();
+    this.plots = [];
+    this.drift_plot?.destroy();
+    this.drift_plot = null;
+  }
+
+  update() {}
+  event(event) { if (event.kind === "run.end") this.load(); }
+  close() { this.closed = true; this.clear(); }
+}
+
+const hours = (night) => Array.from({ length: night.points }, (_, n) => ((n + 0.5) * night.width_ns) / 3600e9);
+
+// Lines that do not share their x.
+class Lines {
+  constructor(place, height, series) {
+    this.place = place;
+    this.height = height;
+    const axis = { stroke: css("--quiet"), grid: { stroke: css("--faint"), width: 1 }, ticks: { stroke: css("--line"), width: 1, size: 4 }, font: "12px system-ui, sans-serif" };
+    const data = series.length > 1 ? uPlot.join(series.map((each) => [each.x, each.y])) : [series[0]?.x ?? [], series[0]?.y ?? []];
+    this.plot = new uPlot({
+      width: Math.max(200, place.clientWidth), height, legend: { show: false }, scales: { x: { time: false } },
+      axes: [{ ...axis, size: 28, values: (_, ticks) => ticks.map((tick) => `${tick} h`) }, { ...axis, size: 52 }],
+      series: [{}, ...series.map((each) => ({ label: each.name, stroke: css(each.colour), dash: each.dash, width: 1.8, spanGaps: true, points: { show: false } }))],
+    }, data, place);
+    this.plot.root.setAttribute("aria-hidden", "true");
+    this.resizing = new ResizeObserver(() => { const width = Math.floor(place.clientWidth); if (width > 0 && Math.abs(width - this.plot.width) > 1) this.plot.setSize({ width, height }); });
+    this.resizing.observe(place);
+  }
+
+  destroy() { this.resizing.disconnect(); this.plot.destroy(); }
+}

@@ -1,0 +1,210 @@
+"""The routes of the page: its files, the history behind its curves, and the last frame."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import yaml
+from fastapi import APIRouter, Query, Response
+from fastapi import Path as PathOf
+from pydantic import BaseModel
+
+from foundation.errors import ConfigError
+from stand.config.stand_config import packaged
+from stand.serving.api.bridge import Bridge, NoAnswer
+from stand.serving.api.recorded import SessionName, session_in
+from stand.serving.api.stream import json_of
+from stand.serving.desk import Missing
+from stand.serving.history import MOST_POINTS, Columns
+from stand.serving.preview_process import session_columns
+from stand.serving.viewing import Viewing
+
+if TYPE_CHECKING:
+    from stand.serving.preview import Preview
+
+PAGE = Path(__file__).parent / "page"
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".webmanifest": "application/manifest+json",
+    ".txt": "text/plain; charset=utf-8",
+}
+_RECIPE = re.compile(r"[a-z0-9][a-z0-9-]*")
+_LIMIT_S = 60.0  # to read a recorded session, at the lowest priority
+_MOST_CHANNELS_TEXT = 4000
+_KEPT = 4  # sessions' curves
+
+Ns = Annotated[int, Query(ge=0, le=1 << 62)]
+Points = Annotated[int, Query(ge=1, le=MOST_POINTS)]
+Camera = Annotated[str, Query(max_length=100)]
+
+
+class Curves(BaseModel):
+    """Column n is width_ns wide and begins at from_ns + n * width_ns. low, high: smallest and largest value in it by
+    channel, null without one; a channel that is not in `high` has one value a column. marks: events and steps (level
+    "step"; end_ns null while it is under way)."""
+
+    from_ns: int
+    width_ns: int
+    points: int
+    low: dict[str, list[float | None]]
+    high: dict[str, list[float | None]]
+    units: dict[str, str]
+    marks: list[dict[str, Any]]
+
+
+class FrameFacts(BaseModel):
+    """The last frame that was looked at, see stand/serving/preview.py. skipped: frames that were not looked at, as
+    others came meanwhile; trouble: why there are no markers."""
+
+    camera: str
+    cameras: list[str]
+    time_ns: int
+    width: int
+    height: int
+    role: str
+    setup: dict[str, Any]
+    markers: list[tuple[int, float, float, float | None, float | None]]
+    expected: int
+    mean_px: float | None
+    mean_dx: float | None
+    mean_dy: float | None
+    worst_px: float | None
+    worst: int | None
+    reference_ns: int | None
+    skipped: int
+    trouble: str
+
+
+class PageRoom:
+    """`Interface.rooms` takes it: called in the thread that serves clients, it gives the routes."""
+
+    def __init__(self, viewing: Viewing) -> None:
+        self._viewing = viewing
+        self._sessions: dict[tuple[str, int, int], Columns] = {}
+        self._running: asyncio.Task[None] | None = None
+
+    def __call__(self, bridge: Bridge) -> APIRouter:
+        """The routes; `bridge` is not needed, what they give is no part of the state."""
+        self._running = asyncio.get_running_loop().create_task(self._viewing.run())
+        router = APIRouter()
+        self._add_curves(router)
+        self._add_frame(router)
+        _add_recipe(router)
+        _add_files(router)
+        return router
+
+    def _add_curves(self, router: APIRouter) -> None:
+        @router.get("/api/v1/history", response_model=Curves)
+        async def history(
+            from_ns: Ns,
+            to_ns: Ns,
+            points: Points = 1200,
+            channels: Annotated[str, Query(max_length=_MOST_CHANNELS_TEXT)] = "",
+        ) -> Response:
+            """Curves of the last week, decimated: smallest and largest value of each column. channels: with commas
+            between them; all without."""
+            wanted = set(channels.split(",")) if channels else None
+            try:
+                found = self._viewing.up_to_date().columns(from_ns, to_ns, points, wanted)
+            except ValueError as error:
+                raise ConfigError(str(error)) from None
+            return _json(found.as_json())
+
+        @router.get("/api/v1/sessions/{name}/history", response_model=Curves)
+        async def of_session(name: SessionName, points: Points = 1200) -> Response:
+            """The same of a recorded session, from its beginning to its end."""
+            path = await asyncio.to_thread(session_in, self._viewing.sessions, name)
+            return _json((await self._session(path, points)).as_json())
+
+    async def _session(self, path: Path, points: int) -> Columns:
+        changed_ns = (await asyncio.to_thread((path / "telemetry").stat)).st_mtime_ns
+        key = (path.name, changed_ns, points)
+        if key not in self._sessions:
+            try:
+                async with asyncio.timeout(_LIMIT_S):
+                    found = await self._viewing.ask(session_columns, str(path), points)
+            except TimeoutError:
+                raise NoAnswer(f"{path.name} could not be read within {_LIMIT_S:g} s") from None
+            except OSError as error:
+                raise NoAnswer(str(error)) from None
+            while len(self._sessions) >= _KEPT:
+                self._sessions.pop(next(iter(self._sessions)))
+            self._sessions[key] = found
+        return self._sessions[key]
+
+    def _add_frame(self, router: APIRouter) -> None:
+        viewing = self._viewing
+
+        @router.get("/api/v1/frame", response_model=FrameFacts, responses={204: {"description": "No frame yet"}})
+        async def frame(camera: Camera = "") -> Response:
+            """What is to be seen in the last frame of a camera; without a name, of the first that has one."""
+            preview = _preview(viewing, camera)
+            if preview is None:
+                return Response(status_code=204)
+            facts = asdict(preview)
+            del facts["jpeg"]
+            more = {"cameras": list(viewing.previews), "skipped": viewing.skipped}
+            return _json({**facts, **more, "trouble": preview.trouble or viewing.trouble})
+
+        @router.get("/api/v1/frame.jpg", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}})
+        async def picture(camera: Camera = "") -> Response:
+            """The last frame at half its size."""
+            preview = _preview(viewing, camera)
+            if preview is None:
+                return Response(status_code=204)
+            return Response(preview.jpeg, media_type="image/jpeg", headers={"x-time-ns": str(preview.time_ns)})
+
+
+def _preview(viewing: Viewing, camera: str) -> Preview | None:
+    """Of that camera, None when nothing was looked at yet; Missing when there is no such camera."""
+    if camera and camera not in viewing.previews and viewing.previews:
+        raise Missing("no frame of a camera of that name was looked at")
+    return viewing.previews.get(camera) if camera else next(iter(viewing.previews.values()), None)
+
+
+def _add_recipe(router: APIRouter) -> None:
+    @router.get("/api/v1/recipes/{name}")
+    async def recipe(name: Annotated[str, PathOf(max_length=100)]) -> dict[str, Any]:
+        """An installed recipe as a document, to fill a form with."""
+        path = packaged("recipes", "overnight").parent / f"{name}.yaml"
+        if not _RECIPE.fullmatch(name) or not path.is_file():
+            raise Missing("there is no installed recipe of that name")
+        return yaml.safe_load(path.read_text("utf-8"))
+
+
+def _add_files(router: APIRouter) -> None:
+    @router.get("/", response_class=Response, include_in_schema=False)
+    async def page() -> Response:
+        """The page."""
+        return _file("index.html")
+
+    @router.get("/static/{name}", response_class=Response, include_in_schema=False)
+    async def static(name: str) -> Response:
+        """A file of the page."""
+        return _file(name)
+
+
+def _file(name: str) -> Response:
+    found = _files().get(name)
+    if found is None:
+        raise Missing("the page has no such file")
+    data, kind = found
+    return Response(data, media_type=kind)
+
+
+@cache
+def _files() -> dict[str, tuple[bytes, str]]:
+    """All of them, read once: what is asked for is a key here and never a path."""
+    return {path.name: (path.read_bytes(), _TYPES[path.suffix]) for path in PAGE.iterdir() if path.suffix in _TYPES}
+
+
+def _json(value: object) -> Response:
+    return Response(json_of(value), media_type="application/json")

@@ -1,0 +1,309 @@
+"""The page in a real browser, as somebody uses it at night. The stand behind it is a desk that a test sets."""
+
+import asyncio
+
+import pytest
+
+from foundation.clock import NS_PER_S
+from stand.gate import OPERATOR
+from tests.stand.browser import DESKTOP, PHONE, a_page, browser, needs_chromium
+from tests.stand.page_desk import a_night, free_port, frame_of, target_image
+
+pytestmark = needs_chromium
+VIEWS = ("now", "plan", "queue", "camera", "sessions", "devices")
+
+
+@pytest.fixture
+async def night(tmp_path):
+    port = free_port()
+    async with a_night(tmp_path / "sessions", port) as desk, browser() as chromium:
+        desk.port, desk.chromium = port, chromium
+        yield desk
+
+
+async def until(check, timeout_s=30.0):
+    """Wait for what another process does."""
+    async with asyncio.timeout(timeout_s):
+        while not check():
+            await asyncio.sleep(0.05)
+
+
+async def ink(page):
+    """How many points of the first curves' canvas are drawn."""
+    return await page.evaluate(
+        """() => { const c = document.querySelector(".curve canvas");
+        if (!c || !c.width) return 0;
+        return c.getContext("2d").getImageData(0, 0, c.width, c.height).data.filter((v, n) => n % 4 === 3 && v).length }"""
+    )
+
+
+async def picture(page):
+    return await page.evaluate("() => document.querySelector('.curve canvas')?.toDataURL() ?? ''")
+
+
+async def test_the_page_shows_the_stand_and_its_curves_move(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        assert await page.locator("#stand").inner_text() == "cold-chamber"
+        row = page.locator(".readings tr", has_text="air")
+        assert "°C" in await row.locator(".value").inner_text()
+        await page.get_by_role("button", name="10 min").click()
+        async with asyncio.timeout(30):
+            while await ink(page) < 2000:
+                await asyncio.sleep(0.1)
+            before = await picture(page)
+            while await picture(page) == before:
+                await asyncio.sleep(0.2)
+
+
+async def test_event_marks_and_the_night_are_there_after_a_reload(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_role("button", name="12 h").click()
+        await page.get_by_text("thermometers does not answer").wait_for()
+        await page.reload()
+        await page.get_by_text("thermometers does not answer").wait_for()
+        assert await page.locator("[data-span='43200']").get_attribute("aria-pressed") == "true"
+
+
+async def test_zooming_shows_a_part_of_the_night_and_the_way_back(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_role("button", name="12 h").click()
+        await page.get_by_text("thermometers does not answer").wait_for()
+        over = await page.locator(".u-over").first.bounding_box()
+        async with page.expect_response(lambda answer: "/history?" in answer.url) as asked:
+            await page.mouse.move(over["x"] + 0.6 * over["width"], over["y"] + 50)
+            await page.mouse.down()
+            await page.mouse.move(over["x"] + 0.7 * over["width"], over["y"] + 60, steps=4)
+            await page.mouse.up()
+        found = await (await asked.value).json()
+        assert found["points"] * found["width_ns"] / NS_PER_S == pytest.approx(4320, rel=0.15)
+        await page.get_by_role("button", name="Back to now").click()
+        await page.get_by_role("button", name="Back to now").wait_for(state="hidden")
+
+
+async def test_pause_and_continue_make_the_round(night):
+    async with a_page(night.chromium, night.port, "plan") as page:
+        await page.get_by_role("button", name="Pause now").click()
+        await page.locator("#phase", has_text="Held").wait_for()
+        assert night.gate.reasons == {OPERATOR}
+        await page.get_by_text("paused by an operator").first.wait_for()
+        await page.locator("main").get_by_role("button", name="Continue").click()
+        await page.locator("#phase", has_text="Running").wait_for()
+        assert [verb for _, verb, _ in night.orders] == ["pause", "continue"]
+
+
+async def test_stop_is_immediate_and_asks_nothing(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        box = await page.locator("#stop").bounding_box()
+        await page.mouse.move(box["x"] + 20, box["y"] + 20)
+        await page.mouse.down()  # not even the release is waited for
+        await until(lambda: night.stops)
+        await page.get_by_text("the stand is made safe").first.wait_for()
+        await page.locator("#phase", has_text="Stopping").wait_for()
+
+
+async def test_escape_twice_stops_and_once_does_not(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        await page.keyboard.press("Escape")
+        await page.wait_for_timeout(300)
+        assert not night.stops
+        await page.keyboard.press("Escape")
+        await until(lambda: night.stops)
+
+
+async def test_stop_goes_on_until_the_stand_has_heard_it(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        tries = []
+
+        async def deaf(route):
+            tries.append(route)
+            await (route.abort() if len(tries) < 3 else route.continue_())
+
+        await page.route("**/run/stop", deaf)
+        await page.locator("#stop").click()
+        await page.get_by_text("NOT STOPPED").wait_for()
+        await until(lambda: night.stops)
+        await page.get_by_text("the stand is made safe").first.wait_for()
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+async def test_nothing_ever_lies_over_stop(night, size):
+    """With a fault, a prompt, a pause and a question open, in every view and however far it is scrolled."""
+    async with a_page(night.chromium, night.port, size=size) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        night.trip()
+        night.ask_operator("Roll the camera by 20 degrees")
+        await page.get_by_text("The run waits for you").wait_for()
+        await page.get_by_role("button", name="Look at it and clear").click()
+        for view in VIEWS:
+            await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
+            await page.wait_for_timeout(200)
+            for down in (0, 100_000):
+                await page.mouse.wheel(0, down)
+                assert await page.evaluate(
+                    """() => { const b = document.getElementById("stop").getBoundingClientRect();
+                    const inside = b.top >= 0 && b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight;
+                    const at = [[8, 8], [b.width - 8, 8], [8, b.height - 8], [b.width - 8, b.height - 8], [b.width / 2, b.height / 2]];
+                    return inside && at.every(([x, y]) => document.elementFromPoint(b.left + x, b.top + y)?.id === "stop") }"""
+                ), view
+
+
+async def test_a_fault_appears_and_is_cleared_only_after_it_was_shown(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        night.trip()
+        await page.locator("#phase", has_text="Tripped").wait_for()
+        alert = page.get_by_role("alert")
+        assert "71.2" in await alert.inner_text()
+        assert not await page.get_by_role("button", name="The cause is removed").is_visible()
+        await page.get_by_role("button", name="Look at it and clear").click()
+        await page.get_by_text("Readings now").wait_for()
+        assert "°C" in await alert.inner_text()
+        await page.get_by_role("button", name="The cause is removed").click()
+        await page.locator("#phase", has_text="Running").wait_for()
+        await alert.wait_for(state="detached")
+        assert [verb for _, verb, _ in night.orders] == ["clear"]
+
+
+async def test_a_prompt_is_answered(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        night.ask_operator("Roll the camera by 20 degrees, <script>alert(1)</script>")
+        await page.get_by_text("Roll the camera by 20 degrees, <script>").first.wait_for()
+        await page.get_by_role("button", name="Done, go on").click()
+        await page.get_by_text("The run waits for you").wait_for(state="detached")
+        assert [verb for _, verb, _ in night.orders] == ["continue"]
+
+
+async def test_the_plan_is_a_time_line_whose_steps_are_left_out_and_extended(night):
+    async with a_page(night.chromium, night.port, "plan") as page:
+        under_way = page.locator(".steps li[data-standing='under_way']")
+        await under_way.wait_for()
+        assert "earned" in await under_way.inner_text()
+        await page.get_by_role("button", name="+15 min: step 32").click()
+        await until(lambda: night.orders)
+        assert night.orders[-1][2]["by_s"] == 900
+        await page.get_by_role("button", name="Skip: step 35").click()
+        assert len(night.orders) == 1  # it asks first
+        await page.get_by_role("button", name="Leave it out").click()
+        await until(lambda: len(night.orders) == 2)
+        await page.get_by_role("button", name="End the run").click()
+        assert not night.stops
+        await page.get_by_role("group", name="End the run").get_by_role("button", name="End the run").click()
+        await until(lambda: night.stops)
+
+
+async def test_the_steps_to_come_are_edited(night):
+    async with a_page(night.chromium, night.port, "plan") as page:
+        await page.get_by_role("button", name="Edit the steps to come").click()
+        text = await page.get_by_label("Steps to come").input_value()
+        assert len(text.splitlines()) == 4
+        await page.get_by_label("Steps to come").fill("\n".join(text.splitlines()[2:]) + "\nnot json")
+        await page.get_by_role("button", name="Replace them").click()
+        await page.get_by_text("line 3").wait_for()
+        await page.get_by_label("Steps to come").fill("\n".join(text.splitlines()[2:]))
+        await page.get_by_role("button", name="Replace them").click()
+        await until(lambda: night.orders)
+        assert night.orders[-1][1:] == ("edit", {"from_index": 32, "steps": 2})
+
+
+async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):
+    async with a_page(night.chromium, night.port, "queue") as page:
+        await page.get_by_label("recipe", exact=True).select_option("overnight")
+        await page.get_by_text("Look at and change its parameters").click()
+        frames = page.get_by_label("frames", exact=True).first
+        assert await frames.input_value() == "3600"
+        await frames.fill("120")
+        await page.get_by_role("button", name="Add to the queue").click()
+        await page.get_by_text("is queued").wait_for()
+        run = night.queue[-1]
+        order, _ = night.requests[run.key]
+        assert '"frames":120' in order.recipe_text
+        assert '"held_out_degC":[17,38]' in order.recipe_text
+        await page.get_by_label("frames", exact=True).first.fill("-5")
+        await page.get_by_role("button", name="Add to the queue").click()
+        assert len(night.queue) == 3  # the browser says what is wrong with the field
+
+
+async def test_runs_are_moved_by_buttons_and_by_dragging_and_removed_after_a_question(night):
+    async with a_page(night.chromium, night.port, "queue") as page:
+        await page.get_by_role("button", name="Later: run 3").click()
+        await until(lambda: night.orders)
+        assert night.orders[-1][2] == {"run": 3, "to": 2}
+        rows = page.get_by_role("list", name="Runs to be done").locator("li")
+        await rows.nth(1).drag_to(rows.nth(0))
+        await until(lambda: len(night.orders) == 2)
+        assert night.orders[-1][2] == {"run": 4, "to": 1}
+        await page.get_by_role("button", name="Remove: run 4").click()
+        await page.get_by_role("button", name="Remove it").click()
+        await until(lambda: len(night.queue) == 1)
+
+
+async def test_devices_take_orders_only_between_runs(night):
+    async with a_page(night.chromium, night.port, "devices") as page:
+        await page.get_by_text("a run owns the stand").first.wait_for()
+        assert await page.get_by_role("button", name="Open", exact=True).is_disabled()
+        night.is_idle = True
+        flap = page.locator("section", has=page.get_by_role("heading", name="flap"))
+        await flap.get_by_role("button", name="Open", exact=True).click()
+        await until(lambda: night.orders)
+        assert night.orders[-1][2] == {"name": "flap", "verb": "open", "arguments": {}}
+
+
+async def test_markers_and_drift_of_the_last_frame_are_shown(night):
+    async with a_page(night.chromium, night.port, "camera") as page:
+        night.hub.publish(frame_of(target_image(0, 0), night.clock.now_ns()))
+        await page.get_by_text("54 of 54").wait_for(timeout=120_000)  # the first of a process compiles
+        night.hub.publish(frame_of(target_image(0.3, 0), night.clock.now_ns()))
+        await page.get_by_text("worst marker").wait_for()
+        async with asyncio.timeout(60):
+            while "0.000 px" in await page.locator(".frame + .facts").inner_text():
+                await asyncio.sleep(0.1)
+        assert "px" in await page.get_by_text("edge width").locator("+ dd").inner_text()
+        label = await page.locator(".frame canvas").get_attribute("aria-label")
+        assert "54 markers found; mean drift" in label
+
+
+async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path):
+    port = free_port()
+    async with browser() as chromium:
+        async with a_night(tmp_path / "sessions", port) as first:
+            manager = a_page(chromium, port)
+            page = await manager.__aenter__()
+            await page.get_by_text("Running", exact=True).wait_for()
+            first.tell("before the restart")
+        await page.locator("#phase", has_text="No connection").wait_for()
+        await page.get_by_text("What is shown is of").wait_for()
+        async with a_night(tmp_path / "sessions", port) as second:
+            await page.locator("#phase", has_text="Running").wait_for()
+            await page.get_by_text("No connection to the stand").wait_for(state="detached")
+            second.trip()
+            await page.locator("#phase", has_text="Tripped").wait_for()
+            await manager.__aexit__(None, None, None)
+
+
+async def test_a_phone_is_wide_enough_for_every_view(night):
+    async with a_page(night.chromium, night.port, size=PHONE, scheme="dark") as page:
+        for view in VIEWS:
+            await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
+            await page.wait_for_timeout(500)
+            assert await page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"), view
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+async def test_every_view_is_accessible(night, scheme):
+    """axe finds nothing; a fault, a prompt and a pause are on the page."""
+    from axe_playwright_python.async_playwright import Axe
+
+    night.trip()
+    night.ask_operator("Roll the camera by 20 degrees")
+    async with a_page(night.chromium, night.port, scheme=scheme) as page:
+        await page.get_by_role("button", name="Look at it and clear").click()
+        for view in VIEWS:
+            await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
+            await page.wait_for_timeout(800)
+            found = await Axe().run(page)
+            assert [(each["id"], [node["html"] for node in each["nodes"]]) for each in found.response["violations"]] == [], view
