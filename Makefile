@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Tests wait half of their time, for real clocks and other processes.
 WORKERS := $(shell processors=$$(nproc); workers=$$((processors * 3 / 2)); echo $$((workers < 8 ? workers : 8)))
 RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
-PEER_PACKAGES := aravis-tools-cli aravis-tools
+PEER_PACKAGES := aravis-tools-cli aravis-tools chromium
 
 .PHONY: setup demo test nightly bench clean
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foundation.clock import Clock
-from foundation.helper import Helper
+from foundation.helper import Helper, Line
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame
@@ -55,7 +55,7 @@ class Viewing:
         self._roles: dict[str, str] = {}
         self._fresh: set[str] = set()  # roles whose next frame is a reference, by camera
         self._helper: Helper | None = None
-        self._starting = asyncio.Lock()
+        self._knows_target = False
         hub.subscribe(self._follow)
 
     def _follow(self, item: Item) -> None:
@@ -96,8 +96,7 @@ class Viewing:
 
     async def ask(self, function: Callable[..., Any], *args: object) -> Any:
         """`function(*args)` in the process at the lowest priority; OSError when that has ended."""
-        helper = await self._started()
-        return await asyncio.to_thread(helper.line(_READ).run, function, *args)
+        return await asyncio.to_thread(self._started().line(_READ).run, function, *args)
 
     async def _keep(self) -> None:
         try:
@@ -129,9 +128,9 @@ class Viewing:
 
         as_reference = role in DRIFT_ROLES and (camera in self._fresh or role == "reference" != self._role_of(camera))
         try:
-            helper = await self._started()
+            line = await self._previewer()
             shot = Shot(camera, frame.time_ns, frame.image, role, as_reference)
-            preview: Preview = await asyncio.to_thread(helper.line(_LOOK).call, "previewer", "look", shot)
+            preview: Preview = await asyncio.to_thread(line.call, "previewer", "look", shot)
         except OSError as error:
             await self._has_ended(str(error))
         except Exception as error:  # noqa: BLE001 - a frame that cannot be looked at is not shown
@@ -151,11 +150,18 @@ class Viewing:
             self.history.add(f"{camera}.drift_mean", preview.time_ns, preview.mean_px, "px")
             self.history.add(f"{camera}.drift_worst", preview.time_ns, preview.worst_px, "px")
 
-    async def _started(self) -> Helper:
-        async with self._starting:
-            if self._helper is None:
-                self._helper = await asyncio.to_thread(_start, self._target_text)
-            return self._helper
+    def _started(self) -> Helper:
+        """The process; the target is known to it from the first frame on."""
+        if self._helper is None:
+            self._helper, self._knows_target = Helper(MODULE, (_LOOK, _READ), _ENDED), False
+        return self._helper
+
+    async def _previewer(self) -> Line:
+        line = self._started().line(_LOOK)
+        if not self._knows_target:
+            await asyncio.to_thread(line.make, "previewer", previewer, self._target_text)
+            self._knows_target = True
+        return line
 
     async def _has_ended(self, why: str) -> None:
         self._warn(f"no new frames on the page for {_AGAIN_S:g} s: {why}")
@@ -172,9 +178,3 @@ class Viewing:
         event = Event(self._clock.now_ns(), "warning", "preview", text)
         with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._hub.publish, event)
-
-
-def _start(target_text: str) -> Helper:
-    helper = Helper(MODULE, (_LOOK, _READ), _ENDED)
-    helper.line(_LOOK).make("previewer", previewer, target_text)
-    return helper

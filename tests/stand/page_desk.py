@@ -319,7 +319,7 @@ async def a_night(
         async with served(desk, folder / "now", Interface(folder, port=port, rooms=(PageRoom(viewing),))):
             if with_frames:
                 desk.hub.publish(frame_of(target_image(0, 0), desk.began_ns))
-                while not viewing.previews:  # noqa: ASYNC110 - another process
+                while not viewing.previews:
                     await asyncio.sleep(0.1)
                 moved = desk.drift_px(desk.now_s())
                 desk.hub.publish(frame_of(target_image(0.7 * moved, -0.5 * moved), desk.clock.now_ns()))

@@ -7,7 +7,7 @@ import pytest
 from foundation.clock import NS_PER_S
 from stand.gate import OPERATOR
 from tests.stand.browser import DESKTOP, PHONE, a_page, browser, needs_chromium
-from tests.stand.page_desk import a_night, free_port, frame_of, target_image
+from tests.stand.page_desk import a_night, frame_of, free_port, target_image
 
 pytestmark = needs_chromium
 VIEWS = ("now", "plan", "queue", "camera", "sessions", "devices")
@@ -28,13 +28,20 @@ async def until(check, timeout_s=30.0):
             await asyncio.sleep(0.05)
 
 
+INK = """() => { const c = document.querySelector(".curve canvas");
+if (!c || !c.width) return 0;
+const points = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+return points.filter((value, n) => n % 4 === 3 && value).length }"""
+STOP_IS_ON_TOP = """() => { const b = document.getElementById("stop").getBoundingClientRect();
+const [w, h] = [b.width, b.height];
+const inside = b.top >= 0 && b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight;
+const points = [[8, 8], [w - 8, 8], [8, h - 8], [w - 8, h - 8], [w / 2, h / 2]];
+return inside && points.every(([x, y]) => document.elementFromPoint(b.left + x, b.top + y)?.id === "stop") }"""
+
+
 async def ink(page):
     """How many points of the first curves' canvas are drawn."""
-    return await page.evaluate(
-        """() => { const c = document.querySelector(".curve canvas");
-        if (!c || !c.width) return 0;
-        return c.getContext("2d").getImageData(0, 0, c.width, c.height).data.filter((v, n) => n % 4 === 3 && v).length }"""
-    )
+    return await page.evaluate(INK)
 
 
 async def picture(page):
@@ -143,12 +150,7 @@ async def test_nothing_ever_lies_over_stop(night, size):
             await page.wait_for_timeout(200)
             for down in (0, 100_000):
                 await page.mouse.wheel(0, down)
-                assert await page.evaluate(
-                    """() => { const b = document.getElementById("stop").getBoundingClientRect();
-                    const inside = b.top >= 0 && b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight;
-                    const at = [[8, 8], [b.width - 8, 8], [8, b.height - 8], [b.width - 8, b.height - 8], [b.width / 2, b.height / 2]];
-                    return inside && at.every(([x, y]) => document.elementFromPoint(b.left + x, b.top + y)?.id === "stop") }"""
-                ), view
+                assert await page.evaluate(STOP_IS_ON_TOP), view
 
 
 async def test_a_fault_appears_and_is_cleared_only_after_it_was_shown(night):
@@ -306,4 +308,6 @@ async def test_every_view_is_accessible(night, scheme):
             await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
             await page.wait_for_timeout(800)
             found = await Axe().run(page)
-            assert [(each["id"], [node["html"] for node in each["nodes"]]) for each in found.response["violations"]] == [], view
+            assert [
+                (each["id"], [node["html"] for node in each["nodes"]]) for each in found.response["violations"]
+            ] == [], view
