@@ -6,7 +6,7 @@ import asyncio
 import itertools
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Generator, Iterable, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -22,14 +22,17 @@ from foundation.progress import progress
 from foundation.usage import one_line, tell
 from recording.repair.salvage import salvage_line
 from stand.aside import aside
+from stand.commands.submitted import daemon_of, follow, submit
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.estimate import PricedStep, price
 from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
-from stand.running.order import load_order
+from stand.estimating.room import existing, small_disk
+from stand.running.order import Order, load_order
 from stand.running.resume import interruption
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.stop import Interrupted
+from stand.serving.client import Server
 from stand.session_report import NotReported, check_reportable, report_session
 
 app = typer.Typer(add_completion=False)
@@ -76,8 +79,13 @@ def run(
     seed: Annotated[int | None, typer.Option(help="The simulated laboratory's seed (with --virtual-time).")] = None,
     attended: AttendedOption = False,
     report: ReportOption = False,
+    detach: Annotated[
+        bool, typer.Option("--detach", help="Where `stand serve` has the stand: submit the run and leave.")
+    ] = False,
 ) -> None:
     """Run a recipe and record it; prints the session's folder.
+
+    Where `stand serve` has the stand, the run is submitted to it and followed; Ctrl-C stops it.
 
     Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions --report
     """
@@ -89,10 +97,15 @@ def run(
         order = replace(load_order(recipe, config), attended=attended)
         if report:
             check_reportable(order.recipe.plan())
+        if not virtual_time and (server := daemon_of(order.config)) is not None:
+            _run_there(server, order, out, detach=detach, report=report)
+            return
+        if detach:
+            raise ConfigError("--detach: no `stand serve` has this stand, and a run by itself ends with its command")
         directory = out or order.config.recording.directory
         _check_writable(directory)
         steps = price(order.recipe.plan(), order.config, load_learned(directory))
-        if lack := small_disk(shutil.disk_usage(_existing(directory)).free, steps, order.config):
+        if lack := small_disk(shutil.disk_usage(existing(directory)).free, steps, order.config):
             typer.echo(one_line(f"warning: {directory}: {lack}"), err=True)
         with _run_progress(steps) as watch:
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
@@ -134,6 +147,18 @@ def resume_run(
         _finished(session, order.config, report=report)
 
 
+def _run_there(server: Server, order: Order, out: Path | None, *, detach: bool, report: bool) -> None:
+    """By the daemon that has the stand."""
+    submitted = submit(server, order, out)
+    if detach:
+        typer.echo(f"run {submitted.id} is queued; `stand status` follows it")
+        return
+    session = follow(server, submitted)
+    typer.echo(session)
+    if report:
+        _report(session, session)
+
+
 def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
     """What follows a complete run: the next plan's durations, its folder printed, its report."""
     try:
@@ -163,23 +188,10 @@ def _unused(out: Path) -> Path:
     return out if not out.exists() else next(path for path in candidates if not path.exists())
 
 
-def _existing(directory: Path) -> Path:
-    """`directory`, or the nearest folder above it that is there."""
-    return next(path for path in (directory, *directory.absolute().parents) if path.exists() or path.is_symlink())
-
-
-def small_disk(free_bytes: int, steps: Iterable[PricedStep], config: StandConfig) -> str:
-    """What is wrong with so much room for a run that would stop in the middle of the night; "" when it will do."""
-    plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
-    if free_bytes / 1e9 >= plan_GB + least_GB:
-        return ""
-    return f"{free_bytes / 1e9:.1f} GB are free; the plan records {plan_GB:.1f} GB and waits below {least_GB:.1f} GB"
-
-
 def _check_writable(directory: Path) -> None:
     """ConfigError when no session could be made below `directory`: to be raised before anything is opened."""
     try:
-        Path(tempfile.mkdtemp(prefix=".writable-", dir=_existing(directory))).rmdir()
+        Path(tempfile.mkdtemp(prefix=".writable-", dir=existing(directory))).rmdir()
     except OSError as error:
         raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error
 

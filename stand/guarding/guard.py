@@ -80,6 +80,12 @@ class Guard:
         good_ns = [self.hub.last_good_ns(channel) for channel in self.vital]
         return all(time_ns is not None and time_ns >= self._fresh_after_ns for time_ns in good_ns)
 
+    @property
+    def is_on_time(self) -> bool:
+        """Whether it looks as often as it must."""
+        now_ns, late_ns = self.clock.now_ns(), _LATE_PERIODS * seconds_ns(self.period_s)
+        return not self._ended and self._looked_ns is not None and now_ns - self._looked_ns <= late_ns
+
     def clear(self) -> Fault | None:
         """An operator has looked: the hold, which is returned, is forgotten, and every grace time begins again.
         What is wrong still trips again, what has no grace time before anything moves. Continuing the run is the

@@ -6,6 +6,7 @@ processes at once. SessionError when the queue cannot be read or written, or a n
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from foundation.errors import SessionError, StandTripped
@@ -28,13 +29,28 @@ def queued(directory: Path) -> Queue:
     return read_queue(directory)
 
 
-def add(directory: Path, order: Order, config: str, now_ns: int) -> Entry:
-    """Queue a run behind all others; `config` is the name of its configuration, for messages."""
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Who asked for a run, and how: see queue_file.Entry."""
+
+    key: str = ""
+    request: str = ""
+    added_by: str = ""
+
+
+def add(directory: Path, order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> Entry:
+    """Queue a run behind all others; `config` is the name of its configuration, for messages. With the key of an
+    earlier run: that one. SessionError when the request of that key was another."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SessionError(f"{directory}: cannot be made ({error.strerror})") from error
     with changing(directory) as draft:
+        earlier = next((each for each in draft.queue.entries if asked.key and each.key == asked.key), None)
+        if earlier is not None:
+            if earlier.request != asked.request:
+                raise SessionError(f"run {earlier.id} was asked for with this key, and it is another one")
+            return earlier
         entry = Entry(
             id=draft.queue.next_id,
             recipe=order.recipe.name,
@@ -43,6 +59,10 @@ def add(directory: Path, order: Order, config: str, now_ns: int) -> Entry:
             recipe_text=order.recipe_text,
             target_text=order.target_text,
             added_ns=now_ns,
+            key=asked.key,
+            request=asked.request,
+            added_by=asked.added_by,
+            attended=order.attended,
         )
         draft.set(next_id=entry.id + 1, entries=(*draft.queue.entries, entry))
     return entry
@@ -117,6 +137,36 @@ def finish(directory: Path, number: int, state: State, now_ns: int, reason: str 
         draft.put(draft.entry(number).model_copy(update=changes))
         if halt:
             draft.set(halted=f"run {number}: {reason}")
+
+
+def halt(directory: Path, reason: str) -> None:
+    """Nothing is begun before an operator says so."""
+    with changing(directory) as draft:
+        draft.set(halted=draft.queue.halted or reason)
+
+
+def put_first(directory: Path, order: Order, config: str, session: str, now_ns: int) -> Entry:
+    """Resume the run of that session next: an entry that has it is interrupted again, else there is a new one. What
+    halted the queue is cleared: an operator has asked for this."""
+    with changing(directory) as draft:
+        found = next((each for each in reversed(draft.queue.entries) if each.session == session), None)
+        number = draft.queue.next_id if found is None else found.id
+        entry = Entry(
+            id=number,
+            recipe=order.recipe.name,
+            config=config,
+            config_text=order.config_text,
+            recipe_text=order.recipe_text,
+            target_text=order.target_text,
+            added_ns=now_ns if found is None else found.added_ns,
+            state=State.INTERRUPTED,
+            began_ns=now_ns if found is None else found.began_ns,
+            session=session,
+        )
+        rest = [each for each in draft.queue.entries if each.id != number]
+        ended, waiting = [e for e in rest if not e.is_open], [e for e in rest if e.is_open]
+        draft.set(next_id=max(draft.queue.next_id, number + 1), entries=(*ended, entry, *waiting), halted="")
+    return entry
 
 
 def clear(directory: Path) -> None:

@@ -49,7 +49,9 @@ class Entry(Document):
 
     config: the file its text is from, for messages. Instants are ns since the epoch on the host's clock. session: the
     name of its folder in the recording directory, "" before it has one. reason: why it failed or was interrupted.
-    fruitless_starts: how often in a row it was begun or resumed without finishing one more step.
+    fruitless_starts: how often in a row it was begun or resumed without finishing one more step. key, request: the
+    word of who asked for it, so that asking again adds nothing, and what was asked. added_by: who that was. attended:
+    somebody is there to do what the plan prompts for.
     """
 
     id: int = Field(ge=1)
@@ -65,6 +67,10 @@ class Entry(Document):
     session: Annotated[str, AfterValidator(_folder_name)] = ""
     reason: str = ""
     fruitless_starts: int = Field(default=0, ge=0)
+    key: str = ""
+    request: str = ""
+    added_by: str = ""
+    attended: bool = False
 
     @property
     def is_open(self) -> bool:

@@ -38,11 +38,11 @@ async def run_entry(
     not confirmed safe; else raises as a run does.
     """
     session = directory / entry.session if entry.session else None
-    if session is not None and await asyncio.to_thread(_is_complete, session):
+    if session is not None and await asyncio.to_thread(is_complete, session):
         return session  # killed between its end and the note of it
     order = order_of(entry)
-    before = None if session is None else await asyncio.to_thread(_interruption, session, order.config)
-    watch = _Watch(frozenset() if before is None else before.kept.done, notes.step_done)
+    before = None if session is None else await asyncio.to_thread(interruption_of, session, order.config)
+    watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
     try:
         with _followed(directory, order, before, tell) as follow:
 
@@ -63,7 +63,7 @@ async def run_entry(
         raise
 
 
-class _Watch:
+class Watch:
     """Reports steps that were not done before, and keeps which actuators have not confirmed their safe state."""
 
     def __init__(self, done: Collection[str], step_done: Callable[[], None]) -> None:
@@ -72,6 +72,7 @@ class _Watch:
         self._step_done = step_done
 
     def __call__(self, item: Item) -> None:
+        """Follow one item."""
         if isinstance(item, Event) and item.kind == "not_confirmed_safe":
             self.unsafe.append(item.text)
         if isinstance(item, StepMark) and item.state is StepState.DONE and item.step_id not in self._done:
@@ -112,14 +113,15 @@ def _followed(
             yield Follow(steps, later(report), later(tell), before.kept.done, before.kept.earned_s)
 
 
-def _interruption(session: Path, own: StandConfig) -> Interruption:
+def interruption_of(session: Path, own: StandConfig, *, clear: bool = False) -> Interruption:
+    """What is left of the run of a session, for this stand; Halt when it cannot be resumed."""
     try:
-        return interruption(session, own)
+        return interruption(session, own, clear=clear)
     except (SessionError, ConfigError) as error:
         raise Halt(str(error)) from error
 
 
-def _is_complete(session: Path) -> bool:
+def is_complete(session: Path) -> bool:
     """Whether the run recorded in `session` came to its end; Halt when its journal does not say."""
     try:
         journal, entries = Journal.open(session)

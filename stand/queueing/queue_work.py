@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from foundation.clock import Now
+from foundation.clock import Now, WallClock
 from foundation.errors import DeviceError, InUse, SessionError, StandError, StandTripped
+from foundation.lane import Lane
 from stand.queueing.queue import finish, note_session, note_step, queued, take
 from stand.queueing.queue_file import Entry, State, working
 from stand.running.stop import Interrupted
@@ -21,11 +22,11 @@ MOST_FRUITLESS_STARTS = 3
 class Notes:
     """What a run reports while it is under way.
 
-    begun: its session's folder, as soon as a run that is killed could be resumed in it. step_done: it has finished a
-    step that it had not finished before.
+    begun: its session's folder, as soon as a run that is killed could be resumed in it; noted when it returns.
+    step_done: it has finished a step that it had not finished before.
     """
 
-    begun: Callable[[Path], None]
+    begun: Callable[[Path], Awaitable[None]]
     step_done: Callable[[], None]
 
 
@@ -42,13 +43,27 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
     interrupted, ends the work, and is resumed by the next one. A run whose daemon was killed MOST_FRUITLESS_STARTS
     times in a row before one more step was done is marked as failed, or it would keep all others from their turn.
     """
-    with working(directory):
-        while (entry := take(directory, clock.now_ns())) is not None:
-            run = _Run(directory, entry, clock, tell)
-            if entry.fruitless_starts >= MOST_FRUITLESS_STARTS:
-                run.set_aside()
-            else:
-                await run.perform(run_one)
+    lane = queue_lane()
+    try:
+        with working(directory):
+            await drain(directory, run_one, clock, tell, lane)
+    finally:
+        lane.close()
+
+
+def queue_lane() -> Lane:
+    """The thread that reads and writes the queue while runs are guarded: no loop waits for its disk."""
+    return Lane("queue", WallClock(), patient=False)
+
+
+async def drain(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], lane: Lane) -> None:
+    """As `work`, for whoever is `working` on the queue already."""
+    while (entry := await lane.call(take, directory, clock.now_ns())) is not None:
+        run = _Run(directory, entry, clock, tell, lane)
+        if entry.fruitless_starts >= MOST_FRUITLESS_STARTS:
+            await run.set_aside()
+        else:
+            await run.perform(run_one)
 
 
 class Halt(StandError):
@@ -56,19 +71,21 @@ class Halt(StandError):
 
 
 class _Run:
-    def __init__(self, directory: Path, entry: Entry, clock: Now, tell: Callable[[str], None]) -> None:
+    def __init__(self, directory: Path, entry: Entry, clock: Now, tell: Callable[[str], None], lane: Lane) -> None:
         self._directory = directory
         self._entry = entry
         self._clock = clock
         self._tell = tell
         self._name = f"run {entry.id} ({entry.recipe})"
         self._has_stepped = False
+        self._lane = lane
+        self._notes: list[asyncio.Task[None]] = []
 
-    def set_aside(self) -> None:
+    async def set_aside(self) -> None:
         """Fail without another try."""
         left = f"; `stand resume {self._directory / self._entry.session}` tries again" if self._entry.session else ""
         times = f"{self._entry.fruitless_starts} times in a row"
-        self._end(State.FAILED, f"its daemon was killed {times} before one more step was done{left}")
+        await self._end(State.FAILED, f"its daemon was killed {times} before one more step was done{left}")
 
     async def perform(self, run_one: RunOne) -> None:
         """Run or resume it; raises what ends the work."""
@@ -77,45 +94,49 @@ class _Run:
         try:
             session = await run_one(entry, Notes(self._note_session, self._note_step))
         except (Interrupted, InUse, asyncio.CancelledError) as error:
-            self._end(State.INTERRUPTED, str(error) or "stopped by the operator")
+            await self._end(State.INTERRUPTED, str(error) or "stopped by the operator")
             raise
         except (StandTripped, Halt) as error:
-            self._end(State.FAILED, str(error), halt=True)
+            await self._end(State.FAILED, str(error), halt=True)
             raise
         except StandError as error:
-            halt = isinstance(error, DeviceError) and not self._has_session()
-            self._end(State.FAILED, str(error), halt=halt)
+            halt = isinstance(error, DeviceError) and not await self._has_session()
+            await self._end(State.FAILED, str(error), halt=halt)
             if halt:
                 raise
         except Exception as error:
-            self._end(State.FAILED, f"{type(error).__name__}: {error}", halt=True)
+            await self._end(State.FAILED, f"{type(error).__name__}: {error}", halt=True)
             raise
         else:
-            self._note_session(session)
-            self._end(State.DONE)
+            await self._note_session(session)
+            await self._end(State.DONE)
 
-    def _has_session(self) -> bool:
-        return any(entry.id == self._entry.id and entry.session for entry in queued(self._directory).entries)
+    async def _has_session(self) -> bool:
+        await self._noted()
+        found = await self._lane.call(queued, self._directory)
+        return any(entry.id == self._entry.id and entry.session for entry in found.entries)
 
-    def _note_session(self, session: Path) -> None:
-        with self._noting():
-            note_session(self._directory, self._entry.id, session)
+    async def _note_session(self, session: Path) -> None:
+        await self._written(note_session, session)
 
     def _note_step(self) -> None:
-        if self._has_stepped:
-            return
-        self._has_stepped = True
-        with self._noting():
-            note_step(self._directory, self._entry.id)
+        """Written beside the run."""
+        if not self._has_stepped:
+            self._has_stepped = True
+            self._notes.append(asyncio.create_task(self._written(note_step)))
 
-    @contextmanager
-    def _noting(self) -> Generator[None]:
+    async def _written(self, function: Callable[..., None], *arguments: object) -> None:
         """A queue that cannot be written is no reason to end a run that goes well."""
         try:
-            yield
+            await self._lane.call(function, self._directory, self._entry.id, *arguments)
         except SessionError as error:
             self._tell(f"{self._name} cannot be noted: {error}")
 
-    def _end(self, state: State, reason: str = "", *, halt: bool = False) -> None:
-        finish(self._directory, self._entry.id, state, self._clock.now_ns(), reason, halt=halt)
+    async def _noted(self) -> None:
+        await asyncio.gather(*self._notes)
+
+    async def _end(self, state: State, reason: str = "", *, halt: bool = False) -> None:
+        await self._noted()
+        now_ns = self._clock.now_ns()
+        await self._lane.call(partial(finish, self._directory, self._entry.id, state, now_ns, reason, halt=halt))
         self._tell(f"{self._name} {state}" + (f": {reason}" if reason else ""))

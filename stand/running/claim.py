@@ -154,11 +154,28 @@ def _holder(file_name: str) -> str:
     return "a run of another user or login"
 
 
-def _told(path: Path) -> str:
+def daemon_pid(config: StandConfig) -> int | None:
+    """The process of the daemon that has any address of this stand; None when none has. May take a while, as
+    `addresses`."""
+    for address in addresses(config):
+        for folder in runtime_folders():
+            with suppress(OSError, ValueError, LookupError, TypeError):
+                said = _said(folder / _file_name(address.place))
+                if not said["session"]:
+                    return int(str(said["pid"]))
+    return None
+
+
+def _said(path: Path) -> dict[str, object]:
     """What the locked file says; LookupError when no process has it locked, else what reading raises."""
     with path.open("rb") as file:
         if try_lock(file.fileno(), shared=True):
             raise LookupError(path)
-        said = cast("dict[str, object]", json.loads(file.read()))
+        return cast("dict[str, object]", json.loads(file.read()))
+
+
+def _told(path: Path) -> str:
+    """Who has it, in words; raises as `_said`."""
+    said = _said(path)
     who = f"session {said['session']}" if said["session"] else "the daemon of `stand serve`"
     return f"{who} (pid {said['pid']})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -60,14 +60,15 @@ class Job:
     out: Path
     seed: int | None
     watch: Callable[[Hub], None]
-    begun: Callable[[Path], None]
+    begun: Callable[[Path], Awaitable[None]]
     before: Interruption | None = None
 
 
 class Guest:
     """A run on an open stand: it reads, begins its journal, performs its plan and leaves the stand safe.
 
-    board, executor: what is published of the run, and what changes its plan; None before its journal is begun.
+    board, executor: what is published of the run, and what changes its plan; desk: what may be asked of it. None before
+    its journal is begun.
     """
 
     def __init__(self, job: Job, house: House, recorder: Recorder, stop: Stop) -> None:
@@ -79,6 +80,7 @@ class Guest:
         self.log = Logbook(assembly.hub, assembly.clock, fold(plan, ()) if before is None else before.state)
         self.board: StatusBoard | None = None
         self.executor: Executor | None = None
+        self.desk: RunDesk | None = None
         self._house = house
         self._assembly = assembly
         assembly.stand.attended = job.order.attended
@@ -112,7 +114,9 @@ class Guest:
                 executor = await watched(self._begun(settling, leaving), (*house.tasks, recording))
                 self.board = await self._board(leaving)
                 self.executor = executor
-                watchers.append(asyncio.create_task(self._answer(self.board, executor)))
+                self.desk = self._desk(self.board, executor, leaving)
+                if house.is_for_one:
+                    watchers.append(asyncio.create_task(self._answer(self.desk)))
                 house.start()
                 if isinstance(assembly.clock, VirtualClock):
                     limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
@@ -151,7 +155,8 @@ class Guest:
         journal = Journal.create(recorder.directory) if before is None else before.journal
         await log.begin(journal, *self._first_entries(), disk=recorder.disk)
         recorder.beside(journal)
-        self.job.begun(recorder.directory)
+        with assembly.clock.hold():
+            await self.job.begun(recorder.directory)
         gate, hub, clock = assembly.stand.gate, assembly.hub, assembly.clock
         gate.subscribe(log.held)
         if house.latched is not None:  # by the first look, when there was no journal yet
@@ -189,30 +194,25 @@ class Guest:
             leaving.callback(assembly.hub.unsubscribe, slip)
         return board
 
-    async def _answer(self, board: StatusBoard, executor: Executor) -> None:
-        """Answer clients until cancelled; a run can do without any."""
-        assembly, directory = self._assembly, self.recorder.directory
+    def _desk(self, board: StatusBoard, executor: Executor, leaving: AsyncExitStack) -> RunDesk:
+        """What may be asked of the run."""
+        assembly, directory, house = self._assembly, self.recorder.directory, self._house
         desk = RunDesk(
-            assembly,
-            directory,
-            self.stop,
-            self.log,
-            executor,
-            board.status,
-            lambda: self._house.latched,
-            board.priced_s,
+            assembly, directory, self.stop, self.log, executor, board.status, lambda: house.latched, board.priced_s
         )
         assembly.hub.subscribe(desk)
+        leaving.callback(assembly.hub.unsubscribe, desk)
+        return desk
+
+    async def _answer(self, desk: RunDesk) -> None:
+        """Answer clients until cancelled; a run can do without any."""
+        assembly, directory, name = self._assembly, self.recorder.directory, self.job.order.config.name
         try:
-            async with serve(
-                desk, assembly.hub, assembly.clock, directory, self.job.order.config.name, Interface(directory.parent)
-            ):
+            async with serve(desk, assembly.hub, assembly.clock, directory, name, Interface(directory.parent)):
                 await asyncio.Event().wait()
         except StandError as error:
             self.log.tell("warning", "no_control", f"the run cannot be queried or paused: {error}")
             await asyncio.Event().wait()
-        finally:
-            assembly.hub.unsubscribe(desk)
 
     def _begin_data(self) -> dict[str, object]:
         """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For

@@ -71,6 +71,7 @@ class House:
         self.background: list[asyncio.Task[None]] = []
         self.recorder: Recorder | None = None
         self.guest: Guest | None = None
+        self.fault_ns = 0  # when the last fault was found
         self._announced = Announcements()
         self._guard: Guard | None = None
         self._pollers: tuple[Poller, ...] = ()
@@ -167,6 +168,10 @@ class House:
         if self._tasks:
             await self.rest()
 
+    def unrecorded(self) -> None:
+        """The recording is complete, and nothing is heated before there is another one."""
+        self.recorder = None
+
     def left(self) -> None:
         """The guest has gone, and what it alone was held for counts no more. A fault stays until it is cleared."""
         self.guest = None
@@ -183,12 +188,19 @@ class House:
         stand.safety.renew()
         stand.attended = False
 
+    def latch(self, fault: Fault, since_ns: int) -> None:
+        """A fault that a daemon before this one has left, and that nobody has cleared."""
+        self.guard.held, self.fault_ns = fault, since_ns
+        self.assembly.stand.gate.hold(INTERLOCK)
+
     def _trip(self, fault: Fault) -> None:
+        self.fault_ns = self.assembly.clock.now_ns()
         if self.guest is None:
             return self._hold(fault)
         return self.guest.trip(fault)
 
     def _hold(self, fault: Fault) -> None:
+        self.fault_ns = self.assembly.clock.now_ns()
         self.assembly.stand.gate.hold(INTERLOCK)
         if self.guest is not None:
             self.guest.hold(fault)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +36,7 @@ from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 __all__ = ["Interrupted", "resume", "run_in", "run_real", "run_virtual"]
 
 
-def _nobody(_: Path) -> None:
+async def _nobody(_: Path) -> None:
     """Gets the session and does nothing."""
 
 
@@ -45,7 +45,7 @@ async def run_virtual(
     out: Path,
     seed: int | None,
     watch: Callable[[Hub], None],
-    begun: Callable[[Path], None] = _nobody,
+    begun: Callable[[Path], Awaitable[None]] = _nobody,
 ) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
@@ -61,7 +61,7 @@ async def run_virtual(
 
 
 async def run_real(
-    order: Order, out: Path, watch: Callable[[Hub], None], begun: Callable[[Path], None] = _nobody
+    order: Order, out: Path, watch: Callable[[Hub], None], begun: Callable[[Path], Awaitable[None]] = _nobody
 ) -> Path:
     """Run on the host's clock, against the devices at the configured addresses; else as run_virtual."""
     async with Stop() as stop:
@@ -96,6 +96,7 @@ async def run_in(house: House, job: Job, stop: Stop) -> Path:
         async with _telling_failure(house.assembly, directory, stop), AsyncExitStack() as stack:
             disk = Disk()
             stack.callback(disk.close)
+            stack.callback(house.unrecorded)
             stack.push_async_callback(stop.settled)
             stop.watch(house.assembly.stand)
             recorder = await _stay(job, directory, house, early, stop, disk)

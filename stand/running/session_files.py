@@ -6,12 +6,14 @@ import importlib.metadata
 import itertools
 import os
 import platform
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
 from foundation.clock import NS_PER_S, Clock, VirtualClock
 from foundation.documents import parse_document
+from foundation.hub import Hub
 from markers.target import Target
 from recording.format.roi import RoiEncoder
 from recording.writing.disk import Disk
@@ -55,20 +57,33 @@ def recorder_of(
     order: Order, directory: Path, info: SessionInfo, assembly: Assembly, disk: Disk | None = None
 ) -> Recorder:
     """The recorder of this run; `disk` is the process that touches the disk for it."""
-    config, clock = order.config, assembly.clock
+    encode = _partial_frames(order)
+    attachments, hub, clock = order.attachments(), assembly.hub, assembly.clock
+    recorder = recorder_in(directory, info, attachments, order.config, hub, clock, disk, encode)
+    if encode is not None:
+        encode.tell = partial(recorder.warn, "search_failed")
+    return recorder
+
+
+def recorder_in(
+    directory: Path,
+    info: SessionInfo,
+    attachments: Mapping[str, str],
+    config: StandConfig,
+    hub: Hub,
+    clock: Clock,
+    disk: Disk | None = None,
+    encode: RoiEncoder | None = None,
+) -> Recorder:
+    """A recorder with the stand's settings. `roi` frames need `encode`; without it they are whole."""
+    encoding = config.recording.frame_encoding
     settings = RecordingSettings(
-        config.recording.frame_encoding,
+        "png" if encoding == "roi" and encode is None else encoding,
         _commit_s(config.recording, clock),
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
-    encode = _partial_frames(order)
-    recorder = Recorder(
-        directory, info, order.attachments(), _kinds(config), assembly.hub, clock, settings, encode, disk
-    )
-    if encode is not None:
-        encode.tell = partial(recorder.warn, "search_failed")
-    return recorder
+    return Recorder(directory, info, attachments, _kinds(config), hub, clock, settings, encode, disk)
 
 
 def _commit_s(recording: RecordingConfig, clock: Clock) -> float:

@@ -35,7 +35,7 @@ class Runs:
         self.seen.append((entry.id, entry.session))
         session = self.directory / f"session-{entry.id}"
         if self.session_first:
-            notes.begun(session)
+            await notes.begun(session)
         await asyncio.sleep(0)
         end = self.ends.pop(0)
         if end is not None:
@@ -134,7 +134,7 @@ async def test_a_queue_that_cannot_be_noted_in_does_not_end_a_run(tmp_path: Path
     async def run(entry: Entry, notes: Notes) -> Path:
         good = (tmp_path / "queue.json").read_bytes()
         (tmp_path / "queue.json").write_bytes(b"")
-        notes.begun(tmp_path / "night")
+        await notes.begun(tmp_path / "night")
         (tmp_path / "queue.json").write_bytes(good)
         return tmp_path / "night"
 
@@ -156,9 +156,11 @@ from foundation.clock import WallClock
 from stand.queueing.queue_work import work
 
 async def run(entry, notes):
-    notes.begun(Path(sys.argv[1]) / "night")
+    await notes.begun(Path(sys.argv[1]) / "night")
     for _ in range(int(sys.argv[2])):
         notes.step_done()
+    await asyncio.sleep(0)
+    await notes.begun(Path(sys.argv[1]) / "night")  # written after the steps, and on the disk now
     os.kill(os.getpid(), signal.SIGKILL)
 
 asyncio.run(work(Path(sys.argv[1]), run, WallClock(), print))

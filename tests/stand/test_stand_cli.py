@@ -10,9 +10,9 @@ import yaml
 from typer.testing import CliRunner
 
 from stand.commands.commands import app
-from stand.commands.run_cli import small_disk
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
+from stand.estimating.room import small_disk
 from stand.running.order import load_order
 
 runner = CliRunner()

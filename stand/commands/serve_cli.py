@@ -1,0 +1,71 @@
+"""`stand serve`: the daemon that owns a stand for days."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from foundation.clock import WallClock
+from foundation.documents import read_document
+from foundation.exit_codes import one_line_errors
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from foundation.usage import one_line
+from stand.aside import aside
+from stand.config.stand_config import load_config, packaged
+from stand.daemon.desk import DaemonDesk
+from stand.daemon.serve import serve as serve_stand
+from stand.serving.api.server import Interface
+from stand.serving.api.server import serve as serve_clients
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def serve(
+    config: Annotated[str, typer.Argument(help="A configuration file, or the name of an installed one.")] = "simulated",
+    out: Annotated[Path | None, typer.Option(help="Where the sessions go; else recording.directory.")] = None,
+    port: Annotated[int | None, typer.Option(help="Listen by TCP, too; without it the Unix socket only.")] = None,
+    host: Annotated[str, typer.Option(help="The address to listen at, with --port.")] = "127.0.0.1",
+) -> None:
+    """Own the stand until it is told to end: status, devices by hand, and a queue whose runs are its guests.
+
+    SIGTERM or Ctrl-C makes the stand safe and ends it; the run under way may be resumed.
+
+    Example: stand serve laboratory.yaml --out /data/sessions
+    """
+    with one_line_errors():
+        path = packaged("", config)
+        stand = load_config(path)
+        texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
+        directory = (out or stand.recording.directory).absolute()
+        interface = Interface(directory, host, port)
+        interface.check()
+
+        @asynccontextmanager
+        async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+            async with serve_clients(desk, hub, clock, directory, stand.name, interface):
+                typer.echo(f"{stand.name} is open; sessions go to {directory}", err=True)
+                with aside() as later:
+                    say = later(_say)
+
+                    def follow(item: Item) -> None:
+                        if isinstance(item, Event) and (item.level != "info" or item.kind in ("queue", "command")):
+                            say(item.text)
+
+                    hub.subscribe(follow)
+                    try:
+                        yield
+                    finally:
+                        hub.unsubscribe(follow)
+
+        asyncio.run(serve_stand(stand, config, texts, directory, front))
+
+
+def _say(line: str) -> None:
+    typer.echo(one_line(line), err=True)

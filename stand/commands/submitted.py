@@ -1,0 +1,118 @@
+"""`stand run` where a daemon has the stand: the run is submitted to it and followed, and Ctrl-C stops it."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import cast
+
+import typer
+from pydantic import ValidationError
+
+from foundation.clock import NS_PER_S
+from foundation.errors import ConfigError, SessionError, StandError
+from foundation.progress import Report, progress
+from foundation.usage import one_line
+from stand.config.stand_config import StandConfig
+from stand.running.claim import daemon_pid
+from stand.running.order import Order
+from stand.running.stop import Interrupted
+from stand.serving.client import Server
+from stand.serving.desk import QueuedRun, StandState
+from stand.serving.presence import living
+
+_LOOK_S = 0.5
+_LOST_LIMIT_S = 60.0  # a daemon that does not answer for so long is not followed any more
+_EVENTS = 500
+_LEVELS = ("warning", "error")
+
+
+def daemon_of(config: StandConfig) -> Server | None:
+    """The daemon that has this stand; None when there is none, or it cannot be asked."""
+    pid = daemon_pid(config)
+    found = next((each for each in living() if each.entry.pid == pid), None)
+    return None if found is None else Server(found.entry.session, found.socket)
+
+
+def submit(server: Server, order: Order, out: Path | None) -> QueuedRun:
+    """Checked and queued there; SessionError when the stand refuses it."""
+    if out is not None and out.absolute() != Path(server.name):
+        raise ConfigError(f"--out {out}: `stand serve` has this stand, and records to {server.name}")
+    body = {"recipe_text": order.recipe_text, "attended": order.attended, "key": uuid.uuid4().hex}
+    try:
+        return QueuedRun.model_validate(server.request("POST", "/api/v1/queue", body, 30.0))
+    except ValidationError as error:
+        raise SessionError(f"{server.name}: its daemon sent an unknown reply; is its version different?") from error
+
+
+def follow(server: Server, run: QueuedRun) -> Path:
+    """Show it until it has ended; its session's folder. Interrupted when it was stopped by Ctrl-C, which it then ends;
+    StandError when it failed."""
+    follower = _Follower(server, run)
+    with progress("run", max(run.expected_s or 0.0, 1e-9)) as report:
+        try:
+            ended = follower.until_ended(report)
+        except KeyboardInterrupt:
+            follower.stop()
+            ended = follower.until_ended(report)
+            raise Interrupted(ended.reason or "stopped by the operator") from None
+    if ended.state != "done":
+        raise StandError(f"run {ended.id} {ended.state}: {ended.reason}")
+    return Path(server.name) / ended.session
+
+
+class _Follower:
+    def __init__(self, server: Server, run: QueuedRun) -> None:
+        self._server = server
+        self._run = run
+        self._seq = server.state().seq
+
+    def until_ended(self, report: Report) -> QueuedRun:
+        """A daemon that is busy, or restarts, may not answer for a while."""
+        silent_s = 0.0
+        while True:
+            try:
+                state = self._server.state()
+                self._tell_events()
+            except SessionError:
+                silent_s += _LOOK_S
+                if silent_s > _LOST_LIMIT_S:
+                    raise
+            else:
+                silent_s = 0.0
+                run = next((each for each in state.queue if each.id == self._run.id), None)
+                if run is None:
+                    raise SessionError(f"run {self._run.id} was taken out of the queue")
+                if run.state not in ("waiting", "running"):
+                    return run
+                self._tell(state, run, report)
+            threading.Event().wait(_LOOK_S)
+
+    def stop(self) -> None:
+        """End it when it is running, else take it out of the queue."""
+        state = self._server.state()
+        waits = any(run.id == self._run.id and run.state == "waiting" for run in state.queue)
+        if waits:
+            self._server.request("DELETE", f"/api/v1/queue/{self._run.id}")
+            raise Interrupted(f"run {self._run.id} was taken out of the queue; nothing was started")
+        self._server.order("stop")
+
+    def _tell(self, state: StandState, run: QueuedRun, report: Report) -> None:
+        status = state.run
+        if run.state == "waiting" or status is None or status.end_ns is None:
+            ahead = sum(each.state in ("waiting", "running", "interrupted") for each in state.queue) - 1
+            report(0.0, f"run {run.id} waits; {state.queue_halted or f'{ahead} others are before it'}")
+            return
+        left_s, whole_s = (status.end_ns - status.now_ns) / NS_PER_S, run.expected_s or 0.0
+        held = f" (held: {', '.join(status.reasons)})" if status.reasons else ""
+        report(max(0.0, whole_s - left_s), f"{status.step}/{status.steps} {status.doing}{held}")
+
+    def _tell_events(self) -> None:
+        found = self._server.request("GET", f"/api/v1/events?from={self._seq}&limit={_EVENTS}")
+        answer = cast("Mapping[str, object]", found)
+        self._seq = max(self._seq, cast("int", answer.get("seq", 0)))
+        for event in cast("list[Mapping[str, object]]", answer.get("events", [])):
+            if event.get("level") in _LEVELS:
+                typer.echo(one_line(f"{event.get('level')}: {event.get('text')}"), err=True)

@@ -1,0 +1,150 @@
+"""What an operator may tell the devices between runs, and how: through the same interlock as the steps of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+
+from pydantic import JsonValue
+
+from experiments.steps import MoveTo, SetTemperature, Step, number_steps
+from foundation.errors import ConfigError
+from stand.assembly import Assembly
+from stand.estimating.estimate import price
+from stand.running.run_desk import device_kinds
+from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb, Missing
+
+Work = Coroutine[None, None, object]
+Arguments = Mapping[str, JsonValue]
+
+_LONGEST_EXPOSURE_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Verb:
+    """What is published of it, and what it does with a device of that name."""
+
+    told: DeviceVerb
+    work: Callable[[str, Arguments], Work]
+
+
+class ByHand:
+    """The verbs of each device. heat: raises Conflict when heat may not be permitted now."""
+
+    def __init__(self, assembly: Assembly, heat: Callable[[], None]) -> None:
+        self._assembly = assembly
+        self._stand = assembly.stand
+        self._heat = heat
+        self._kinds = device_kinds(assembly)
+
+    def devices(self, refused: str) -> tuple[DeviceState, ...]:
+        """What there is; refused: why nothing is taken now."""
+        readings = self._assembly.hub.readings
+        return tuple(
+            DeviceState(
+                name=name,
+                kind=kind,
+                channels=tuple(channel for channel in readings if channel.startswith(f"{name}.")),
+                verbs=tuple(verb.told for verb in self._verbs(name).values()),
+                refused=refused,
+            )
+            for name, kind in self._kinds.items()
+        )
+
+    def work(self, name: str, verb: str, arguments: Arguments) -> Work:
+        """What is to be done; Missing when there is no such device or verb, ConfigError for what it is given, Conflict
+        when the stand cannot do it now."""
+        if name not in self._kinds:
+            raise Missing(f"this stand has no device of that name; there are {', '.join(self._kinds)}")
+        verbs = self._verbs(name)
+        if verb not in verbs:
+            raise Missing(f"{name} does not know that; it takes {', '.join(verbs) or 'no orders'}")
+        known = {argument.name for argument in verbs[verb].told.arguments}
+        if unknown := sorted(set(arguments) - known):
+            raise ConfigError(f"{name} {verb} has no {', '.join(unknown)}; it takes {', '.join(known) or 'nothing'}")
+        return verbs[verb].work(name, arguments)
+
+    def _verbs(self, name: str) -> dict[str, _Verb]:
+        kind = self._kinds[name]
+        table = {
+            "regulator": self._of_regulator,
+            "flap": self._of_flap,
+            "axis": lambda: self._of_axis(name),
+            "camera": self._of_camera,
+        }
+        verbs = table[kind]() if kind in table else ()
+        return {verb.told.verb: verb for verb in verbs}
+
+    def _of_regulator(self) -> tuple[_Verb, ...]:
+        low, high = self._assembly.config.limits.chamber_degC
+        setpoint = Argument(name="setpoint_degC", unit="degC", minimum=low, maximum=high)
+        return (
+            _Verb(DeviceVerb(verb="set", text="heat or cool to a set-point", arguments=(setpoint,)), self._set),
+            _Verb(DeviceVerb(verb="stop", text="stop heating and cooling"), _simply(self._stand.chamber.stop)),
+        )
+
+    def _of_flap(self) -> tuple[_Verb, ...]:
+        imaging = self._stand.imaging
+        return (
+            _Verb(DeviceVerb(verb="open", text="open the flap"), _simply(imaging.open_flap)),
+            _Verb(DeviceVerb(verb="close", text="close the flap"), _simply(imaging.close_flap)),
+        )
+
+    def _of_axis(self, name: str) -> tuple[_Verb, ...]:
+        position = Argument(name="position", unit=self._stand.devices.axes[name].profile.unit)
+        return (
+            _Verb(DeviceVerb(verb="move", text="move to a position", arguments=(position,)), self._move),
+            _Verb(DeviceVerb(verb="home", text="find the home switch"), self._home),
+        )
+
+    def _of_camera(self) -> tuple[_Verb, ...]:
+        supply = self._stand.imaging.supply
+        exposure = Argument(name="exposure_s", unit="s", minimum=0.0, maximum=_LONGEST_EXPOSURE_S)
+        return (
+            _Verb(DeviceVerb(verb="on", text="switch the supply of all cameras on"), _simply(supply.switch_on)),
+            _Verb(DeviceVerb(verb="off", text="switch the supply of all cameras off"), _simply(supply.switch_off)),
+            _Verb(DeviceVerb(verb="frame", text="take one frame", arguments=(exposure,)), self._frame),
+        )
+
+    def _set(self, _: str, arguments: Arguments) -> Work:
+        setpoint_degC = _number(arguments, "setpoint_degC")
+        self._check(SetTemperature(setpoint_degC))
+        self._heat()
+        chamber = self._stand.chamber
+        return chamber.set_temperature(setpoint_degC) if chamber.permits.granted else chamber.start(setpoint_degC)
+
+    def _move(self, axis: str, arguments: Arguments) -> Work:
+        position = _number(arguments, "position")
+        self._check(MoveTo(axis, position))
+        return self._stand.table.move_to(axis, position)
+
+    def _home(self, axis: str, _: Arguments) -> Work:
+        return self._stand.table.check_home(axis)
+
+    def _frame(self, name: str, arguments: Arguments) -> Work:
+        exposure_s = _number(arguments, "exposure_s", self._assembly.config.cameras[name].exposure_s)
+        if not 0 < exposure_s <= _LONGEST_EXPOSURE_S:
+            raise ConfigError(f"exposure_s: above 0 and at most {_LONGEST_EXPOSURE_S:g} s, not {exposure_s:g}")
+        if not self._stand.imaging.supply.is_on:
+            raise Conflict("the camera is off; switch it on first")
+        return self._stand.imaging.take_frame(exposure_s, "")
+
+    def _check(self, step: Step) -> None:
+        """ConfigError outside the stand's limits."""
+        price(number_steps([step]), self._assembly.config)
+
+
+def _simply(work: Callable[[], Work]) -> Callable[[str, Arguments], Work]:
+    """Of a verb that needs no arguments."""
+
+    def made(_name: str, _arguments: Arguments) -> Work:
+        return work()
+
+    return made
+
+
+def _number(arguments: Arguments, name: str, default: float | None = None) -> float:
+    value = arguments.get(name, default)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise ConfigError(f"{name}: a number is needed")
+    return float(value)

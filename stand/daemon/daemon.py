@@ -1,0 +1,347 @@
+"""The daemon: it owns a stand for days. One guard from its first look to its last; runs of the queue are its guests.
+
+locks -> open, harmless -> the house's record -> polled and guarded -> clients -> the queue, one run after another
+end: the run stopped, the stand safe and tried until it confirms, the record completed, everything closed
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, suppress
+from pathlib import Path
+from typing import cast
+
+from pydantic import JsonValue
+
+from drivers.devices.relays import CAMERA_POWER
+from foundation.clock import NS_PER_S, WallClock, seconds_ns
+from foundation.errors import DeviceError, SessionError, StandError, StandTripped
+from foundation.hub import Hub
+from foundation.items import Event, Item
+from foundation.tasks import cancelled, failure_text, watched
+from recording.writing.recorder import FINISH_WITHIN_S
+from stand.daemon import systemd
+from stand.daemon.by_hand import ByHand
+from stand.daemon.counters import Counters
+from stand.daemon.desk import DaemonDesk
+from stand.daemon.house_record import HouseRecord
+from stand.daemon.kept import Kept, KeptFile, Latch
+from stand.daemon.orders import Orders, Stopped
+from stand.fault import Fault
+from stand.queueing.queue_file import Entry, working
+from stand.queueing.queue_work import Notes, drain
+from stand.running.guest import Guest
+from stand.running.house import House
+from stand.running.stop import Interrupted
+from stand.serving.desk import Conflict
+
+# What answers the daemon's clients while inside.
+Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[object]]
+
+_BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
+_LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
+_KEEP_EVERY_S = 60.0
+_EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0  # systemd is asked for more time while the stand is made safe
+
+
+class Daemon:
+    """An open stand with its queue and record. `serve` until it is told to leave, or something fails."""
+
+    def __init__(self, house: House, orders: Orders, record: HouseRecord, kept: Kept, keep: KeptFile) -> None:
+        assembly = house.assembly
+        self.house = house
+        self.orders = orders
+        self.record = record
+        config, hub = assembly.config, assembly.hub
+        self.counters = Counters(kept.counters, config.axes, config.chamber.heater_W, hub)
+        self.by_hand = ByHand(assembly, self._check_heat)
+        self.has_guest = False  # from the moment it is let in until it has gone
+        self._assembly = assembly
+        self._hub = hub
+        self._clock = assembly.clock
+        self._kept, self._keep = kept, keep
+        self._leaving, self._wake = asyncio.Event(), asyncio.Event()
+        self._hands: set[asyncio.Task[object]] = set()
+        self._others: set[asyncio.Task[None]] = set()
+        self._extending: list[asyncio.Task[None]] = []
+        self._recorded_ns = 0  # when a record was last begun, or could not be
+        hub.subscribe(self._follow)
+
+    @property
+    def guest(self) -> Guest | None:
+        """The run that has the stand."""
+        return cast("Guest | None", self.house.guest)
+
+    @property
+    def disk_free_bytes(self) -> int:
+        """Where it is recorded; 0 when that is not known."""
+        return 0 if self.record.recorder is None else self.record.recorder.disk_free_bytes
+
+    def wake(self) -> None:
+        """There may be something to be run."""
+        self._wake.set()
+
+    def leave(self) -> None:
+        """As soon as the stand is confirmed safe; may be called again."""
+        if not self._extending:
+            self._extending.append(asyncio.create_task(_extend()))
+        self.orders.leaving = True
+        self.stop()
+        self._leaving.set()
+
+    def stop(self) -> None:
+        """The stand is made safe at once; a run that has it ends."""
+        for hand in self._hands:
+            hand.cancel()
+        if self.orders.stop is not None:
+            self.orders.stop()
+        else:
+            self._assembly.stand.safety.demand()
+        if self._leaving.is_set():
+            self._assembly.stand.safety.give_up()
+
+    def clear_queue(self) -> None:
+        """What halted it has been looked into."""
+        self._beside(self._clear_queue())
+
+    def refused_by_hand(self) -> str:
+        """Why no device takes an order now, "" when they do."""
+        if self.has_guest:
+            return "a run has the stand; `stand stop` ends it"
+        if self.house.latched is not None:
+            return f"the stand has tripped, and nobody has cleared it: {self.house.latched.text}"
+        reasons = self._assembly.stand.gate.reasons
+        return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
+
+    async def do_by_hand(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
+        """What came of it within a moment, as a sentence; Conflict when that is nothing good, or it is refused."""
+        work = self.by_hand.work
+        if refused := self.refused_by_hand():
+            raise Conflict(refused)
+        what = f"{name} {verb}"
+        hand = asyncio.ensure_future(work(name, verb, arguments))
+        self._hands.add(hand)
+        hand.add_done_callback(self._hands.discard)
+        done, _ = await asyncio.wait([hand], timeout=_BY_HAND_S)
+        if not done:
+            hand.add_done_callback(lambda ended: self._tell_failure(what, ended))
+            return f"{what}: under way"
+        if hand.cancelled():
+            raise Conflict(f"{what}: stopped")
+        error = hand.exception()
+        if isinstance(error, StandError):
+            raise Conflict(str(error)) from error
+        if error is not None:
+            raise error
+        return f"{what}: done"
+
+    async def serve(self, front: Front) -> None:
+        """Until `leave`; then the stand is safe. Raises what makes that impossible."""
+        async with AsyncExitStack() as stack:
+            stack.push_async_callback(cancelled, self._extending)
+            stack.push_async_callback(self._keep.close)
+            stack.callback(self._note)
+            await self._record_house()
+            stack.push_async_callback(self._end_record)
+            stack.push_async_callback(self.house.close)
+            self.house.prepare()
+            await self.house.read_once()
+            self.house.start()
+            if self._kept.latch is not None:
+                latch = self._kept.latch
+                self.house.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
+            self.house.guard.look()
+            _catch_signals(self.leave)
+            await watched(self._serve(front), self.house.tasks)
+
+    async def _serve(self, front: Front) -> None:
+        with working(self.orders.directory):
+            await self.orders.ready()
+            self.wake()
+            worker = asyncio.create_task(self._work())
+            tasks = [worker, asyncio.create_task(self._look_after()), asyncio.create_task(self._feed())]
+            try:
+                async with front(DaemonDesk(self), self._hub, cast("WallClock", self._clock)):
+                    systemd.tell(systemd.READY, "STATUS=idle")
+                    try:
+                        await watched(self._left(), tasks)
+                    finally:
+                        await self._end_guest(worker)
+            finally:
+                await cancelled([*tasks, *self._hands, *self._others])
+
+    async def _left(self) -> None:
+        await self._leaving.wait()
+
+    async def _end_guest(self, worker: asyncio.Task[None]) -> None:
+        """The run has made the stand safe, and completed its session, before anything else ends."""
+        self.orders.leaving = True
+        while self.has_guest and not worker.done():
+            if self.orders.stop is not None:
+                self.orders.stop()
+            await asyncio.wait([worker], timeout=_LOOK_S)
+
+    async def _work(self) -> None:
+        """The queue, whenever there is something in it and nothing is halted."""
+        await self._adopt_camera()
+        lane, directory = self.orders.lane, self.orders.directory
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            if self.house.latched is not None or self.orders.queued.halted or self.orders.leaving:
+                continue
+            try:
+                await drain(directory, self._run_one, self._clock, self._say, lane)
+            except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
+                self._say(f"the queue is halted: {failure_text(error)}")
+            with suppress(SessionError):
+                await self.orders.read()
+
+    async def _run_one(self, entry: Entry, notes: Notes) -> Path:
+        if self.orders.leaving:
+            raise Interrupted("the daemon ends")
+        if self.house.latched is not None:
+            raise StandTripped(f"the stand has tripped: {self.house.latched.text}")
+        self.has_guest = True
+        systemd.tell(f"STATUS=run {entry.id} ({entry.recipe})")
+        try:
+            await cancelled(list(self._hands))
+            await self.orders.read()
+            if self._assembly.stand.chamber.permits.granted:
+                await self._assembly.stand.chamber.stop()
+            return await self.orders.run_one(entry, notes, lambda: self._beside(self._hand_over()), self._say)
+        except Stopped as error:
+            waiting = [each for each in self.orders.queued.entries if each.is_open]
+            if waiting:
+                raise StandTripped(f"{error}; `stand clear` lets the next of the queue begin") from error
+            raise
+        finally:
+            await self._record_house()
+            self.has_guest = False
+            self._note()
+            systemd.tell("STATUS=idle")
+
+    async def _record_house(self) -> None:
+        """The house's record is what heat depends on, when no run records; a disk that refuses it is an event, and
+        there is no heat by hand."""
+        self._recorded_ns = self._clock.now_ns()
+        try:
+            self.house.recorder = self.record.recorder or await self.record.begin()
+        except (SessionError, OSError) as error:
+            self.house.recorder = None
+            self._assembly.stand.safety.demand()
+            self._tell(
+                "error", "house_not_recorded", f"nothing is recorded between runs, so nothing is heated: {error}"
+            )
+
+    async def _hand_over(self) -> None:
+        """The run records, and its session is known."""
+        await self._end_record()
+        with suppress(SessionError):
+            await self.orders.read()
+
+    async def _end_record(self) -> None:
+        try:
+            await self.record.end(FINISH_WITHIN_S)
+        except (SessionError, OSError) as error:
+            self._tell("warning", "house_not_recorded", str(error))
+
+    async def _look_after(self) -> None:
+        """Midnight, a record that has ended by itself, and what is kept for the next start."""
+        kept_ns = self._clock.now_ns()
+        while True:
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_LOOK_S))
+            if not self.has_guest and self._needs_record():
+                self.house.unrecorded()
+                await self._end_record()
+                await self._record_house()
+            if self._clock.now_ns() - kept_ns >= _KEEP_EVERY_S * NS_PER_S:
+                kept_ns = self._clock.now_ns()
+                self._note()
+
+    def _needs_record(self) -> bool:
+        """A new one: at midnight, and when the last one has ended by itself and nobody has to look at that first; what
+        the disk has refused is tried again after a while."""
+        recorder = self.record.recorder
+        if recorder is None:
+            return self._clock.now_ns() - self._recorded_ns >= _KEEP_EVERY_S * NS_PER_S
+        has_ended = bool(recorder.writer_ended) and self.house.latched is None
+        return has_ended or not self.record.is_of_today()
+
+    async def _adopt_camera(self) -> None:
+        """A camera that is found powered is opened; one that is off stays off until somebody wants it."""
+        stand, devices = self._assembly.stand, self._assembly.devices
+        power = self._hub.latest(f"{devices.relays.name}.{CAMERA_POWER}")
+        if not devices.cameras or power is None or power.value != 1:
+            return
+        try:
+            await stand.imaging.supply.switch_on()
+        except (DeviceError, StandTripped) as error:
+            self._tell("warning", "camera_not_opened", f"the camera is powered, and cannot be opened: {error}")
+
+    async def _feed(self) -> None:
+        """Feed the watchdog while guard and loop are on time: a disk that hangs is no reason to be killed."""
+        limit_s = systemd.watchdog_s()
+        every_s = _KEEP_EVERY_S if limit_s is None else limit_s / 3
+        while True:
+            if limit_s is not None and self.house.guard.is_on_time:
+                systemd.tell(systemd.FED)
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(every_s))
+
+    async def _clear_queue(self) -> None:
+        try:
+            await self.orders.clear()
+        except SessionError as error:
+            self._tell("warning", "queue", str(error))
+        self.wake()
+
+    def _check_heat(self) -> None:
+        recorder = self.record.recorder
+        if recorder is None or recorder.folder_lost or recorder.writer_ended:
+            raise Conflict("nothing is recorded now, and there is no heat without a recording; see the last events")
+        if not self.house.guard.may_permit():
+            raise Conflict("the guard does not permit heat now: it waits for fresh readings, or holds the stand")
+
+    def _beside(self, work: object) -> None:
+        task = asyncio.ensure_future(cast("asyncio.Future[None]", work))
+        self._others.add(cast("asyncio.Task[None]", task))
+        task.add_done_callback(lambda done: self._others.discard(cast("asyncio.Task[None]", done)))
+
+    def _follow(self, item: Item) -> None:
+        """The hub's subscriber: what has tripped is kept at once."""
+        if isinstance(item, Event) and (item.kind.startswith("guard.") or item.kind in ("command", "hold_ended")):
+            self._note()
+
+    def _note(self) -> None:
+        fault = self.house.latched
+        latch = None if fault is None else Latch(rule=fault.rule, text=fault.text, since_ns=self.house.fault_ns)
+        self._keep.note(Kept(counters=dict(self.counters.values), latch=latch))
+
+    def _say(self, line: str) -> None:
+        self._tell("info", "queue", line)
+
+    def _tell(self, level: str, kind: str, text: str) -> None:
+        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
+
+    def _tell_failure(self, what: str, ended: asyncio.Future[object]) -> None:
+        if not ended.cancelled() and (error := ended.exception()) is not None:
+            self._tell("warning", "by_hand_failed", f"{what}: {failure_text(error)}")
+
+
+async def _extend() -> None:
+    """systemd waits for as long as the stand is being made safe."""
+    while True:
+        systemd.tell(systemd.STOPPING, systemd.extended(_EXTENDED_S), "STATUS=making the stand safe")
+        await asyncio.sleep(_EXTEND_EVERY_S)
+
+
+def _catch_signals(leave: Callable[[], None]) -> None:
+    """The signals that end the daemon call `leave`, each time they come, and for good: nothing may end the process
+    while the stand is being made safe."""
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        asyncio.get_running_loop().add_signal_handler(number, leave)

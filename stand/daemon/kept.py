@@ -1,0 +1,84 @@
+"""What a daemon knows across restarts, beside its sessions: `daemon.json` with the counters and a fault nobody has
+cleared. Written in the background, by the process that touches the disk: no loop waits for it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from foundation.clock import Clock
+from foundation.files import replace_file
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.lane import Lane
+
+NAME = "daemon.json"
+_CLOSE_LIMIT_S = 1.0
+
+
+class Latch(BaseModel):
+    """A fault that nobody has cleared."""
+
+    model_config = ConfigDict(frozen=True)
+
+    rule: str
+    text: str
+    since_ns: int
+
+
+class Kept(BaseModel):
+    """The file. counters: by name, see counters.py."""
+
+    model_config = ConfigDict(frozen=True)
+
+    counters: dict[str, float] = Field(default_factory=dict)
+    latch: Latch | None = None
+
+
+def kept_in(directory: Path) -> Kept:
+    """What a daemon before has left; nothing when there is none, or when it cannot be read. Blocking."""
+    try:
+        return Kept.model_validate_json((directory / NAME).read_bytes())
+    except (OSError, ValidationError):
+        return Kept()
+
+
+class KeptFile:
+    """Writes the last state that was noted; those that come while the disk works wait, and only the last is written.
+
+    run: calls a function with its arguments where the disk may hang.
+    """
+
+    def __init__(self, directory: Path, run: Callable[..., object], hub: Hub, clock: Clock) -> None:
+        self._path = directory.absolute() / NAME
+        self._run = run
+        self._hub = hub
+        self._clock = clock
+        self._lane = Lane("daemon-file", clock, patient=False)
+        self._waiting: Kept | None = None
+        self._writing: asyncio.Task[None] | None = None
+
+    def note(self, kept: Kept) -> None:
+        """Write it as soon as the disk takes it; returns at once."""
+        self._waiting = kept
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.create_task(self._write())
+
+    async def close(self) -> None:
+        """Give the disk a moment for the last state."""
+        if self._writing is not None:
+            await asyncio.wait([self._writing], timeout=_CLOSE_LIMIT_S)
+            self._writing.cancel()
+        self._lane.abandon()
+
+    async def _write(self) -> None:
+        while self._waiting is not None:
+            kept, self._waiting = self._waiting, None
+            try:
+                await self._lane.call(self._run, replace_file, self._path, kept.model_dump_json(indent=1).encode())
+            except (OSError, TimeoutError) as error:
+                text = f"counters and faults are not kept for the next start: {error}"
+                self._hub.publish(Event(self._clock.now_ns(), "warning", "daemon_not_kept", text))

@@ -1,0 +1,254 @@
+"""The queue of a daemon: what may be queued, what is in it, and how one of it is run on the open stand.
+
+A night is checked when it is queued: recipe, limits, devices that answer, room on the disk. All of the queue's file is
+read and written in a thread of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import importlib.resources
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from experiments.steps import Capture
+from foundation.errors import ConfigError, SessionError, StandError
+from foundation.hub import Hub
+from foundation.readings import Quality
+from recording.reading.session import Session
+from stand.config.stand_config import StandConfig
+from stand.estimating.estimate import price
+from stand.estimating.learned import load_learned
+from stand.estimating.room import existing, small_disk
+from stand.queueing import queue
+from stand.queueing.queue import Asked, order_of
+from stand.queueing.queue_file import Entry, Queue, State
+from stand.queueing.queue_run import Watch, conclude, interruption_of, is_complete
+from stand.queueing.queue_work import Notes, queue_lane
+from stand.running.guest import Job
+from stand.running.house import House
+from stand.running.order import Order, check_plan, parse_order
+from stand.running.run import run_in
+from stand.running.settling_watch import load_for
+from stand.running.stop import Interrupted, Stop
+from stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
+
+_SHOWN = 50  # runs that have ended
+
+
+class Stopped(StandError):
+    """The operator has stopped the run; the queue continues with the next one that is asked for."""
+
+
+class Orders:
+    """Of the daemon that has `house`. texts: config.yaml and target.yaml, as they were when it began.
+
+    queued: as it was last read. stop: of the run under way. leaving: the daemon ends, and its run is interrupted by it.
+    """
+
+    def __init__(self, house: House, directory: Path, config_name: str, texts: dict[str, str]) -> None:
+        self.queued = Queue()
+        self.stop: Stop | None = None
+        self.leaving = False
+        self.directory = directory
+        self.lane = queue_lane()
+        self._house = house
+        self._config_name = config_name
+        self._texts = texts
+        self._expected_s: dict[int, float] = {}
+
+    async def read(self) -> None:
+        """Know the queue as it is on the disk."""
+        self.queued = await self.lane.call(queue.queued, self.directory)
+
+    async def ready(self) -> None:
+        """What a daemon that was killed had under way is not resumed by itself: somebody has to ask for it."""
+        await self.read()
+        first = next((entry for entry in self.queued.entries if entry.is_open), None)
+        if first is not None and first.state is State.INTERRUPTED:
+            reason = f"run {first.id} ({first.recipe}) was interrupted: {first.reason}; resume it, or take it out"
+            await self.lane.call(queue.halt, self.directory, reason)
+            await self.read()
+
+    async def clear(self) -> None:
+        """The queue may continue."""
+        await self.lane.call(queue.clear, self.directory)
+        await self.read()
+
+    async def submit(self, who: Who, request: RunRequest, key: str) -> Entry:
+        """ConfigError for what is wrong with the request, Conflict for what is wrong with the stand."""
+        order = await asyncio.to_thread(self._order, request)
+        await asyncio.to_thread(self._check_disk, order)
+        self._check_wires(order)
+        digest = hashlib.sha256(request.model_dump_json().encode()).hexdigest()[:16]
+        asked = Asked(key, digest, who.name)
+        now_ns = self._house.assembly.clock.now_ns()
+        try:
+            entry = await self.lane.call(queue.add, self.directory, order, self._config_name, now_ns, asked)
+        except SessionError as error:
+            raise Conflict(str(error)) from error
+        self._expected_s[entry.id] = sum(step.duration_s for step in price(order.recipe.plan(), order.config))
+        await self.read()
+        return entry
+
+    async def cancel(self, number: int) -> None:
+        """Take it out; what it was halted for is over when it was that run."""
+        entry = self._entry(number)
+        await self._changed(queue.remove, number)
+        if entry.state is State.INTERRUPTED and not any(each.is_open for each in self.queued.entries):
+            await self.clear()
+
+    async def move(self, number: int, to: int) -> None:
+        """Make it the `to`-th of those to be done."""
+        self._entry(number)
+        await self._changed(queue.move, number, to)
+
+    async def resume(self, session: str) -> Entry:
+        """Its run is the next one."""
+        order = await asyncio.to_thread(self._recorded, session)
+        now_ns = self._house.assembly.clock.now_ns()
+        entry = await self.lane.call(queue.put_first, self.directory, order, self._config_name, session, now_ns)
+        await self.read()
+        return entry
+
+    async def run_one(self, entry: Entry, notes: Notes, begun: Callable[[], None], tell: Callable[[str], None]) -> Path:
+        """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
+        without the house's. Raises as a run does, Stopped when an operator has stopped it and others follow."""
+        session = self.directory / entry.session if entry.session else None
+        if session is not None and await asyncio.to_thread(is_complete, session):
+            return session  # killed between its end and the note of it
+        order = await asyncio.to_thread(self._order_of, entry)
+        config = order.config
+        before = None if session is None else await asyncio.to_thread(interruption_of, session, config, clear=True)
+        watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
+        hub = self._house.assembly.hub
+
+        async def recorded(folder: Path) -> None:
+            await notes.begun(folder)
+            begun()
+
+        def follow(hub: Hub) -> None:
+            hub.subscribe(watch)
+
+        plan = tuple(order.recipe.plan())
+        await asyncio.to_thread(load_for, plan)
+        job = Job(order, self.directory, None, follow, recorded, before)
+        try:
+            async with Stop(has_signals=False) as self.stop:
+                done = await run_in(self._house, job, self.stop)
+        except Interrupted as error:
+            if self.leaving:
+                raise
+            raise Stopped(f"{error}; it may be resumed") from error
+        finally:
+            self.stop = None
+            hub.unsubscribe(watch)
+        await asyncio.to_thread(conclude, entry, done, tell, report=False)
+        return done
+
+    def shown(self) -> tuple[QueuedRun, ...]:
+        """The queue for clients: the last that have ended, the run under way, those to be done."""
+        ended = [entry for entry in self.queued.entries if not entry.is_open and entry.state is not State.RUNNING]
+        first = ended[-_SHOWN:][:1]
+        since = self.queued.entries.index(first[0]) if first else 0
+        return tuple(self.shown_run(entry) for entry in self.queued.entries[since:])
+
+    def shown_run(self, entry: Entry) -> QueuedRun:
+        """One of it."""
+        return QueuedRun(
+            id=entry.id,
+            recipe=entry.recipe,
+            state=entry.state.value,
+            added_ns=entry.added_ns,
+            began_ns=entry.began_ns,
+            ended_ns=entry.ended_ns,
+            session=entry.session,
+            reason=entry.reason,
+            expected_s=self._expected_s.get(entry.id),
+            key=entry.key,
+            added_by=entry.added_by,
+        )
+
+    async def _changed(self, change: Callable[..., object], *arguments: object) -> None:
+        try:
+            await self.lane.call(partial(change, self.directory, *arguments))
+        except SessionError as error:
+            raise Conflict(str(error)) from error
+        await self.read()
+
+    def _entry(self, number: int) -> Entry:
+        entry = next((entry for entry in self.queued.entries if entry.id == number), None)
+        if entry is None:
+            raise Missing(f"no run {number} is in the queue")
+        return entry
+
+    def _order(self, request: RunRequest) -> Order:
+        """ConfigError when the recipe cannot be run on this stand."""
+        if bool(request.recipe) == bool(request.recipe_text):
+            raise ConfigError("either the name of an installed recipe, or the text of one")
+        text = request.recipe_text or _installed(request.recipe)
+        names = {
+            "config.yaml": self._config_name,
+            "recipe.yaml": request.recipe or "the recipe",
+            "target.yaml": "target",
+        }
+        order = replace(parse_order({**self._texts, "recipe.yaml": text}, names), attended=request.attended)
+        return self._here(order)
+
+    def _order_of(self, entry: Entry) -> Order:
+        return self._here(replace(order_of(entry), attended=entry.attended))
+
+    def _here(self, order: Order) -> Order:
+        """The same on the stand as it is open now."""
+        config = self._house.assembly.config
+        check_plan(order.recipe.plan(), config)
+        return replace(order, config=config, config_text=self._texts["config.yaml"])
+
+    def _recorded(self, session: str) -> Order:
+        """What a session was to run; Missing when there is no such session, Conflict when it cannot be resumed."""
+        folder = self.directory / session
+        if not session or "/" in session or session.startswith(".") or not folder.is_dir():
+            raise Missing("there is no session of that name")
+        try:
+            if is_complete(folder):
+                raise Conflict(f"{session}: its run is complete; there is nothing to resume")
+            texts = dict(Session.open(folder).attachments)
+            return parse_order({**self._texts, **texts}, {name: f"{session}: {name}" for name in texts})
+        except (StandError, LookupError) as error:
+            raise error if isinstance(error, Conflict) else Conflict(str(error)) from error
+
+    def _check_disk(self, order: Order) -> None:
+        config: StandConfig = order.config
+        steps = price(order.recipe.plan(), config, load_learned(self.directory))
+        if lack := small_disk(shutil.disk_usage(existing(self.directory)).free, steps, config):
+            raise Conflict(f"{self.directory}: {lack}")
+
+    def _check_wires(self, order: Order) -> None:
+        """What does not answer now, and what else would end the night at its beginning."""
+        assembly = self._house.assembly
+        lacks = [
+            f"{channel} is not read: {reading.reason}"
+            for channel, reading in assembly.hub.readings.items()
+            if reading.quality is Quality.BAD and reading.cause == "wire"
+        ]
+        captures = any(isinstance(planned.step, Capture) for planned in order.recipe.plan())
+        cameras = assembly.devices.cameras.values()
+        if captures and assembly.stand.imaging.supply.is_on and not all(camera.is_usable for camera in cameras):
+            lacks.append("a camera does not answer")
+        if missing := assembly.notifier.missing():
+            lacks.append(missing)
+        if lacks:
+            raise Conflict(f"this stand cannot run it now: {'; '.join(lacks)}")
+
+
+def _installed(name: str) -> str:
+    """The text of an installed recipe; ConfigError lists what there is."""
+    root = Path(str(importlib.resources.files("configs"))) / "recipes"
+    known = {path.stem: path for path in root.glob("*.yaml")}
+    if name not in known:
+        raise ConfigError(f"no recipe of that name is installed; there are {', '.join(sorted(known))}")
+    return known[name].read_text(encoding="utf-8")

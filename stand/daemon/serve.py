@@ -1,0 +1,55 @@
+"""A stand opened for a daemon: its addresses locked, what was left on switched off, the dead man tested."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from foundation.clock import WallClock
+from foundation.errors import StandTripped
+from foundation.hub import Hub
+from foundation.items import Event
+from recording.repair.salvage import salvage_line, salvage_unfinished
+from recording.writing.disk import FILES_LINE
+from stand.assembly import assemble
+from stand.clock_watch import ClockWatch
+from stand.config.safe_ranges import accepted_text
+from stand.config.stand_config import StandConfig
+from stand.daemon.daemon import Daemon, Front
+from stand.daemon.house_record import HouseRecord
+from stand.daemon.kept import KeptFile, kept_in
+from stand.daemon.orders import Orders
+from stand.running.claim import claimed
+from stand.running.house import opened
+from stand.running.stop import Stop
+
+
+async def serve(config: StandConfig, config_name: str, texts: dict[str, str], out: Path, front: Front) -> None:
+    """Own the stand until SIGINT, SIGTERM, SIGQUIT or SIGHUP. texts: config.yaml and target.yaml.
+
+    InUse when it belongs to another daemon or run: then nothing was touched. Raises what opening raises, and
+    StandTripped when the stand could not be confirmed safe at the end.
+    """
+    async with Stop() as stop, claimed(config, None):
+        hub, clock = Hub(), WallClock()
+        await asyncio.to_thread(out.mkdir, parents=True, exist_ok=True)
+        kept = await asyncio.to_thread(kept_in, out)
+        watch = ClockWatch(hub, clock)
+        assembly = assemble(config, hub, clock)
+        assembly.notifier.start()
+        try:
+            async with opened(assembly, watch.run, stop, is_for_one=False) as house:
+                if house.disk is None:
+                    raise ValueError("a daemon is on the host's clock, and has a process for its disk")
+                record = HouseRecord(assembly, texts["config.yaml"], out, clock)
+                keep = KeptFile(out, house.disk.line(FILES_LINE).run, hub, clock)
+                orders = Orders(house, out, config_name, texts)
+                for segment in await asyncio.to_thread(salvage_unfinished, out):
+                    hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
+                if accepted := config.accepted():
+                    hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
+                await Daemon(house, orders, record, kept, keep).serve(front)
+            if unsafe := assembly.stand.safety.unconfirmed:
+                raise StandTripped(f"the daemon ends, but NOT SAFE: {'; '.join(unsafe)}")
+        finally:
+            assembly.notifier.close()

@@ -1,0 +1,31 @@
+"""What systemd is told: READY, STATUS, WATCHDOG, STOPPING (sd_notify(3)), without a library."""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import suppress
+
+STOPPING, READY, FED = "STOPPING=1", "READY=1", "WATCHDOG=1"
+
+
+def tell(*lines: str) -> None:
+    """Send these lines to the service manager; nothing when there is none."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager:
+        manager.sendto("\n".join(lines).encode(), f"\0{address[1:]}" if address.startswith("@") else address)
+
+
+def watchdog_s() -> float | None:
+    """How often it wants to be fed at the least, None when it does not."""
+    with suppress(ValueError):
+        if int(os.environ.get("WATCHDOG_PID", os.getpid())) == os.getpid():
+            return int(os.environ["WATCHDOG_USEC"]) / 1e6 if "WATCHDOG_USEC" in os.environ else None
+    return None
+
+
+def extended(by_s: float) -> str:
+    """The line that asks for more time, from now on."""
+    return f"EXTEND_TIMEOUT_USEC={round(by_s * 1e6)}"

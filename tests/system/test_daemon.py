@@ -1,0 +1,268 @@
+"""A stand that is served for days, over real wires, its socket and the command line: runs are guests, and what is done
+by hand between them goes through the same gate."""
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from foundation.errors import SessionError
+from recording.reading.session import Session
+from stand.config.stand_config import load_config
+from stand.serving.client import Server, server_of
+from stand.serving.desk import StandState
+from tests.system.conftest import require_aravis
+from tests.system.test_real_time import BRIEF
+
+LIMIT_S = 120.0  # for a busy machine
+LONG = BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600").replace("[26]", "[40]")
+
+
+class Served:
+    """A daemon of its own process, and what it answers."""
+
+    def __init__(self, config_file: Path, out: Path) -> None:
+        self.out = out
+        command = [sys.executable, "-m", "stand.cli", "serve", str(config_file), "--out", str(out)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    @property
+    def server(self) -> Server:
+        return server_of(self.out)
+
+    def state(self) -> StandState:
+        return self.server.state(20.0)
+
+    def until(self, wanted: Callable[[StandState], bool]) -> StandState:
+        """The first state that is as wanted; the last one and what the daemon said when there is none in time."""
+        end_s, state = time.monotonic() + LIMIT_S, None
+        while time.monotonic() < end_s:
+            if self.process.poll() is not None:
+                pytest.fail(f"the daemon has ended: {self.process.communicate()[0]}")
+            try:
+                state = self.state()
+            except SessionError:
+                state = None
+            if state is not None and wanted(state):
+                return state
+            threading.Event().wait(0.1)
+        pytest.fail(f"not in time; {None if state is None else state.model_dump(exclude={'readings'})}")
+
+    def post(self, path: str, **body: object) -> dict[str, object]:
+        answer = self.server.request("POST", f"/api/v1/{path}", body, 20.0)
+        assert isinstance(answer, dict)
+        return answer
+
+    def submit(self, recipe: str, key: str = "") -> dict[str, object]:
+        return self.post("queue", recipe_text=recipe, key=key)
+
+    def told(self) -> str:
+        """What it said, after its end."""
+        return self.process.communicate(timeout=LIMIT_S)[0]
+
+
+@pytest.fixture
+def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Callable[..., object]) -> Path:
+    """The configuration of a simulated stand that answers, with a guard that looks often."""
+    require_aravis()
+    data = yaml.safe_load(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}))
+    data["relays"]["self_test_s"] = 1.0
+    data["cameras"]["camera"] |= {"boot_s": 0.5, "poll_s": 1.0}
+    data["flap"]["poll_s"] = 0.5
+    data["guard"] |= {"period_s": 1.0}
+    for axis in data["axes"].values():
+        axis["poll_s"] = 1.0
+    path = tmp_path / "stand.yaml"
+    path.write_text(yaml.safe_dump(data))
+    simulator(load_config(path), False)
+    return path
+
+
+@pytest.fixture
+def serve(tmp_path: Path, laboratory: Path) -> Iterator[Callable[[], Served]]:
+    """Start daemons of this laboratory; whatever is left of them ends with the test."""
+    started: list[Served] = []
+
+    def start() -> Served:
+        started.append(Served(laboratory, tmp_path / "out"))
+        return started[-1]
+
+    yield start
+    for served in started:
+        served.process.kill()
+        served.process.communicate()
+
+
+def is_idle(state: StandState) -> bool:
+    return state.phase == "idle" and len(state.readings) > 10
+
+
+def states_of(state: StandState) -> list[str]:
+    return [run.state for run in state.queue]
+
+
+def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve: Callable[[], Served]):
+    served = serve()
+    idle = served.until(is_idle)
+    assert idle.run is None
+    assert idle.readings["thermometers.air"].value is not None
+    assert not idle.heater_permitted
+    served.submit(BRIEF, "one")
+    served.submit(BRIEF, "one")  # asked again: the same
+    second = served.submit(BRIEF.replace("name: brief", "name: other"), "two")
+    running = served.until(lambda state: state.run is not None and bool(state.queue[0].session))
+    with pytest.raises(SessionError, match="a run has the stand"):
+        served.post("devices/flap/open")
+    with pytest.raises(SessionError, match="another one"):
+        served.submit(LONG, "two")
+    done = served.until(lambda state: states_of(state) == ["done", "done"] and state.phase == "idle")
+    assert [run.recipe for run in done.queue] == ["brief", "other"]
+    assert second["id"] == 2
+    assert running.queue[0].session.endswith("-brief")
+    assert not done.heater_permitted
+    served.post("devices/flap/open")
+    served.until(lambda state: state.flap == "open")
+    served.post("devices/flap/close")
+    served.until(lambda state: state.flap == "closed")
+    served.post("devices/linear/move", arguments={"position": 3.0})
+    served.until(lambda state: abs((state.axes["linear"] or 0.0) - 3.0) < 0.01)
+    served.post("devices/camera/frame", arguments={"exposure_s": 0.01})
+    served.post("devices/regulator/set", arguments={"setpoint_degC": 30.0})
+    served.until(lambda state: state.setpoint_degC == 30.0 and state.readings["relays.heater_enable"].value == 1)
+    with pytest.raises(SessionError, match=r"outside|limits"):
+        served.post("devices/regulator/set", arguments={"setpoint_degC": 300.0})
+    served.post("run/stop")
+    served.until(lambda state: state.readings["relays.heater_enable"].value == 0 and state.setpoint_degC is None)
+    counters = served.state().counters
+    assert counters["flap_cycles"] >= 1
+    assert counters["stage_cycles.linear"] >= 1
+    served.process.send_signal(signal.SIGTERM)
+    told = served.told()
+    assert served.process.returncode == 0, told
+    (house,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
+    session = Session.open(house)
+    assert session.incomplete == ()
+    assert any(event.kind == "command" and event.data.get("verb") == "device" for event in session.events())
+    assert len(list(session.frames())) == 1
+    for name in ("brief", "other"):
+        (run,) = [path for path in served.out.iterdir() if path.name.endswith(f"-{name}")]
+        assert Session.open(run).events()[-1].data.get("status") == "complete"
+
+
+def test_a_stop_ends_the_run_and_leaves_the_daemon_with_a_safe_stand(serve: Callable[[], Served]):
+    served = serve()
+    served.until(is_idle)
+    served.submit(LONG)
+    served.until(lambda state: state.run is not None and state.heater_permitted)
+    served.post("run/stop")
+    idle = served.until(lambda state: is_idle(state) and states_of(state) == ["failed"])
+    assert "stopped by the operator" in idle.queue[0].reason
+    assert idle.readings["relays.heater_enable"].value == 0
+    assert idle.fault is None
+    served.submit(BRIEF)
+    served.until(lambda state: states_of(state) == ["failed", "done"])
+
+
+def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(serve: Callable[[], Served]):
+    served = serve()
+    served.until(is_idle)
+    served.submit(LONG.replace("3600", "20"))
+    served.until(lambda state: state.run is not None and state.readings["relays.heater_enable"].value == 1)
+    served.process.send_signal(signal.SIGKILL)
+    served.process.wait()
+    again = serve()
+    offered = again.until(is_idle)
+    assert states_of(offered) == ["interrupted"]
+    assert "resume it" in offered.queue_halted
+    assert not offered.heater_permitted
+    assert offered.readings["relays.heater_enable"].value == 0
+    session = offered.queue[0].session
+    again.post(f"sessions/{session}/resume")
+    again.until(lambda state: state.run is not None)
+    again.process.send_signal(signal.SIGTERM)
+    told = again.told()
+    assert again.process.returncode == 0, told
+    kinds = [event.kind for event in Session.open(again.out / session).events()]
+    assert "run.resume" in kinds
+
+
+def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(serve: Callable[[], Served]):
+    served = serve()
+    served.until(is_idle)
+    (house,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
+    served.post("devices/regulator/set", arguments={"setpoint_degC": 30.0})
+    house.rename(house.with_name("elsewhere"))
+    tripped = served.until(lambda state: state.fault is not None)
+    assert tripped.fault is not None
+    assert tripped.fault.rule == "folder_lost"
+    served.until(lambda state: state.readings["relays.heater_enable"].value == 0)
+    with pytest.raises(SessionError, match="nobody has cleared"):
+        served.post("devices/regulator/set", arguments={"setpoint_degC": 30.0})
+    served.submit(BRIEF)
+    assert states_of(served.state()) == ["waiting"]
+    served.process.send_signal(signal.SIGKILL)
+    served.process.wait()
+    again = serve()
+    latched = again.until(is_idle)
+    assert latched.fault is not None
+    assert latched.fault.rule == tripped.fault.rule
+    again.post("run/clear")
+    again.until(lambda state: state.fault is None and states_of(state) == ["done"])
+
+
+def test_a_second_daemon_and_a_second_run_touch_nothing(serve: Callable[[], Served], laboratory: Path, tmp_path: Path):
+    served = serve()
+    served.until(is_idle)
+    second = Served(laboratory, tmp_path / "other")
+    told = second.told()
+    assert second.process.returncode == 1
+    assert "in use by the daemon of `stand serve`" in told
+    assert served.state().fault is None
+
+
+def test_the_end_of_the_daemon_ends_its_run_which_may_be_resumed(serve: Callable[[], Served]):
+    served = serve()
+    served.until(is_idle)
+    served.submit(LONG)
+    served.until(lambda state: state.run is not None and state.heater_permitted)
+    began_s = time.monotonic()
+    served.process.send_signal(signal.SIGTERM)
+    told = served.told()
+    assert served.process.returncode == 0, told
+    assert time.monotonic() - began_s < 30.0
+    assert states_of(serve().until(is_idle)) == ["interrupted"]
+
+
+def run_command(config_file: Path, recipe: str, *options: str) -> "subprocess.Popen[str]":
+    recipe_file = config_file.with_name("recipe.yaml")
+    recipe_file.write_text(recipe)
+    command = [sys.executable, "-m", "stand.cli", "run", str(recipe_file), "--config", str(config_file), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_stand_run_goes_through_the_daemon_that_has_the_stand(serve: Callable[[], Served], laboratory: Path):
+    served = serve()
+    served.until(is_idle)
+    run = run_command(laboratory, BRIEF)
+    out, err = run.communicate(timeout=LIMIT_S)
+    assert run.returncode == 0, err
+    assert Path(out.strip()).name.endswith("-brief")
+    assert Session.open(Path(out.strip())).events()[-1].data.get("status") == "complete"
+    long = run_command(laboratory, LONG)
+    served.until(lambda state: state.run is not None and state.heater_permitted)
+    detached = run_command(laboratory, BRIEF, "--detach")
+    assert "run 3 is queued" in detached.communicate(timeout=LIMIT_S)[0]
+    long.send_signal(signal.SIGINT)
+    _, err = long.communicate(timeout=LIMIT_S)
+    assert long.returncode == 130
+    assert "the stand is safe" in err
+    halted = served.until(lambda state: is_idle(state) and states_of(state) == ["done", "failed", "waiting"])
+    assert halted.queue_halted  # who presses stop does not want the next one to begin
+    served.post("run/clear")
+    served.until(lambda state: states_of(state) == ["done", "failed", "done"])
