@@ -153,7 +153,7 @@ def _search(
         watch(tried / len(sizes_px))
         candidates = find_candidates(grey, target, size_px)
         try:
-            identified = identify(candidates, target, previous)
+            identified = identify(candidates, target, previous, grey.shape)
             return _first_fit(grey, target, candidates, identified, noise)
         except DetectionError as error:
             if nearest is None or error.found > nearest.found:

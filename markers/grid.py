@@ -2,14 +2,15 @@
 
 1. Growth: from a seed and two lattice vectors, breadth first; each step is predicted from the step before.
 2. Placement: every way the target's cells can lie on the lattice; gaps that the growth left are filled. The smallest
-   homography residual wins, not the largest count: clutter in line with the grid adds support, but does not fit.
+   homography residual wins, not the largest count: clutter in line with the grid adds support, but does not fit. Where
+   a side of the grid is beyond the frame, the window wins whose missing markers are all beyond it.
 3. Orientation: the odd marker, else the rotation nearest to the previous frame's, else nearest to the nominal roll
    (0: the rows point to the right, marker 1 is bottom left). Never a guess: what stays open is refused.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,11 @@ class Identified:
     homography: Float
 
 
-def identify(candidates: Candidates, target: Target, previous: Float | None = None) -> Identified:
-    """The markers among the candidates; `previous` is the homography of the frame before.
+def identify(
+    candidates: Candidates, target: Target, previous: Float | None = None, shape: tuple[int, int] | None = None
+) -> Identified:
+    """The markers among the candidates; `previous` is the homography of the frame before, `shape` the image's (height,
+    width), which says what may be beyond it.
 
     Raises DetectionError with the reason when there are too few or more than one reading is possible.
     """
@@ -69,7 +73,7 @@ def identify(candidates: Candidates, target: Target, previous: Float | None = No
     _require(max((p.seen for p in possible), default=0), target)
     possible = _with_odd_marker(possible, candidates, target)
     possible = _near_previous(possible, points, target, previous)
-    chosen = _by_roll(_by_residual(possible, target), target, previous)
+    chosen = _by_roll(_by_residual(possible, target, shape), target, previous)
     return _checked(chosen, points, target)
 
 
@@ -99,12 +103,28 @@ def _with_odd_marker(placements: list[Placement], candidates: Candidates, target
     fitting = [p for p in placements if abs(np.log(_odd_size(p, candidates, target))) < 0.5 * abs(np.log(usual))]
     if not fitting:
         found = max(p.seen for p in placements)
+        if any(
+            abs(np.log(_odd_size(_mirrored(p, target), candidates, target))) < 0.5 * abs(np.log(usual))
+            for p in placements
+        ):
+            raise DetectionError(
+                f"the image of {target.name} is mirrored: its odd marker {target.odd_marker.number} is where only a "
+                "mirror puts it. Turn mirroring off in the camera or the viewer",
+                found,
+            )
         raise DetectionError(
             f"found {found} of {target.count} markers of {target.name}, but not the odd marker "
             f"{target.odd_marker.number}",
             found,
         )
     return fitting
+
+
+def _mirrored(placement: Placement, target: Target) -> Placement:
+    """The placement of a mirrored target: each marker has the candidate of the one across its row."""
+    row, column = np.divmod(np.arange(target.count), target.columns)
+    across = row * target.columns + target.columns - 1 - column
+    return replace(placement, candidate=placement.candidate[across])
 
 
 def _odd_size(placement: Placement, candidates: Candidates, target: Target) -> float:
@@ -135,8 +155,9 @@ def _rms_distance(placement: Placement, points: Float, expected: Float) -> float
     return float(np.sqrt(np.mean(np.sum((points[placement.candidate[seen]] - expected[seen]) ** 2, axis=1))))
 
 
-def _by_residual(placements: list[Placement], target: Target) -> list[Placement]:
+def _by_residual(placements: list[Placement], target: Target, shape: tuple[int, int] | None) -> list[Placement]:
     """The rotations of the best-fitting window; refuses when another window fits nearly as well."""
+    placements = _beyond_the_frame(placements, target, shape) or placements
     best = min(placements, key=lambda p: p.residual_px)
     same = [p for p in placements if _same_window(p, best, target)]
     others = [p for p in placements if not _same_window(p, best, target)]
@@ -148,6 +169,22 @@ def _by_residual(placements: list[Placement], target: Target) -> list[Placement]
             found,
         )
     return same
+
+
+def _beyond_the_frame(placements: list[Placement], target: Target, shape: tuple[int, int] | None) -> list[Placement]:
+    """Those with missing markers, all of which are cut by the image's border or beyond it; none when one has all."""
+    if shape is None or any(p.seen == target.count for p in placements):
+        return []
+    limits = np.array(shape[::-1]) - 1
+    chosen: list[Placement] = []
+    for placement in placements:
+        missing = placement.candidate < 0
+        places = target.coordinates_mm()[missing]
+        radii = target.diameters_mm()[missing] / 2 * np.sqrt(area_scale(placement.homography, places))
+        centres = project(placement.homography, places)
+        if np.all(np.any((centres < radii[:, None]) | (centres > limits - radii[:, None]), axis=1)):
+            chosen.append(placement)
+    return chosen
 
 
 def _same_window(one: Placement, other: Placement, target: Target) -> bool:

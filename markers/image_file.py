@@ -14,6 +14,17 @@ import PIL.Image
 from foundation.image_limit import size_fault
 from markers.detection import DetectionError, Image, grey_image
 
+_ORIENTATION, _UPRIGHT = 0x0112, 1
+"""EXIF tag (CIPA DC-008, table 4) and its value for pixels that are stored as they are to be shown."""
+_TURNS = {
+    2: "mirrored",
+    3: "turned by 180 deg",
+    4: "mirrored",
+    5: "mirrored and turned",
+    6: "turned by 90 deg",
+    7: "mirrored and turned",
+    8: "turned by 270 deg",
+}
 _NO_IMAGE = (OSError, ValueError, SyntaxError, LookupError, EOFError, OverflowError, struct.error)
 
 
@@ -38,13 +49,25 @@ def read_image(path: Path | str) -> Image:
         raise DetectionError(f"{path}: {error}") from error
 
 
+def _turned(orientation: int) -> str:
+    """What an EXIF orientation says against reading the pixels as they are stored, "" when it is upright or unknown."""
+    if orientation <= _UPRIGHT or orientation > max(_TURNS):
+        return ""
+    return (
+        f"its EXIF orientation says it is to be shown {_TURNS[orientation]}, so that its coordinates would not be "
+        "those of the camera's pixels: take the tag out (exiftool -Orientation= FILE), or turn the pixels"
+    )
+
+
 def _fault(data: bytes) -> str:
     """What its header says against reading it, "" when nothing."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of what is below our limit
             with PIL.Image.open(io.BytesIO(data)) as image:  # which decodes nothing yet
-                return f"{fault} (--max-megapixels)" if (fault := size_fault(*image.size)) else ""
+                if fault := size_fault(*image.size):
+                    return f"{fault} (--max-megapixels)"
+                return _turned(int(image.getexif().get(_ORIENTATION, _UPRIGHT)))
     except PIL.Image.DecompressionBombError:
         return "claims far more pixels than any camera has"
     except _NO_IMAGE:

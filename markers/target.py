@@ -105,6 +105,18 @@ class Target(Document):
         return self.minimum_markers if self.minimum_markers is not None else math.ceil(0.75 * self.count)
 
     @property
+    def orientation(self) -> str:
+        """How it is known which way up the target is, in a sentence."""
+        if self.odd_marker is not None:
+            return f"orientation: by the odd marker {self.odd_marker.number}"
+        known = "nominal_roll_deg" in self.model_fields_set
+        said = "as the target file says" if known else "assumed, for the target file does not say"
+        return (
+            f"orientation: {self.name} looks the same after half a turn; its rows are taken to point within 75 deg of "
+            f"{self.nominal_roll_deg:g} deg in the image ({said}: nominal_roll_deg)"
+        )
+
+    @property
     def spacing_mm(self) -> float:
         """Between nearest neighbours, centre to centre."""
         return self.pitch_mm * (math.sqrt(0.5) if self.layout == "staggered" else 1.0)

@@ -61,6 +61,7 @@ def detect_images(
         with late_progress("find markers", sum(_count(source) for source in opened)) as report:
             write_detections(out, chosen, _detections(opened, chosen, failures, report))
         typer.echo(CENTRES)
+        typer.echo(chosen.orientation)
         for failure in failures:
             typer.echo(f"not found in {one_line(failure)}", err=True)
 

@@ -1,0 +1,86 @@
+"""Which marker is which where the image alone does not say: sides beyond the frame, mirrors, turned files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from markers.detection import DetectionError, Flag, detect
+from markers.image_file import read_image
+from markers.target import OddMarker, Target
+
+from .rendered import Scene, photograph, render, true_centres_px
+from .test_markers import HALF, PAPER, rms_mpx
+
+MARKED = PAPER.model_copy(update={"odd_marker": OddMarker(number=1, diameter_mm=14.0)})
+SCENE = replace(HALF, roll_deg=3, distance_mm=1100)
+
+
+def shifted(scene: Scene, x_px: float, y_px: float) -> Scene:
+    per_px = scene.distance_mm / scene.f_px
+    return replace(scene, shift_mm=(x_px * per_px, y_px * per_px))
+
+
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+@pytest.mark.parametrize("cut", ["beyond", "half", "a tenth"])
+def test_a_side_of_the_grid_beyond_the_frame_is_told_by_the_frame(side: str, cut: str):
+    scene = replace(SCENE, roll_deg=0)
+    truth, (width, height) = true_centres_px(scene), scene.size
+    radius = 4 * scene.f_px / scene.distance_mm
+    inside = {"beyond": -2 * radius, "half": 0.0, "a tenth": 0.8 * radius}[cut]
+    moves = {
+        "left": (inside - truth[:, 0].min(), 0.0),
+        "right": (width - 1 - inside - truth[:, 0].max(), 0.0),
+        "top": (0.0, inside - truth[:, 1].min()),
+        "bottom": (0.0, height - 1 - inside - truth[:, 1].max()),
+    }
+    scene = shifted(scene, *moves[side])
+    found = detect(photograph(scene, render(scene), 1), PAPER)
+    assert found.found == (48 if side in ("left", "right") else 45)
+    assert rms_mpx(found, scene) < 6
+    assert np.all(found.flags[np.isnan(found.centres_px[:, 0])] & Flag.MISSING)
+
+
+def test_a_side_that_should_be_in_the_frame_and_is_not_leaves_two_places_and_is_refused():
+    scene = replace(SCENE, distance_mm=1500, missing=tuple(range(1, 55, 9)))
+    with pytest.raises(DetectionError, match="they fit in more than one place of the grid"):
+        detect(photograph(scene, render(scene), 1), PAPER)
+
+
+def test_a_mirrored_image_of_a_marked_target_is_refused_and_the_image_itself_is_not():
+    scene = replace(SCENE, diameters_mm={1: 14.0}, roll_deg=150)
+    image = photograph(scene, render(scene), 1)
+    assert rms_mpx(detect(image, MARKED), scene) < 6
+    for mirrored in (image[:, ::-1], image[::-1]):
+        with pytest.raises(DetectionError, match=r"mirrored: its odd marker 1 is where only a mirror puts it"):
+            detect(np.ascontiguousarray(mirrored, np.uint8), MARKED)
+
+
+def test_a_target_says_how_its_orientation_is_known():
+    assert MARKED.orientation == "orientation: by the odd marker 1"
+    assert "as the target file says" in PAPER.orientation
+    silent = Target(name="t", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
+    assert "within 75 deg of 0 deg in the image (assumed" in silent.orientation
+
+
+@pytest.mark.parametrize(("orientation", "words"), [(2, "mirrored"), (3, "180"), (6, "90"), (8, "270")])
+def test_a_file_that_is_to_be_shown_turned_is_refused(tmp_path: Path, orientation: int, words: str):
+    exif = PIL.Image.Exif()
+    exif[0x0112] = orientation
+    picture = PIL.Image.fromarray(np.zeros((8, 12), np.uint8))
+    for name in ("turned.jpg", "turned.png"):
+        picture.save(tmp_path / name, exif=exif)
+        with pytest.raises(DetectionError, match=rf"{name}: its EXIF orientation .* {words}.*exiftool -Orientation="):
+            read_image(tmp_path / name)
+
+
+@pytest.mark.parametrize("orientation", [0, 1, 9])
+def test_a_file_that_is_upright_or_says_nonsense_is_read(tmp_path: Path, orientation: int):
+    exif = PIL.Image.Exif()
+    exif[0x0112] = orientation
+    PIL.Image.fromarray(np.zeros((8, 12), np.uint8)).save(tmp_path / "upright.jpg", exif=exif)
+    assert read_image(tmp_path / "upright.jpg").shape == (8, 12)
