@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -15,13 +16,14 @@ from fastapi import Path as PathOf
 from pydantic import BaseModel
 
 from foundation.errors import ConfigError
+from recording.format.layout import TELEMETRY
 from stand.config.stand_config import packaged
 from stand.serving.api.bridge import Bridge, NoAnswer
 from stand.serving.api.recorded import SessionName, session_in
 from stand.serving.api.stream import json_of
 from stand.serving.desk import Missing
-from stand.serving.history import MOST_POINTS, Columns
-from stand.serving.preview_process import session_columns
+from stand.serving.history import MOST_POINTS
+from stand.serving.preview_process import session_columns, session_drift
 from stand.serving.viewing import Viewing
 
 if TYPE_CHECKING:
@@ -39,7 +41,8 @@ _TYPES = {
 _RECIPE = re.compile(r"[a-z0-9][a-z0-9-]*")
 _LIMIT_S = 60.0  # to read a recorded session, at the lowest priority
 _MOST_CHANNELS_TEXT = 4000
-_KEPT = 4  # sessions' curves
+_DRIFT_LIMIT_S = 300.0
+_KEPT = 8  # sessions' curves and drifts
 
 Ns = Annotated[int, Query(ge=0, le=1 << 62)]
 Points = Annotated[int, Query(ge=1, le=MOST_POINTS)]
@@ -58,6 +61,14 @@ class Curves(BaseModel):
     high: dict[str, list[float | None]]
     units: dict[str, str]
     marks: list[dict[str, Any]]
+
+
+class DriftOfSession(BaseModel):
+    """points: time_ns, mean_px and worst_px, in order of time. trouble: why frames had none."""
+
+    camera: str
+    points: list[dict[str, float | int]]
+    trouble: str
 
 
 class FrameFacts(BaseModel):
@@ -88,7 +99,7 @@ class PageRoom:
 
     def __init__(self, viewing: Viewing) -> None:
         self._viewing = viewing
-        self._sessions: dict[tuple[str, int, int], Columns] = {}
+        self._read_already: dict[tuple[object, ...], Any] = {}
         self._running: asyncio.Task[None] | None = None
 
     def __call__(self, bridge: Bridge) -> APIRouter:
@@ -121,24 +132,35 @@ class PageRoom:
         @router.get("/api/v1/sessions/{name}/history", response_model=Curves)
         async def of_session(name: SessionName, points: Points = 1200) -> Response:
             """The same of a recorded session, from its beginning to its end."""
-            path = await asyncio.to_thread(session_in, self._viewing.sessions, name)
-            return _json((await self._session(path, points)).as_json())
+            return _json((await self._read(name, _LIMIT_S, session_columns, points)).as_json())
 
-    async def _session(self, path: Path, points: int) -> Columns:
-        changed_ns = (await asyncio.to_thread((path / "telemetry").stat)).st_mtime_ns
-        key = (path.name, changed_ns, points)
-        if key not in self._sessions:
+        @router.get("/api/v1/sessions/{name}/drift", response_model=DriftOfSession)
+        async def drift(name: SessionName) -> Response:
+            """How the markers of a recorded session moved, from at most 120 of its frames; the first time this takes
+            up to minutes."""
+            found = await self._read(name, _DRIFT_LIMIT_S, session_drift, self._viewing.target_text)
+            return _json(asdict(found))
+
+    async def _read(self, name: str, limit_s: float, function: Callable[..., Any], argument: object) -> Any:
+        """What `function` finds in a session; kept until the session has changed."""
+        path = await asyncio.to_thread(session_in, self._viewing.sessions, name)
+        try:
+            changed_ns = (await asyncio.to_thread((path / TELEMETRY).stat)).st_mtime_ns
+        except OSError as error:
+            raise Missing(f"{path.name} has no telemetry ({error.strerror})") from None
+        key = (function.__name__, path.name, changed_ns, argument)
+        if key not in self._read_already:
             try:
-                async with asyncio.timeout(_LIMIT_S):
-                    found = await self._viewing.ask(session_columns, str(path), points)
+                async with asyncio.timeout(limit_s):
+                    found = await self._viewing.ask(function, str(path), argument)
             except TimeoutError:
-                raise NoAnswer(f"{path.name} could not be read within {_LIMIT_S:g} s") from None
+                raise NoAnswer(f"{path.name} could not be read within {limit_s:g} s") from None
             except OSError as error:
                 raise NoAnswer(str(error)) from None
-            while len(self._sessions) >= _KEPT:
-                self._sessions.pop(next(iter(self._sessions)))
-            self._sessions[key] = found
-        return self._sessions[key]
+            while len(self._read_already) >= _KEPT:
+                self._read_already.pop(next(iter(self._read_already)))
+            self._read_already[key] = found
+        return self._read_already[key]
 
     def _add_frame(self, router: APIRouter) -> None:
         viewing = self._viewing

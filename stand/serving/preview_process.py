@@ -15,6 +15,7 @@ from foundation.helper_process import serve
 if TYPE_CHECKING:
     from stand.serving.history import Columns, History
     from stand.serving.preview import Previewer
+    from stand.serving.recorded_drift import SessionDrift
 
 MODULE = "stand.serving.preview_process"
 _LEFT_NAME = "stand-look-left"  # of a process whose daemon has gone
@@ -37,6 +38,16 @@ def session_columns(path: str, points: int) -> Columns:
     from stand.serving.recorded_history import session_columns
 
     return session_columns(path, points)
+
+
+def session_drift(path: str, target_text: str) -> SessionDrift:
+    """How a recorded session's markers moved; SessionError when it cannot be read."""
+    import cv2
+
+    from stand.serving.recorded_drift import session_drift
+
+    cv2.setNumThreads(1)
+    return session_drift(path, target_text)
 
 
 def recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]:

@@ -48,7 +48,7 @@ class Viewing:
         self.skipped = 0
         self.trouble = ""  # why there are no previews
         self._hub, self._clock = hub, clock
-        self._target_text = target_text
+        self.target_text = target_text
         self._loop = asyncio.get_running_loop()
         self._items: deque[Item] = deque(maxlen=_WAITING)
         self._newest: dict[str, tuple[Frame, str]] = {}
@@ -159,7 +159,7 @@ class Viewing:
     async def _previewer(self) -> Line:
         line = self._started().line(_LOOK)
         if not self._knows_target:
-            await asyncio.to_thread(line.make, "previewer", previewer, self._target_text)
+            await asyncio.to_thread(line.make, "previewer", previewer, self.target_text)
             self._knows_target = True
         return line
 

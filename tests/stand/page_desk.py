@@ -57,6 +57,7 @@ class NightDesk(ADesk):
         self.prompt: PromptState | None = None
         self.is_idle = False
         self.stops = 0
+        self.viewing: Viewing | None = None
         self.began_ns = self.clock.now_ns() - round(10.6 * 3600 * NS_PER_S)
         self._air, self._granite, self._camera = 24.0, 24.0, 38.0
         self.queue = [
@@ -313,6 +314,7 @@ async def a_night(
     prepare(desk)
     viewing = Viewing(desk.hub, desk.clock, folder, TARGET)
     desk.live_through(viewing)
+    desk.viewing = viewing
     folder.mkdir(exist_ok=True)
     polling = asyncio.create_task(desk.go_on())
     try:

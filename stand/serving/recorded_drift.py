@@ -1,0 +1,65 @@
+"""How the markers moved over a recorded night, from a part of its frames: for a look at it, or at two together.
+A fit with all of them is `compensate`'s. It takes seconds: in a process of its own, at the lowest priority.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from experiments.steps import Role
+from foundation.documents import parse_document
+from markers.target import Target
+from recording.reading.session import Session
+from stand.serving.preview import DRIFT_ROLES, Previewer, Shot
+
+MOST_FRAMES = 120
+
+
+@dataclass(frozen=True, slots=True)
+class DriftPoint:
+    """mean_px: length of the mean drift since the reference, worst_px: the largest of a marker."""
+
+    time_ns: int
+    mean_px: float
+    worst_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class SessionDrift:
+    """Of one camera, in order of time. trouble: why frames had no drift, "" when all had."""
+
+    camera: str
+    points: tuple[DriftPoint, ...]
+    trouble: str = ""
+
+
+def session_drift(path: Path | str, target_text: str) -> SessionDrift:
+    """The drift of a session's first camera against its first reference frame (without one: its first frame), in at
+    most MOST_FRAMES frames spread over the night. Its own target is taken, else `target_text`. SessionError when the
+    session cannot be read."""
+    session = Session.open(path)
+    table = session.frames_table()
+    usable = np.isin(table.role, [role for role in DRIFT_ROLES if role]) & ~table.superseded
+    if not usable.any():
+        return SessionDrift("", (), "no frames that a drift is told of")
+    camera = str(table.camera[usable][0])
+    usable &= table.camera == camera
+    chosen = np.flatnonzero(usable)
+    if len(chosen) > MOST_FRAMES:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, MOST_FRAMES).round().astype(int)]
+    references = np.flatnonzero(usable & (table.role == Role.REFERENCE))
+    reference = int(references[0]) if len(references) else int(chosen[0])
+    text = session.attachment("target.yaml") or target_text
+    previewer = Previewer(parse_document(text, Target, "the target of the session"))
+    trouble = ""
+    points: list[DriftPoint] = []
+    for index in (reference, *chosen.tolist()):
+        frame = session.frame(index)
+        seen = previewer.look(Shot(camera, frame.time_ns, frame.image, str(table.role[index]), not points))
+        if seen.mean_px is not None and seen.worst_px is not None:
+            points.append(DriftPoint(frame.time_ns, seen.mean_px, seen.worst_px))
+        trouble = trouble or seen.trouble
+    return SessionDrift(camera, tuple(sorted(points[1:], key=lambda point: point.time_ns)), trouble)

@@ -1,0 +1,174 @@
+"""The routes of the page, asked as a browser asks them: its files, curves, frames, recorded nights."""
+
+import asyncio
+import json
+import shutil
+import urllib.error
+import urllib.parse
+import urllib.request
+
+import pytest
+
+from foundation.items import Batch, Event, StepMark, StepState
+from stand.serving.page_room import PAGE
+from tests.recording.recorded import half_second, record
+from tests.stand.page_desk import TARGET, a_night, frame_of, free_port, target_image
+
+
+@pytest.fixture
+async def night(tmp_path):
+    port = free_port()
+    async with a_night(tmp_path / "sessions", port) as desk:
+        desk.port, desk.folder = port, tmp_path / "sessions"
+        yield desk
+
+
+def _read(url):
+    try:
+        with urllib.request.urlopen(url, timeout=60) as answer:
+            return answer.status, dict(answer.headers), answer.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, dict(error.headers), error.read()
+
+
+async def ask(desk, path):
+    return await asyncio.to_thread(_read, f"http://127.0.0.1:{desk.port}{path}")
+
+
+async def test_the_page_is_whole_and_lets_nothing_in_from_elsewhere(night):
+    status, headers, text = await ask(night, "/")
+    assert status == 200
+    assert "script-src 'self'" in headers["content-security-policy"]
+    assert "unsafe" not in headers["content-security-policy"]
+    for path in PAGE.iterdir():
+        found, _, data = await ask(night, f"/static/{path.name}")
+        assert (found, data) == (200, path.read_bytes())
+    assert b"<style" not in text
+    assert b"style=" not in text
+    own = [path for path in PAGE.iterdir() if path.suffix in (".js", ".css", ".html") and "uPlot" not in path.name]
+    assert all("http://" not in path.read_text().replace("http://www.w3.org/2000/svg", "") for path in own)
+    assert all("https://" not in path.read_text() for path in own)
+    assert all("innerHTML" not in path.read_text() for path in own)
+
+
+@pytest.mark.parametrize("name", ["../page_room.py", "..%2Fpage_room.py", "%2e%2e%2fdesk.py", "nothing.js", ".", "%00"])
+async def test_no_other_file_is_given(night, name):
+    status, _, data = await ask(night, f"/static/{name}")
+    assert status in (400, 404)
+    assert "error" in json.loads(data)
+
+
+async def test_curves_of_the_night_are_given_decimated(night):
+    to_ns = night.clock.now_ns()
+    path = f"/api/v1/history?from_ns={night.began_ns}&to_ns={to_ns}&points=300&channels=thermometers.air,regulator.sp"
+    status, _, data = await ask(night, path)
+    found = json.loads(data)
+    assert status == 200
+    assert set(found["low"]) == {"thermometers.air", "regulator.sp"}
+    assert len(found["low"]["regulator.sp"]) == found["points"] <= 301
+    assert max(value for value in found["low"]["regulator.sp"] if value is not None) == 52.0
+    assert any(mark["kind"] == "device_lost" for mark in found["marks"])
+    assert any(mark["level"] == "step" for mark in found["marks"])
+
+
+@pytest.mark.parametrize(
+    "query", ["from_ns=5&to_ns=5", "from_ns=9&to_ns=5", "from_ns=0&to_ns=5&points=0", "to_ns=5", "from_ns=a&to_ns=1"]
+)
+async def test_what_is_no_time_is_told_in_a_sentence(night, query):
+    status, _, data = await ask(night, f"/api/v1/history?{query}")
+    assert status == 422
+    assert json.loads(data)["error"]
+
+
+async def test_before_the_first_frame_there_is_none_and_then_there_is(night):
+    assert (await ask(night, "/api/v1/frame"))[0] == 204
+    assert (await ask(night, "/api/v1/frame.jpg"))[0] == 204
+    time_ns = night.clock.now_ns()
+    night.hub.publish(frame_of(target_image(0, 0), time_ns))
+    async with asyncio.timeout(120):
+        while (await ask(night, "/api/v1/frame"))[0] == 204:
+            await asyncio.sleep(0.2)
+    status, _, data = await ask(night, "/api/v1/frame?camera=camera")
+    found = json.loads(data)
+    assert (status, found["time_ns"], len(found["markers"]), found["mean_px"]) == (200, time_ns, 54, 0.0)
+    status, headers, picture = await ask(night, "/api/v1/frame.jpg")
+    assert (status, headers["content-type"], picture[:2]) == (200, "image/jpeg", b"\xff\xd8")
+    assert headers["cache-control"] == "no-store"
+    assert (await ask(night, "/api/v1/frame?camera=other"))[0] == 404
+
+
+async def test_a_recipe_is_given_as_a_document(night):
+    status, _, data = await ask(night, "/api/v1/recipes/overnight")
+    assert status == 200
+    assert json.loads(data)["experiments"][1]["calibration"]["linear_mm"][0] == 0
+    for name in ("..%2Fsimulated", "nothing", "Overnight", "%20"):
+        assert (await ask(night, f"/api/v1/recipes/{name}"))[0] == 404
+
+
+async def test_a_recorded_night_gives_its_curves(night):
+    await record(night.folder / "one night", 12)
+    status, _, data = await ask(night, f"/api/v1/sessions/{urllib.parse.quote('one night')}/history?points=100")
+    found = json.loads(data)
+    assert status == 200
+    assert max(value for value in found["low"]["regulator.pv"] if value is not None) >= 31
+    assert (await ask(night, "/api/v1/sessions/another/history"))[0] == 404
+    shutil.rmtree(night.folder / "one night" / "telemetry")
+    status, _, data = await ask(night, f"/api/v1/sessions/{urllib.parse.quote('one night')}/history")
+    assert status in (404, 409)
+
+
+async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
+    """Eight frames to fit after a reference; the target moves by 0.2 px a frame."""
+
+    def items(time_ns, index):
+        yield from (
+            item
+            for item in half_second(time_ns, index)
+            if not isinstance(item, Event | StepMark) and not hasattr(item, "image")
+        )
+        parameters = {"frames": 1, "interval_s": 0.5, "role": "reference" if not index else "fit"}
+        yield StepMark(time_ns, f"c{index}", index, "Capture", StepState.STARTED, parameters)
+        yield frame_of(target_image(0, 0.2 * index, (612, 512)), time_ns, f"c{index}")
+        yield StepMark(time_ns, f"c{index}", index, "Capture", StepState.DONE, parameters)
+
+    await record(night.folder / "night", 9, items, attachments={"target.yaml": TARGET})
+    status, _, data = await ask(night, "/api/v1/sessions/night/drift")
+    found = json.loads(data)
+    assert (status, found["camera"], found["trouble"]) == (200, "camera", "")
+    means = [point["mean_px"] for point in found["points"]]
+    assert means == pytest.approx([0.2 * index for index in range(9)], abs=0.05)
+    assert found["points"][0]["time_ns"] < found["points"][-1]["time_ns"]
+
+
+async def test_a_process_that_ends_is_a_warning_and_the_curves_go_on(night):
+    events = []
+    night.hub.subscribe(lambda item: isinstance(item, Event) and events.append(item))
+    night.hub.publish(frame_of(target_image(0, 0), night.clock.now_ns()))
+    async with asyncio.timeout(120):
+        while (await ask(night, "/api/v1/frame"))[0] == 204:
+            await asyncio.sleep(0.2)
+    night.viewing._helper._process.kill()
+    night.hub.publish(frame_of(target_image(0, 0), night.clock.now_ns()))
+    async with asyncio.timeout(30):
+        while not [event for event in events if event.kind == "preview"]:
+            await asyncio.sleep(0.05)
+    (told,) = [event for event in events if event.kind == "preview"]
+    assert told.level == "warning"
+    assert "killed by SIGKILL" in told.text or "has ended" in told.text
+    assert (await ask(night, f"/api/v1/history?from_ns={night.began_ns}&to_ns={night.clock.now_ns()}"))[0] == 200
+    assert (await ask(night, "/api/v1/frame"))[0] == 200  # the last one stays
+
+
+async def test_frames_are_skipped_and_never_queued(night):
+    """A hundred at once: the newest is what is looked at."""
+    time_ns = night.clock.now_ns()
+    for index in range(100):
+        night.hub.publish(frame_of(target_image(0, 0, (612, 512)), time_ns + index))
+    async with asyncio.timeout(120):
+        while (answer := await ask(night, "/api/v1/frame"))[0] == 204:
+            await asyncio.sleep(0.2)
+        while (found := json.loads(answer[2]))["time_ns"] != time_ns + 99:
+            answer = await ask(night, "/api/v1/frame")
+            await asyncio.sleep(0.1)
+    assert found["skipped"] >= 97
