@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,8 +21,10 @@ from stand.aside import aside
 from stand.config.stand_config import load_config, packaged
 from stand.daemon.desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
+from stand.serving.api.bridge import Bridge
 from stand.serving.api.server import Interface
 from stand.serving.api.server import serve as serve_clients
+from stand.serving.viewing import Viewing
 
 app = typer.Typer(add_completion=False)
 
@@ -49,7 +52,9 @@ def serve(
 
         @asynccontextmanager
         async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
-            async with serve_clients(desk, hub, clock, directory, stand.name, interface):
+            viewing = Viewing(hub, clock, directory, texts["target.yaml"])
+            served = replace(interface, rooms=(_page(viewing),))
+            async with serve_clients(desk, hub, clock, directory, stand.name, served):
                 typer.echo(f"{stand.name} is open; sessions go to {directory}", err=True)
                 with aside() as later:
                     say = later(_say)
@@ -65,6 +70,15 @@ def serve(
                         hub.unsubscribe(follow)
 
         asyncio.run(serve_stand(stand, config, texts, directory, front))
+
+
+def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
+    def room(bridge: Bridge) -> Any:
+        from stand.serving.page_room import PageRoom  # FastAPI, which the thread loads that serves clients
+
+        return PageRoom(viewing)(bridge)
+
+    return room
 
 
 def _say(line: str) -> None:
