@@ -11,6 +11,7 @@ import usb.backend
 
 from drivers.devices.cameras import make_camera
 from drivers.devices.flap import Flap
+from drivers.devices.inputs import Inputs
 from drivers.devices.protocols import Sensor
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays
@@ -55,6 +56,11 @@ class Assembly:
             (devices.regulator, config.regulator.poll_s),
             (devices.thermometers, config.thermometer_module.poll_s),
             (devices.relays, config.relays.poll_s),
+            *(
+                ((devices.inputs, config.inputs.poll_s),)
+                if devices.inputs is not None and config.inputs is not None
+                else ()
+            ),
             *((devices.cameras[name], camera.poll_s) for name, camera in config.cameras.items()),
             (devices.flap, config.flap.poll_s),
             *((devices.axes[name], axis.poll_s) for name, axis in config.axes.items()),
@@ -116,6 +122,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         axes={name: Axis(name, axis, clock) for name, axis in config.axes.items()},
         flap=_flap(config, clock),
         cameras={name: make_camera(name, camera, clock) for name, camera in config.cameras.items()},
+        inputs=inputs_of(config, bus, clock),
     )
     state_file = config.compressor.state_file
     if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces
@@ -131,17 +138,26 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
 def bus_units(config: StandConfig, bus: Bus, clock: Clock) -> tuple[Regulator, Relays, Thermometers]:
     """The units on the bus; ConfigError when a register map is missing or wrong, or that of another kind of unit."""
 
-    def register_map(key: str, unit: OnBus) -> RegisterMap:
-        path = packaged("registers", unit.registers, key=f"{key}.registers")
-        return load_register_map(path).at_unit(unit.unit)
-
     channels = {str(name): number for name, number in config.relays.channels.items()}
-    module = register_map("thermometer_module", config.thermometer_module)
+    module = _register_map("thermometer_module", config.thermometer_module)
     return (
-        Regulator("regulator", bus, register_map("regulator", config.regulator), clock),
-        Relays("relays", bus, register_map("relays", config.relays), channels),
+        Regulator("regulator", bus, _register_map("regulator", config.regulator), clock),
+        Relays("relays", bus, _register_map("relays", config.relays), channels),
         Thermometers("thermometers", bus, module, config.thermometers, clock),
     )
+
+
+def inputs_of(config: StandConfig, bus: Bus, clock: Clock) -> Inputs | None:
+    """The stand's contacts, None when it has none; ConfigError as bus_units."""
+    if config.inputs is None:
+        return None
+    channels = {name: contact.channel for name, contact in config.inputs.contacts.items()}
+    return Inputs("inputs", bus, _register_map("inputs", config.inputs), channels, clock)
+
+
+def _register_map(key: str, unit: OnBus) -> RegisterMap:
+    path = packaged("registers", unit.registers, key=f"{key}.registers")
+    return load_register_map(path).at_unit(unit.unit)
 
 
 class _BackendModule(Protocol):

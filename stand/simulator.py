@@ -50,6 +50,15 @@ def laboratory_of(
         "regulator_unit": config.regulator.unit,
         "relays_unit": config.relays.unit,
         "relay_channels": dict(config.relays.channels),
+        "inputs_unit": None if config.inputs is None else config.inputs.unit,
+        "input_channels": {name: each.channel for name, each in config.inputs.contacts.items()}
+        if config.inputs
+        else {},
+        "inputs_closed": [
+            each.channel
+            for each in (config.inputs.contacts.values() if config.inputs else ())
+            if each.fault_when == "open"
+        ],
         "thermometers_unit": config.thermometer_module.unit,
         "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.items()},
         "axes": {

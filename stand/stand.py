@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.devices.flap import Flap
+from drivers.devices.inputs import Inputs
 from drivers.devices.protocols import Actuator, Camera
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays
@@ -37,6 +38,7 @@ class Devices:
     axes: Mapping[str, Axis]
     flap: Flap
     cameras: Mapping[str, Camera]
+    inputs: Inputs | None = None
 
 
 class Stand:

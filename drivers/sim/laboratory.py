@@ -71,6 +71,9 @@ class LaboratorySpec(Document):
     regulator_unit: int
     relays_unit: int
     relay_channels: dict[str, int]
+    inputs_unit: int | None = None
+    input_channels: dict[str, int] = Field(default_factory=dict[str, int])
+    inputs_closed: tuple[int, ...] = ()
     thermometers_unit: int
     thermometer_channels: dict[str, int]
     axes: dict[Literal["linear", "rotary"], AxisSpec]
@@ -185,7 +188,13 @@ class Laboratory:
         self.thermometers = FakeThermometers(
             plant, clock, spec.thermometers_unit, spec.thermometer_channels, seed=spec.seed
         )
-        units = (self.regulator, self.relays, self.thermometers)
+        units = [self.regulator, self.relays, self.thermometers]
+        self.inputs = self.relays  # a board that has both
+        if spec.inputs_unit not in (None, spec.relays_unit):
+            self.inputs = FakeRelays(plant, clock, spec.inputs_unit, {})
+            units.append(self.inputs)
+        if spec.inputs_unit is not None:
+            self.inputs.closed_inputs = set(spec.inputs_closed)
         framing = RtuEngine if spec.bus.startswith("serial:") else TcpEngine
         self._listen("bus", spec.bus, lambda: framing(units))
         for name, settings in spec.axes.items():

@@ -136,6 +136,13 @@ def _weld(laboratory: Laboratory, value: object) -> None:
     laboratory.relays.welded = {str(value)} if value else set()
 
 
+def _change_contact(laboratory: Laboratory, value: object) -> None:
+    spec, closed = laboratory.spec, set(laboratory.spec.inputs_closed)
+    changed = {spec.input_channels[str(value)]} if value else set[int]()
+    if spec.inputs_unit is not None:
+        laboratory.inputs.closed_inputs = closed ^ changed
+
+
 def _alarm_axis(laboratory: Laboratory, value: object) -> None:
     for name, axis in laboratory.axes.items():
         axis.alarm = name == value
@@ -281,6 +288,7 @@ FAULTS: dict[str, Fault] = {
     "heater.welded_share": Fault(
         _to(lambda lab: lab, "ssr_welded_share", _number), 1.0, None, "its solid-state relay conducts this share"
     ),
+    "inputs.changed": Fault(_change_contact, None, None, "name of a contact that is not as it is while all is well"),
     "relays.silent": Fault(_to(lambda lab: lab.relays, "silent"), True, False, "the board does not answer"),
     "relays.silent_s": Fault(_silent_relays, 60.0, 0, "for so long; its timed-on relays time out and drop"),
     "relays.lost_writes": Fault(_to(lambda lab: lab.relays, "lost_writes"), True, False, "acknowledged, not done"),

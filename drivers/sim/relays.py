@@ -13,6 +13,7 @@ from typing import Protocol
 
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
     Refusal,
     Timeline,
@@ -63,7 +64,8 @@ class Relay:
 
 class FakeRelays:
     """The board as unit `unit`; `channels` says which relay, counted from 0, switches which contact of the plant:
-    heater_enable, compressor, camera_power. All relays are open at power-up.
+    heater_enable, compressor, camera_power. All relays are open at power-up. closed_inputs: of the eight digital inputs
+    that some of these boards have, None for one without.
 
     Faults: silent; lost_writes (acknowledged, not done); welded (names of contacts that stay closed regardless of
     the coil); rearms False (a repeated timed-on does not start its time again); times False (a timed-on stays on).
@@ -81,6 +83,7 @@ class FakeRelays:
         self.silent = False
         self.lost_writes = False
         self.welded: set[str] = set()
+        self.closed_inputs: set[int] | None = None
         self.rearms = True
         self.times = True
         self._plant = plant
@@ -90,6 +93,7 @@ class FakeRelays:
         self._relays = [Relay()] * RELAYS
         self._functions = {
             0x01: reads_bits(self._read_coils),
+            0x02: reads_bits(self._read_inputs),
             0x03: reads_words(self._read_registers),
             0x05: writes_one(self._write_coil),
             0x06: writes_one(self._write_register),
@@ -116,6 +120,12 @@ class FakeRelays:
     def _read_coils(self, address: int, count: int) -> list[bool]:
         _check_span(address, count)
         return [relay.closed_at(self._now_ns) for relay in self._relays[address : address + count]]
+
+    def _read_inputs(self, address: int, count: int) -> list[bool]:
+        if self.closed_inputs is None:
+            raise Refusal(ILLEGAL_FUNCTION)
+        _check_span(address, count)
+        return [channel in self.closed_inputs for channel in range(address, address + count)]
 
     def _write_coil(self, address: int, value: int) -> bool:
         """FC 05: one relay, all of them, or one for a time; the reply always repeats the request."""

@@ -15,6 +15,7 @@ from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
 from drivers.devices.cameras import AnyCameraSettings
 from drivers.devices.flap import FlapSettings
+from drivers.devices.inputs import InputsSettings
 from drivers.devices.relays import RelaysSettings
 from drivers.devices.stage import AxisSettings
 from drivers.devices.thermometers import ThermometerSettings
@@ -47,7 +48,7 @@ Folder = Literal["", "registers", "recipes", "targets"]
 MAPPED = ("regulator", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
 _GUARDED = {"air", "granite_inside"}  # thermometers without which nothing is heated
-_DEVICES = ("bus", "regulator", "relays", "thermometers", "flap", "stand", "control")  # names that are taken
+_DEVICES = ("bus", "regulator", "relays", "thermometers", "flap", "stand", "control", "inputs")  # names that are taken
 
 
 class LimitsConfig(Document):
@@ -120,6 +121,7 @@ class StandConfig(Document):
     thermometers: dict[DeviceName, ThermometerSettings]
     axes: dict[DeviceName, AxisSettings] = Field(default_factory=dict)
     flap: FlapSettings
+    inputs: InputsSettings | None = None
     cameras: dict[DeviceName, AnyCameraSettings] = Field(default_factory=dict)
     chamber: ChamberConfig = ChamberConfig()
     limits: LimitsConfig = LimitsConfig()
@@ -152,6 +154,8 @@ class StandConfig(Document):
         units = [self.regulator.unit, self.relays.unit, self.thermometer_module.unit]
         if len(set(units)) < len(units):
             yield f"regulator, relays and thermometer_module need different units on one bus, not {units}"
+        if self.inputs is not None and self.inputs.unit in (self.regulator.unit, self.thermometer_module.unit):
+            yield "inputs.unit is that of the regulator or the thermometers; take the relay board's, or another"
         addresses = [self.bus.address, *(axis.address for axis in self.axes.values())]
         addresses += [camera.address for camera in self.cameras.values()]
         if twice := [address for address in addresses if addresses.count(address) > 1]:
@@ -208,6 +212,7 @@ def load_config(path: Path) -> StandConfig:
     """The configuration file, checked. Register maps that lie beside it are named by their whole path."""
     config = load_document(path, StandConfig)
     units: dict[str, OnBus] = {name: getattr(config, name) for name in MAPPED}
+    units |= {} if config.inputs is None else {"inputs": config.inputs}
     return config.model_copy(
         update={
             name: unit.model_copy(update={"registers": _beside(path, unit.registers)}) for name, unit in units.items()

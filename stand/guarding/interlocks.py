@@ -156,6 +156,15 @@ def stage_alarm(position: str) -> Rule:
     return rule
 
 
+def contact(channel: str, fault_when: float, text: str) -> Rule:
+    """A contact of the stand reads `fault_when` (0 open, 1 closed)."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        return Fault("contact", text) if value_of(readings, channel) == fault_when else None
+
+    return rule
+
+
 def flap_open(position: str, is_excused: Callable[[], bool] = lambda: False) -> Rule:
     """The flap is open and nothing excuses it; how long that may last is the watch's grace time."""
 

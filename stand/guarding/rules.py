@@ -7,6 +7,7 @@ from collections.abc import Callable
 from experiments.steps import Capture
 from foundation.items import Event, Item, StepMark, StepState
 from stand.config.stand_config import StandConfig
+from stand.fault import Action
 from stand.gate import OPERATOR
 from stand.guarding.felt_air import camera_feels, granite_feels
 from stand.guarding.first_heat import first_heat
@@ -17,6 +18,7 @@ from stand.guarding.interlocks import (
     Rule,
     Watch,
     camera_temperature_bad,
+    contact,
     disagreement,
     flap_open,
     folder_lost,
@@ -49,6 +51,7 @@ PV, AIR, GRANITE, LABORATORY = (
 RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
 FLAP = "flap.position"
 _CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
+_DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
 VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these there is no heat
 
 
@@ -87,6 +90,7 @@ def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
         *_sensors(config),
         *_independent(config),
         *_operations(config, announced),
+        *_contacts(config),
     )
 
 
@@ -184,6 +188,22 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
         Watch(frames_stopped(lambda: announced.frames_stopped), limits.disk_low_s, "hold"),
         Watch(paused(lambda: announced.is_paused), 3600.0 * limits.pause_limit_h, "hold"),
     )
+
+
+def _contacts(config: StandConfig) -> tuple[Watch, ...]:
+    """Door, emergency stop and whatever else the stand's file names. One that cannot be read for as long as any other
+    reading may be old counts as one that says so, but ends no run: whether it is a fault nobody knows."""
+    watches: list[Watch] = []
+    for name, each in ({} if config.inputs is None else config.inputs.contacts).items():
+        channel = f"inputs.{name}"
+        text = f"{channel} is {each.fault_when}{f': {each.means}' if each.means else ''}"
+        watches.append(
+            Watch(contact(channel, float(each.fault_when == "closed"), text), each.after_s, _DONE[each.action])
+        )
+        stale = "warn" if each.action == "warn" else "hold"
+        limit_s = config.guard.stale_after_s
+        watches.append(Watch(trustworthy(channel, limit_s), action=stale, after_gap_s=limit_s))
+    return tuple(watches)
 
 
 def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:

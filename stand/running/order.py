@@ -13,7 +13,7 @@ from foundation.clock import WallClock
 from foundation.documents import parse_document, read_document
 from foundation.errors import ConfigError
 from markers.target import Target
-from stand.assembly import bus_units
+from stand.assembly import bus_units, inputs_of
 from stand.config.recipe import Recipe
 from stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
 from stand.estimating.estimate import price
@@ -66,8 +66,13 @@ def with_register_maps(order: Order) -> Order:
     for name in MAPPED:
         path = packaged("registers", getattr(order.config, name).registers, key=f"{name}.registers")
         texts[_REGISTERS.format(name)] = read_document(path)
+    if order.config.inputs is not None:
+        path = packaged("registers", order.config.inputs.registers, key="inputs.registers")
+        texts[_REGISTERS.format("inputs")] = read_document(path)
     clock = WallClock()
-    bus_units(order.config, Bus("bus", order.config.bus, clock), clock)
+    bus = Bus("bus", order.config.bus, clock)
+    bus_units(order.config, bus, clock)
+    inputs_of(order.config, bus, clock)
     return replace(order, register_texts=texts)
 
 
@@ -91,7 +96,7 @@ def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:
         texts["config.yaml"],
         texts["recipe.yaml"],
         texts["target.yaml"],
-        register_texts={name: texts[name] for name in map(_REGISTERS.format, MAPPED) if name in texts},
+        register_texts={name: texts[name] for name in map(_REGISTERS.format, (*MAPPED, "inputs")) if name in texts},
     )
     parse_document(order.target_text, Target, names["target.yaml"])
     return order

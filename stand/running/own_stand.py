@@ -86,6 +86,8 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
         name: getattr(recorded, name).model_copy(update={"registers": getattr(simulated, name).registers})
         for name in ("regulator", "relays", "thermometer_module")
     }
+    if recorded.inputs is not None:
+        maps["inputs"] = recorded.inputs.model_copy(update={"registers": "waveshare-inputs"})
     state_file = {"state_file": simulated.compressor.state_file}
     return recorded.model_copy(
         update={

@@ -108,4 +108,5 @@ def _kinds(config: StandConfig) -> dict[str, str]:
     """Device name -> what kind of device it is, for the recorder's topics."""
     kinds = {name: name for name in ("regulator", "relays", "thermometers")}
     kinds |= dict.fromkeys(config.cameras, "camera")
+    kinds |= {} if config.inputs is None else {"inputs": "relays"}  # contacts, as those of the relays
     return {**kinds, "flap": "flap", **dict.fromkeys(config.axes, "axis")}

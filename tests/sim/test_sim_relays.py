@@ -57,6 +57,13 @@ def test_all_relays_are_open_at_power_up(bench: Bench) -> None:
     assert not bench.plant.camera_powered
 
 
+def test_the_inputs_are_read_by_function_2(bench: Bench) -> None:
+    bench.board.closed_inputs = {0, 2, 7}
+    assert bench.ask("02 0000 0008") == "02 01 85"
+    assert bench.ask("02 0002 0001") == "02 01 01"
+    assert bench.ask("02 0001 0008") == "82 02"
+
+
 def test_the_frame_of_the_manual_closes_relay_0_and_enables_the_heater(bench: Bench) -> None:
     frame = bytes.fromhex("01 05 00 00 FF 00 8C 3A")
     assert RtuEngine([bench.board]).feed(frame) == frame

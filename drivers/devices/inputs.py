@@ -1,0 +1,72 @@
+"""Contacts of the stand on the digital inputs of a relay board or an input module: door, emergency stop, cut-out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from drivers.settings import DeviceName, Line, OnBus
+from drivers.wires.bus import Bus
+from drivers.wires.modbus_unit import ModbusUnit
+from drivers.wires.registers import RegisterMap
+from foundation.clock import Clock
+from foundation.documents import Document
+from foundation.errors import ConfigError
+from foundation.readings import Reading
+
+
+class ContactSettings(Document):
+    """One contact. channel: its input, 0 is the first. fault_when: open (a contact that is closed while all is well, as
+    safety contacts are: a broken wire opens them) or closed. action: what then happens; trip ends the run, hold waits
+    for an operator, warn says so. after_s: how long it must last. means: what people are told."""
+
+    channel: int = Field(ge=0, le=31)
+    fault_when: Literal["open", "closed"] = "open"
+    action: Literal["trip", "hold", "warn"] = "hold"
+    after_s: float = Field(default=0.0, ge=0, le=60)
+    means: Line = ""
+
+
+class InputsSettings(OnBus):
+    """The contacts of the stand, by name; `unit` may be that of the relay board, when it has the inputs."""
+
+    contacts: dict[DeviceName, ContactSettings] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _each_its_own(self) -> Self:
+        if len({contact.channel for contact in self.contacts.values()}) < len(self.contacts):
+            raise ValueError("two contacts share one input")
+        return self
+
+
+class Inputs:
+    """Named contacts of one unit, points input_<n> of the map: 1 closed, 0 open."""
+
+    def __init__(
+        self, name: str, bus: Bus, register_map: RegisterMap, channels: Mapping[str, int], clock: Clock
+    ) -> None:
+        self.name = name
+        self._unit = ModbusUnit(name, bus, register_map)
+        self._points = {contact: f"input_{channel}" for contact, channel in channels.items()}
+        self._clock = clock
+        for contact, point in self._points.items():
+            if point not in register_map.points:
+                raise ConfigError(f"{name}.{contact}: register map {register_map.model} has no {point}")
+
+    async def open(self) -> None:
+        """See that the unit answers; raises DeviceError."""
+        await self.read()
+
+    async def close(self) -> None:
+        """Nothing to let go of."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """Every contact; raises DeviceError."""
+        bits = (await self._unit.snapshot(self._points.values())).bits
+        now_ns = self._clock.now_ns()
+        return tuple(
+            Reading(f"{self.name}.{contact}", float(bits[point]), "1", now_ns)
+            for contact, point in self._points.items()
+        )
