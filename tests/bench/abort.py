@@ -81,16 +81,16 @@ class WatchedRelays(Relays):
 async def _measured(config: StandConfig) -> tuple[list[float], list[float]]:
     """ms of each trip by the operator, and by the guard."""
     draw = random.Random(1)
-    async with _polled(config) as (assembly, control):
+    async with polled(config) as (assembly, control):
         times_ms = [
-            [await _trip_ms(assembly, control, trip, draw.uniform(0.0, POLL_s)) for trip in (_by_operator, _by_guard)]
+            [await trip_ms(assembly, control, trip, draw.uniform(0.0, POLL_s)) for trip in (_by_operator, _by_guard)]
             for _ in range(TRIPS)
         ]
     by_operator, by_guard = zip(*times_ms, strict=True)
     return list(by_operator), list(by_guard)
 
 
-async def _trip_ms(assembly: Assembly, control: ControlSocket, trip: Trip, delay_s: float) -> float:
+async def trip_ms(assembly: Assembly, control: ControlSocket, trip: Trip, delay_s: float) -> float:
     """One trip, `delay_s` after a stand never tripped before has begun to heat."""
     relays = assembly.devices.relays
     config = assembly.config
@@ -143,7 +143,7 @@ async def _expect_heater(control: ControlSocket, enabled: int) -> None:
 
 
 @asynccontextmanager
-async def _polled(config: StandConfig) -> AsyncGenerator[tuple[Assembly, ControlSocket]]:
+async def polled(config: StandConfig) -> AsyncGenerator[tuple[Assembly, ControlSocket]]:
     """A stand with its laboratory in real time, opened (but for the camera) and polled."""
     simulation = config.simulation
     if simulation is None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 import statistics
+from collections.abc import Callable
 from pathlib import Path
 
 from drivers.wires.aravis_library import library
@@ -49,7 +50,7 @@ def figures(directory: Path) -> list[Figure]:
     order = simulated_order(directory, RECIPE, poll_s=1.0)
     simulator = Simulator(laboratory_of(order.config, virtual=False, seed=None))
     try:
-        late_ms = _deviations_ms(order, directory / "jitter")
+        late_ms = deviations_ms(order, directory / "jitter")
     finally:
         simulator.stop()
     p99_ms = statistics.quantiles(late_ms, n=100, method="inclusive")[98]
@@ -57,8 +58,8 @@ def figures(directory: Path) -> list[Figure]:
     return [at_most(LIMIT_ms, Figure(what, "ms", p99_ms, seen))]
 
 
-def _deviations_ms(order: Order, out: Path) -> list[float]:
-    """How late each frame of the first capture was triggered."""
+def deviations_ms(order: Order, out: Path, begun: Callable[[Path], None] = lambda _: None) -> list[float]:
+    """How late each frame of the first capture was triggered. `begun` gets the session."""
     triggered_ns: list[int] = []
 
     def follow(item: Item) -> None:
@@ -68,7 +69,7 @@ def _deviations_ms(order: Order, out: Path) -> list[float]:
     def watch(hub: Hub) -> None:
         hub.subscribe(follow)
 
-    asyncio.run(run_real(order, out, watch))
+    asyncio.run(run_real(order, out, watch, begun))
     shutil.rmtree(out)
     since_first_ns = [time_ns - triggered_ns[0] for time_ns in triggered_ns]
     off_ms = [(time_ns - seconds_ns(number * INTERVAL_s)) / 1e6 for number, time_ns in enumerate(since_first_ns)]

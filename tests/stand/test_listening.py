@@ -114,7 +114,8 @@ async def test_silent_clients_shut_nobody_out(tmp_path: Path, silence: bytes):
             with contextlib.suppress(BrokenPipeError):  # it had to make room already
                 client.sendall(silence)
         for _ in range(2 * MOST_CLIENTS):
-            assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
+            assert (await asyncio.to_thread(ask, tmp_path, "pause"))["verb"] == "pause"
+        assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
 
 
 async def test_a_client_that_asks_and_never_reads_is_not_waited_for(tmp_path: Path):

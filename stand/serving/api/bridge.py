@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import inspect
+import math
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
@@ -29,7 +30,7 @@ _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
 _FRESH_S = 0.3  # so long one who asks for the state waits for a new one
 _QUEUE = 20_000  # items, which are some MB; the thread takes them four times a second at the least
 _PLAN_AGE_S = 5.0  # what a plan has earned and expects changes slowly; a step that begins or ends is told at once
-_STOPPED_S = 0.1  # so long one stop answers for others: they are the same, and a flood must not fill the recording
+_STOPPED_S = 0.1  # between two stops, whoever asks for them: a flood must not fill the recording
 COMMAND_LIMIT_S = 5.0
 _FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
@@ -73,7 +74,7 @@ class Bridge:
         self._plan_at_s = 0.0
         self._tasks: set[asyncio.Task[None]] = set()
         self._stopping: asyncio.Future[Done] | None = None  # on the other side
-        self._stopped: tuple[float, Done] | None = None
+        self._stopped_s = -math.inf
         self._refreshing: asyncio.Future[None] | None = None
         self._next: asyncio.TimerHandle | None = None
         self._is_open = True
@@ -151,14 +152,18 @@ class Bridge:
         return await self.ask(numbered)
 
     async def stop(self, who: Who) -> Done:
-        """Stop, before anything else that waits to be called. Stops that come while one is under way, or within
-        0.1 s, are the same one."""
-        if self._stopped is not None and time.monotonic() < self._stopped[0] + _STOPPED_S:
-            return self._stopped[1]
+        """Stop, before anything else that waits to be called. Stops that come while one is on its way are that one;
+        one that follows within 0.1 s is done when these are over, with all that came until then."""
         if self._stopping is None:
-            self._stopping = asyncio.ensure_future(self.ask(lambda desk: desk.stop(who)))
+            self._stopping = asyncio.ensure_future(self._stop(who))
             self._stopping.add_done_callback(self._has_stopped)
         return await asyncio.shield(self._stopping)
+
+    async def _stop(self, who: Who) -> Done:
+        if (wait_s := self._stopped_s + _STOPPED_S - time.monotonic()) > 0.0:
+            await asyncio.sleep(wait_s)
+        self._stopped_s = time.monotonic()
+        return await self.command(lambda desk: desk.stop(who))
 
     async def fresh(self) -> Snapshot:
         """The stand as it is now; the last snapshot when the control loop has no time for another one."""
@@ -184,8 +189,8 @@ class Bridge:
 
     def _has_stopped(self, stopping: asyncio.Future[Done]) -> None:
         self._stopping = None
-        if not stopping.cancelled() and stopping.exception() is None:
-            self._stopped = time.monotonic(), stopping.result()
+        if not stopping.cancelled():
+            stopping.exception()
 
     def _hand_over(self, call: Callable[[], None]) -> None:
         try:

@@ -1,0 +1,162 @@
+"""What ten viewers of the stream cost: the stop command to the heater confirmed off, the jitter of frames, the control
+loop's lateness, and processor time; each beside the same without them.
+
+The viewers are a process of their own that follows the stream of the Unix socket, as ten open pages do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, cast
+
+from drivers.wires.aravis_library import library
+from foundation.errors import StandError
+from stand.assembly import Assembly
+from stand.config.stand_config import StandConfig
+from stand.running.fold import fold
+from stand.running.journal import Logbook
+from stand.running.run_desk import RunDesk
+from stand.running.stop import Interrupted, Stop
+from stand.serving.api.server import Interface, serve
+from stand.serving.client import Server, server_of
+from stand.serving.desk import Done, StandState, Who
+from stand.serving.presence import living
+from stand.serving.seen import seen_state
+from stand.simulator import Simulator, laboratory_of
+from stand.stand import Stand
+from tests.bench import abort, jitter
+from tests.bench.figures import Figure, at_most, progress, skipped
+from tests.system.simulated_orders import simulated_order
+
+VIEWERS = 10
+TRIPS = 60
+LIMIT_ms = 20.0
+
+FOLLOW = """
+import asyncio, sys
+from websockets.asyncio.client import unix_connect
+
+async def follow():
+    async with unix_connect(sys.argv[1], "ws://localhost/api/v1/stream?from=0") as viewer:
+        async for message in viewer:
+            pass
+
+async def main():
+    await asyncio.gather(*(follow() for _ in range(int(sys.argv[2]))))
+
+asyncio.run(main())
+"""
+
+
+def figures(directory: Path) -> list[Figure]:
+    """99th percentiles, ms."""
+    config = simulated_order(directory, abort.RECIPE, abort.POLL_s).config
+    session = directory / "stops"
+    session.mkdir()
+    progress(f"stop command, {TRIPS} times without and {TRIPS} times with {VIEWERS} viewers")
+    with asyncio.Runner() as runner:
+        alone_ms, viewed_ms = runner.run(_stops(config, session))
+    return [
+        _stop_figure("`stop` over HTTP", alone_ms),
+        _stop_figure(f"`stop` over HTTP, {VIEWERS} viewers", viewed_ms),
+        *_frames(directory),
+    ]
+
+
+def _stop_figure(what: str, times_ms: list[float]) -> Figure:
+    p99_ms = statistics.quantiles(times_ms, n=100, method="inclusive")[98]
+    seen = f"p99 of {len(times_ms)}; median {statistics.median(times_ms):.1f}, longest {max(times_ms):.1f} ms"
+    return at_most(LIMIT_ms, Figure(f"{what} to heater confirmed off", "ms", p99_ms, seen))
+
+
+class _Desk(RunDesk):
+    """Of a stand on which nothing is run but the stop."""
+
+    def state(self) -> StandState:
+        return seen_state(self.assembly.config, self.assembly.stand, self.assembly.hub, self.assembly.clock)
+
+    def stop(self, who: Who) -> Done:
+        self.stop_run()
+        return Done(verb="stop")
+
+
+async def _stops(config: StandConfig, session: Path) -> tuple[list[float], list[float]]:
+    async with abort.polled(config) as (assembly, control):
+        nothing = cast("Any", None)
+        log = Logbook(assembly.hub, assembly.clock, fold((), ()))
+        desk = _Desk(assembly, session, Stop(), log, nothing, nothing, nothing)
+
+        async def by_command(stand: Stand, _: Assembly) -> float:
+            begun_s = math.nan
+            with suppress(Interrupted):
+                async with Stop() as stop:
+                    stop.watch(stand)
+                    desk.stop_run = stop
+                    begun_s = time.perf_counter()
+                    await asyncio.to_thread(server.order, "stop")
+                    await asyncio.Event().wait()
+            return begun_s
+
+        async with serve(desk, assembly.hub, assembly.clock, session, config.name, Interface(session.parent)):
+            server: Server = server_of(session)
+            await asyncio.to_thread(server.state, 30.0)  # everything is imported
+            alone_ms = [await abort.trip_ms(assembly, control, by_command, 0.03) for _ in range(TRIPS)]
+            with followed(session):
+                await asyncio.sleep(2.0)
+                viewed_ms = [await abort.trip_ms(assembly, control, by_command, 0.03) for _ in range(TRIPS)]
+    return alone_ms, viewed_ms
+
+
+@contextmanager
+def followed(session: Path) -> Generator[None]:
+    """Viewers of the daemon that runs `session`, while inside."""
+    (daemon,) = [each for each in living() if each.entry.session == str(session)]
+    process = subprocess.Popen([sys.executable, "-c", FOLLOW, str(daemon.socket), str(VIEWERS)])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _frames(directory: Path) -> list[Figure]:
+    what = f"frame schedule at {1 / jitter.INTERVAL_s:g} fps, {VIEWERS} viewers, deviation"
+    try:
+        library()
+    except StandError as error:
+        return [skipped(what, error)]
+    progress(f"{jitter.FRAMES} frames in real time with {VIEWERS} viewers")
+    order = simulated_order(directory, jitter.RECIPE, poll_s=1.0)
+    simulator = Simulator(laboratory_of(order.config, virtual=False, seed=None))
+    out, viewers = directory / "viewed", list[subprocess.Popen[bytes]]()
+
+    def begun(session: Path) -> None:
+        """Viewers that come as soon as the run can be asked."""
+        script = "import time, sys\nfrom pathlib import Path\nfrom stand.serving.presence import living\n"
+        script += "while not (found := [d for d in living() if d.entry.session == sys.argv[1]]): time.sleep(0.2)\n"
+        script += "sys.argv[1] = str(found[0].socket)\n" + FOLLOW
+        viewers.append(subprocess.Popen([sys.executable, "-c", script, str(session), str(VIEWERS)]))
+
+    began_s, used_s = time.monotonic(), time.process_time()
+    try:
+        late_ms = jitter.deviations_ms(order, out, begun)
+        share = (time.process_time() - used_s) / (time.monotonic() - began_s)
+    finally:
+        simulator.stop()
+        for viewer in viewers:
+            viewer.kill()
+            viewer.wait()
+    p99_ms = statistics.quantiles(late_ms, n=100, method="inclusive")[98]
+    seen = f"p99 of {len(late_ms)} frames; median {statistics.median(late_ms):.2f}, last {max(late_ms):.2f} ms late"
+    figure = at_most(
+        jitter.LIMIT_ms, Figure(what, "ms", p99_ms, f"{seen}; the daemon took {100 * share:.0f} % of a core")
+    )
+    return [figure]
