@@ -27,6 +27,7 @@ app = lazy_app(
         "config": Lazy("stand.commands.config_cli", "Configuration files: JSON Schemas for editors, older versions."),
         "queue": Lazy("stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
         "alert": Lazy("stand.commands.alert_cli", "Alerts to people elsewhere: test them."),
+        "token": Lazy("stand.commands.token_cli", "Tokens for the network: add, list, remove, login."),
         "session": Lazy(
             "stand.commands.session_commands",
             "Recorded sessions: list, look at, verify, salvage, replay, export, trim.",

@@ -18,6 +18,7 @@ from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.usage import one_line
 from stand.aside import aside
+from stand.config.interface import load_tokens
 from stand.config.stand_config import load_config, packaged
 from stand.daemon.desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
@@ -47,7 +48,7 @@ def serve(
         stand = load_config(path)
         texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
         directory = (out or stand.recording.directory).absolute()
-        interface = Interface(directory, host, port)
+        interface = Interface(directory, host, port, load_tokens(stand.interface.secrets), stand.interface.hosts)
         interface.check()
 
         @asynccontextmanager

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import stat
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +9,7 @@ from pydantic import Field
 
 from foundation.documents import Document, parse_document
 from foundation.errors import ConfigError
+from stand.config.private_file import private_text
 
 Cause = Literal[
     "trip",
@@ -36,7 +35,6 @@ _ALL: tuple[Cause, ...] = (
     "queue_empty",
     "eta_slipped",
 )
-_LARGEST_BYTES = 100_000
 
 
 class AlertsConfig(Document):
@@ -63,24 +61,11 @@ class AlertSecrets(Document):
 def load_secrets(path: Path) -> AlertSecrets:
     """ConfigError when the file cannot be used, or others may read it; its sentence quotes nothing of the file."""
     place = f"alerts.secrets: {path}"
+    text = private_text(path, place)
     try:
-        fd = os.open(path.expanduser(), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    except OSError as error:
-        raise ConfigError(f"{place}: cannot be read ({error.strerror})") from error
-    try:
-        told = os.fstat(fd)
-        if not stat.S_ISREG(told.st_mode) or told.st_size > _LARGEST_BYTES:
-            raise ConfigError(f"{place}: is no file of a few lines")
-        if told.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-            mode = stat.S_IMODE(told.st_mode)
-            raise ConfigError(f"{place}: others may read or write it (mode {mode:04o}); type `chmod 600 {path}`")
-        data = os.read(fd, _LARGEST_BYTES)
-    finally:
-        os.close(fd)
-    try:
-        return parse_document(data.decode(), AlertSecrets, str(path))
-    except (ConfigError, UnicodeDecodeError):
-        text = (
+        return parse_document(text, AlertSecrets, str(path))
+    except ConfigError:
+        wrong = (
             "is not as it should be: `urls:` with a list of Apprise's addresses, and `alive_url:` with an http address"
         )
-        raise ConfigError(f"{place}: {text}") from None  # the reason would quote a secret
+        raise ConfigError(f"{place}: {wrong}") from None  # the reason would quote a secret

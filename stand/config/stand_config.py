@@ -27,6 +27,7 @@ from foundation.documents import Document, load_document
 from foundation.errors import ConfigError
 from stand.config.alerts import AlertsConfig
 from stand.config.guard import GuardConfig
+from stand.config.interface import InterfaceConfig
 from stand.config.looks import ChamberConfig
 from stand.config.older_forms import CAMERA, renewed
 from stand.config.safe_ranges import check, outside
@@ -129,6 +130,7 @@ class StandConfig(Document):
     compressor: CompressorConfig = CompressorConfig()
     recording: RecordingConfig = RecordingConfig()
     alerts: AlertsConfig = AlertsConfig()
+    interface: InterfaceConfig = InterfaceConfig()
     simulation: SimulationConfig | None = None
 
     @model_validator(mode="before")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 import statistics
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from drivers.wires.aravis_library import library
@@ -58,7 +58,11 @@ def figures(directory: Path) -> list[Figure]:
     return [at_most(LIMIT_ms, Figure(what, "ms", p99_ms, seen))]
 
 
-def deviations_ms(order: Order, out: Path, begun: Callable[[Path], None] = lambda _: None) -> list[float]:
+async def _nobody(_: Path) -> None:
+    pass
+
+
+def deviations_ms(order: Order, out: Path, begun: Callable[[Path], Awaitable[None]] | None = None) -> list[float]:
     """How late each frame of the first capture was triggered. `begun` gets the session."""
     triggered_ns: list[int] = []
 
@@ -69,7 +73,7 @@ def deviations_ms(order: Order, out: Path, begun: Callable[[Path], None] = lambd
     def watch(hub: Hub) -> None:
         hub.subscribe(follow)
 
-    asyncio.run(run_real(order, out, watch, begun))
+    asyncio.run(run_real(order, out, watch, begun or _nobody))
     shutil.rmtree(out)
     since_first_ns = [time_ns - triggered_ns[0] for time_ns in triggered_ns]
     off_ms = [(time_ns - seconds_ns(number * INTERVAL_s)) / 1e6 for number, time_ns in enumerate(since_first_ns)]

@@ -42,12 +42,15 @@ LIMIT_ms = 20.0
 
 FOLLOW = """
 import asyncio, sys
+from contextlib import suppress
 from websockets.asyncio.client import unix_connect
+from websockets.exceptions import ConnectionClosed
 
 async def follow():
     async with unix_connect(sys.argv[1], "ws://localhost/api/v1/stream?from=0") as viewer:
-        async for message in viewer:
-            pass
+        with suppress(ConnectionClosed):
+            async for message in viewer:
+                pass
 
 async def main():
     await asyncio.gather(*(follow() for _ in range(int(sys.argv[2]))))
@@ -138,7 +141,7 @@ def _frames(directory: Path) -> list[Figure]:
     simulator = Simulator(laboratory_of(order.config, virtual=False, seed=None))
     out, viewers = directory / "viewed", list[subprocess.Popen[bytes]]()
 
-    def begun(session: Path) -> None:
+    async def begun(session: Path) -> None:
         """Viewers that come as soon as the run can be asked."""
         script = "import time, sys\nfrom pathlib import Path\nfrom stand.serving.presence import living\n"
         script += "while not (found := [d for d in living() if d.entry.session == sys.argv[1]]): time.sleep(0.2)\n"

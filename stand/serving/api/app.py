@@ -58,7 +58,7 @@ def make_app(
         redirect_slashes=False,
         responses={403: _ERROR, 401: _ERROR, 422: _ERROR},
     )
-    app.include_router(reads(bridge, stream, access))
+    app.include_router(reads(bridge, stream, access, interface.url))
     app.include_router(commands(bridge))
     app.include_router(recorded(bridge, interface.sessions))
     for room in interface.rooms:

@@ -35,6 +35,14 @@ class Health(BaseModel):
     error: str = ""
 
 
+class Invitation(BaseModel):
+    """What opens the page in a browser elsewhere, once, within ten minutes. url: "" when the stand is not reached over
+    the network."""
+
+    path: str
+    url: str
+
+
 class Events(BaseModel):
     """Events after a number. seq: the last one given, to go on from; gone: what came before is not kept any more."""
 
@@ -43,8 +51,8 @@ class Events(BaseModel):
     events: list[dict[str, Any]]
 
 
-def reads(bridge: Bridge, stream: Stream, access: Access) -> APIRouter:
-    """The routes."""
+def reads(bridge: Bridge, stream: Stream, access: Access, url: str) -> APIRouter:
+    """The routes. url: of this stand on the network, "" when it does not listen there."""
     router = APIRouter()
 
     @router.get("/healthz", response_model=Health, responses={503: {"model": Health}})
@@ -104,11 +112,11 @@ def reads(bridge: Bridge, stream: Stream, access: Access) -> APIRouter:
         answer.set_cookie(COOKIE, cookie, max_age=30 * 86400, httponly=True, samesite="strict", path="/")
         return answer
 
-    @router.post("/api/v1/login")
+    @router.post("/api/v1/login", response_model=Invitation)
     async def invite(request: Request) -> Response:
         """A one-time path that opens the page on another machine; for the Unix socket and holders of a token."""
-        who = request.state.who
-        return _json(json_of({"path": f"{LOGIN_PATH}?once={access.login_code(who.name)}"}))
+        path = f"{LOGIN_PATH}?once={access.login_code(request.state.who.name)}"
+        return _json(json_of({"path": path, "url": f"{url}{path}" if url else ""}))
 
     return router
 

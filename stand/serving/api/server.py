@@ -41,6 +41,14 @@ class Interface:
     hosts: tuple[str, ...] = ()
     rooms: Sequence[Callable[[Bridge], Any]] = ()
 
+    @property
+    def url(self) -> str:
+        """Where it is reached over the network, "" when it is not."""
+        if self.port is None:
+            return ""
+        name = socket.gethostname() if self.host in ("0.0.0.0", "::", "") else self.host
+        return f"http://[{name}]:{self.port}" if ":" in name else f"http://{name}:{self.port}"
+
     def check(self) -> None:
         """ConfigError when everybody on the network could operate the stand."""
         from stand.serving.api.access import is_loopback

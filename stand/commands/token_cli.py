@@ -1,0 +1,108 @@
+"""`stand token`: who may operate a stand over the network."""
+
+from __future__ import annotations
+
+import json
+import secrets
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.usage import OneLineUsage
+from stand.commands.reached import DirectoryArgument, JsonOption, reached
+from stand.serving.client import API, Answer
+
+app = typer.Typer(
+    cls=OneLineUsage,
+    no_args_is_help=True,
+    add_completion=False,
+    help="Tokens for the network: add, list, remove, login.\n\nExample: stand token add rose --config my-stand.yaml",
+)
+
+ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
+NameArgument = Annotated[str, typer.Argument(help="Who has the token; it is recorded with what they do.")]
+_BYTES = 32
+
+
+@app.command()
+def add(name: NameArgument, config: ConfigOption = "simulated") -> None:
+    """Make a token and print it, once. A daemon that runs already takes it when it is started again.
+
+    Example: stand token add rose --config my-stand.yaml
+    """
+    from stand.config.interface import TokenFile, load_tokens, write_tokens
+
+    with one_line_errors():
+        path = _file(config)
+        tokens = load_tokens(path) if path.expanduser().exists() else {}
+        if name in tokens:
+            raise ConfigError(f"{path}: {name} has a token already; `stand token remove {name}` first")
+        token = secrets.token_urlsafe(_BYTES)
+        try:
+            TokenFile(tokens={name: token})
+        except ValueError:
+            raise ConfigError(f"{name!r}: a name has up to 64 letters, digits and . _ @ -") from None
+        write_tokens(path, {**tokens, name: token})
+        typer.echo(token)
+
+
+@app.command("list")
+def list_names(config: ConfigOption = "simulated", as_json: JsonOption = False) -> None:
+    """Who has a token.
+
+    Example: stand token list --config my-stand.yaml
+    """
+    from stand.config.interface import load_tokens
+
+    with one_line_errors():
+        names = sorted(load_tokens(_file(config)))
+        if as_json:
+            typer.echo(json.dumps(names))
+            return
+        for name in names:
+            typer.echo(name)
+
+
+@app.command()
+def remove(name: NameArgument, config: ConfigOption = "simulated") -> None:
+    """Take a token back; a daemon that runs already knows it until it is started again.
+
+    Example: stand token remove rose --config my-stand.yaml
+    """
+    from stand.config.interface import load_tokens, write_tokens
+
+    with one_line_errors():
+        path = _file(config)
+        tokens = load_tokens(path)
+        if name not in tokens:
+            raise ConfigError(f"{path}: {name} has no token; `stand token list` shows who has")
+        write_tokens(path, {other: token for other, token in tokens.items() if other != name})
+
+
+@app.command()
+def login(directory: DirectoryArgument = None, config: ConfigOption = "simulated", as_json: JsonOption = False) -> None:
+    """An address that opens the page in a browser elsewhere, once, within ten minutes. Asked of the running daemon.
+
+    Example: stand token login
+    """
+    with one_line_errors():
+        server = reached(directory, config, anywhere=True)
+        answer = cast("Answer", server.request("POST", f"{API}/login"))
+        if as_json:
+            typer.echo(json.dumps(answer))
+            return
+        if not answer["url"]:
+            raise ConfigError(f"{server.name}: its daemon does not listen to the network; start it with --port")
+        typer.echo(str(answer["url"]))
+
+
+def _file(config: str) -> Path:
+    from stand.config.stand_config import load_config, packaged
+
+    stand = load_config(packaged("", config))
+    if stand.interface.secrets is None:
+        raise ConfigError(f"{config}: has no interface.secrets; name a file for the tokens there (docs/api.md)")
+    return stand.interface.secrets

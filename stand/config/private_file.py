@@ -1,0 +1,32 @@
+"""Files of secrets, which the configuration names and nothing records, attaches or shows."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from foundation.errors import ConfigError
+
+_LARGEST_BYTES = 100_000
+
+
+def private_text(path: Path, place: str) -> str:
+    """The file's text; `place` is for messages. ConfigError when it cannot be used, or others may read or write it; its
+    sentence quotes nothing of the file."""
+    try:
+        fd = os.open(path.expanduser(), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError as error:
+        raise ConfigError(f"{place}: cannot be read ({error.strerror})") from error
+    try:
+        told = os.fstat(fd)
+        if not stat.S_ISREG(told.st_mode) or told.st_size > _LARGEST_BYTES:
+            raise ConfigError(f"{place}: is no file of a few lines")
+        if told.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            mode = stat.S_IMODE(told.st_mode)
+            raise ConfigError(f"{place}: others may read or write it (mode {mode:04o}); type `chmod 600 {path}`")
+        return os.read(fd, _LARGEST_BYTES).decode()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{place}: is no text") from None
+    finally:
+        os.close(fd)

@@ -1,0 +1,74 @@
+"""Tokens for the network: their file, and the commands that write it."""
+
+import stat
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from foundation.errors import ConfigError
+from stand.commands.token_cli import app
+from stand.config.interface import load_tokens, write_tokens
+from stand.config.stand_config import load_config, packaged
+
+TOKEN = "correct-horse-battery-staple"
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["interface"] = {"secrets": str(tmp_path / "private" / "tokens.yaml"), "hosts": ["stand.example"]}
+    path = tmp_path / "stand.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def invoke(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_a_token_is_made_listed_known_and_taken_back(config: Path):
+    made = invoke("add", "rose", "--config", config)
+    token = made.stdout.strip()
+    assert (made.exit_code, len(token) >= 40) == (0, True)
+    path = load_config(config).interface.secrets
+    assert path is not None
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert load_tokens(path) == {"rose": token}
+    assert "has a token already" in invoke("add", "rose", "--config", config).stderr
+    assert invoke("add", "<script>", "--config", config).exit_code == 2
+    assert invoke("add", "li.wei@home", "--config", config).exit_code == 0
+    assert invoke("list", "--config", config).stdout == "li.wei@home\nrose\n"
+    assert invoke("remove", "rose", "--config", config).exit_code == 0
+    assert "has no token" in invoke("remove", "rose", "--config", config).stderr
+    assert list(load_tokens(path)) == ["li.wei@home"]
+
+
+def test_without_a_file_in_the_configuration_it_is_said_where_to_name_one():
+    told = invoke("add", "rose")
+    assert told.exit_code == 2
+    assert "has no interface.secrets" in told.stderr
+    assert load_tokens(None) == {}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [f"tokens: {{rose: short{TOKEN[:5]}}}", f"tokens: [{TOKEN}]", f"tokens: {{rose: [{TOKEN}]}}", f"- {TOKEN}"],
+)
+def test_what_is_wrong_in_the_file_is_said_without_a_word_of_it(tmp_path: Path, content: str):
+    path = tmp_path / "tokens.yaml"
+    path.write_text(content)
+    path.chmod(0o600)
+    with pytest.raises(ConfigError, match="is not as it should be") as raised:
+        load_tokens(path)
+    assert TOKEN[:5] not in str(raised.value)
+
+
+def test_a_file_that_others_may_read_is_refused(tmp_path: Path):
+    path = tmp_path / "tokens.yaml"
+    write_tokens(path, {"rose": TOKEN})
+    assert load_tokens(path) == {"rose": TOKEN}
+    path.chmod(0o640)
+    with pytest.raises(ConfigError, match="others may read or write it"):
+        load_tokens(path)
