@@ -56,7 +56,8 @@ def serve(
             viewing = Viewing(hub, clock, directory, texts["target.yaml"])
             served = replace(interface, rooms=(_page(viewing),))
             async with serve_clients(desk, hub, clock, directory, stand.name, served):
-                typer.echo(f"{stand.name} is open; sessions go to {directory}", err=True)
+                where = f"; http://{host}:{port}/" if port is not None else ""
+                typer.echo(f"{stand.name} is open; sessions go to {directory}{where}", err=True)
                 with aside() as later:
                     say = later(_say)
 

@@ -35,6 +35,7 @@ from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
 from stand.running.house import House
 from stand.running.stop import Interrupted
+from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 
 # What answers the daemon's clients while inside.
@@ -42,7 +43,7 @@ Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[objec
 
 _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
-_KEEP_EVERY_S = 60.0
+_KEEP_EVERY_S, _READ_EVERY_S = 60.0, 5.0
 _EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0  # systemd is asked for more time while the stand is made safe
 
 
@@ -190,10 +191,14 @@ class Daemon:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            if self.house.latched is not None or self.orders.queued.halted or self.orders.leaving:
+            queued = self.orders.queued
+            if self.house.latched is not None or queued.halted or self.orders.leaving:
+                continue
+            if not any(entry.is_open for entry in queued.entries):
                 continue
             try:
                 await drain(directory, self._run_one, self._clock, self._say, lane)
+                self._tell("info", "queue_empty", "all that was queued is done")
             except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
                 self._say(f"the queue is halted: {failure_text(error)}")
             with suppress(SessionError):
@@ -204,6 +209,13 @@ class Daemon:
             raise Interrupted("the daemon ends")
         if self.house.latched is not None:
             raise StandTripped(f"the stand has tripped: {self.house.latched.text}")
+        has_begun = False
+
+        def begun() -> None:
+            nonlocal has_begun
+            has_begun = True
+            self._beside(self._hand_over())
+
         self.has_guest = True
         systemd.tell(f"STATUS=run {entry.id} ({entry.recipe})")
         try:
@@ -211,11 +223,15 @@ class Daemon:
             await self.orders.read()
             if self._assembly.stand.chamber.permits.granted:
                 await self._assembly.stand.chamber.stop()
-            return await self.orders.run_one(entry, notes, lambda: self._beside(self._hand_over()), self._say)
+            return await self.orders.run_one(entry, notes, begun, self._say)
         except Stopped as error:
             waiting = [each for each in self.orders.queued.entries if each.is_open]
             if waiting:
                 raise StandTripped(f"{error}; `stand clear` lets the next of the queue begin") from error
+            raise
+        except StandError as error:
+            if not has_begun and not isinstance(error, Interrupted):
+                self._tell("error", RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
             raise
         finally:
             await self._record_house()
@@ -250,9 +266,14 @@ class Daemon:
 
     async def _look_after(self) -> None:
         """Midnight, a record that has ended by itself, and what is kept for the next start."""
-        kept_ns = self._clock.now_ns()
+        kept_ns = read_ns = self._clock.now_ns()
         while True:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_LOOK_S))
+            if self._clock.now_ns() - read_ns >= _READ_EVERY_S * NS_PER_S and not self.has_guest:
+                read_ns = self._clock.now_ns()
+                with suppress(SessionError):
+                    await self.orders.read()  # `stand queue add` writes it, too
+                self.wake()
             if not self.has_guest and self._needs_record():
                 self.house.unrecorded()
                 await self._end_record()

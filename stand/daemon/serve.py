@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 from foundation.clock import WallClock
@@ -22,6 +23,7 @@ from stand.daemon.orders import Orders
 from stand.running.claim import claimed
 from stand.running.house import opened
 from stand.running.stop import Stop
+from stand.serving.alerts import alerting
 
 
 async def serve(config: StandConfig, config_name: str, texts: dict[str, str], out: Path, front: Front) -> None:
@@ -38,7 +40,9 @@ async def serve(config: StandConfig, config_name: str, texts: dict[str, str], ou
         assembly = assemble(config, hub, clock)
         assembly.notifier.start()
         try:
-            async with opened(assembly, watch.run, stop, is_for_one=False) as house:
+            async with AsyncExitStack() as stack:
+                house = await stack.enter_async_context(opened(assembly, watch.run, stop, is_for_one=False))
+                await stack.enter_async_context(alerting(config.name, config.alerts, hub, clock, house.is_well))
                 if house.disk is None:
                     raise ValueError("a daemon is on the host's clock, and has a process for its disk")
                 record = HouseRecord(assembly, texts["config.yaml"], out, clock)

@@ -89,6 +89,10 @@ class House:
         """What the guard has made the stand safe for, and nobody has cleared."""
         return None if self._guard is None else self._guard.held
 
+    def is_well(self) -> bool:
+        """Whether the guard looks as often as it must, and finds nothing."""
+        return self._guard is not None and self._guard.is_on_time and self._guard.held is None
+
     @property
     def tasks(self) -> tuple[asyncio.Task[None], ...]:
         """Those whose end ends everything."""

@@ -325,6 +325,25 @@ async def test_a_fault_that_aborts_does_so_during_a_hold():
     assert bench.log == ["hold rule0", "revoke", "safe", "stop rule1", "revoke", "safe"]
 
 
+async def test_a_guard_that_keeps_on_looks_after_an_abort_which_stays_until_it_is_cleared():
+    bench = Bench("hold", "abort")
+    bench.guard.keeps_on = True
+    bench.objecting = {1}
+    assert await bench.run_for(5)
+    assert bench.log == ["stop rule1", "revoke", "safe"]  # once, though it still objects
+    bench.objecting = {0, 1}
+    assert await bench.run_for(2)
+    assert bench.log == ["stop rule1", "revoke", "safe"]
+    assert not bench.guard.may_permit()
+    assert bench.guard.is_on_time
+    bench.guard.clear()
+    assert bench.guard.held == Fault("rule0", "it is so", "hold")  # still wrong: held again, before anything moves
+    bench.objecting = set()
+    bench.guard.clear()
+    assert await bench.run_for(2)
+    assert bench.guard.may_permit()
+
+
 async def test_without_a_way_to_hold_every_trip_aborts():
     bench = Bench("hold", can_hold=False)
     bench.objecting = {0}

@@ -111,6 +111,7 @@ def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve
     served = serve()
     idle = served.until(is_idle)
     assert idle.run is None
+    assert served.server.request("GET", "/api/v1/history?from_ns=0&to_ns=9000000000000000000&points=10")
     assert idle.readings["thermometers.air"].value is not None
     assert not idle.heater_permitted
     served.submit(BRIEF, "one")
@@ -211,6 +212,7 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(serve
     again = serve()
     latched = again.until(is_idle)
     assert latched.fault is not None
+    assert latched.counters["relay_cycles.heater_enable"] >= 1  # of the daemon before
     assert latched.fault.rule == tripped.fault.rule
     again.post("run/clear")
     again.until(lambda state: state.fault is None and states_of(state) == ["done"])

@@ -1,0 +1,103 @@
+"""What a daemon counts, keeps for the next start, and tells the service manager."""
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from foundation.clock import NS_PER_S, WallClock
+from foundation.hub import Hub
+from foundation.items import Batch, Event
+from foundation.readings import Reading, bad_reading
+from stand.daemon import systemd
+from stand.daemon.counters import Counters
+from stand.daemon.kept import Kept, KeptFile, Latch, kept_in
+
+
+def read(hub: Hub, time_s: float, **values: float) -> None:
+    """One batch of a device: `relays_compressor=1` is its channel and value."""
+    time_ns = round(time_s * NS_PER_S)
+    readings = tuple(Reading(name.replace("__", "."), value, "1", time_ns) for name, value in values.items())
+    hub.publish(Batch(readings[0].channel.partition(".")[0], time_ns, readings))
+
+
+def test_what_wears_is_counted_from_what_is_read():
+    hub = Hub()
+    counters = Counters({"compressor_starts": 7.0}, ["linear"], 2000.0, hub)
+    for time_s, on in ((0, 0), (10, 1), (20, 1), (30, 1), (40, 0)):
+        read(hub, time_s, relays__compressor=on, relays__heater_enable=on)
+        read(hub, time_s, regulator__mv_heat=50.0)
+    for time_s, position in ((0, 0.0), (5, 0.4), (10, 1.0), (15, 1.0), (20, 0.0), (25, 1.0)):
+        read(hub, time_s, flap__position=position)
+    for time_s, position, moving in ((0, 0.0, 0), (5, 1.0, 1), (10, 2.0, 1), (15, 2.0, 0), (20, 2.0, 0), (25, 0.0, 0)):
+        read(hub, time_s, linear__position=position, linear__moving=moving)
+    values = counters.values
+    assert values["compressor_starts"] == 8
+    assert values["compressor_hours"] == pytest.approx(30 / 3600)
+    assert values["relay_cycles.compressor"] == values["relay_cycles.heater_enable"] == 1
+    assert values["flap_cycles"] == 2
+    assert values["stage_cycles.linear"] == 2  # the second lay between two polls
+    assert values["heater_Wh"] == pytest.approx(0.5 * 2000 * 30 / 3600)
+
+
+def test_what_was_not_read_is_not_counted():
+    hub = Hub()
+    counters = Counters({}, [], 2000.0, hub)
+    read(hub, 0, relays__compressor=1)
+    hub.publish(Batch("relays", NS_PER_S, (bad_reading("relays.compressor", "1", NS_PER_S, "no answer", "wire"),)))
+    read(hub, 3600, relays__compressor=1)  # an hour in which nobody knows
+    assert counters.values["compressor_hours"] == 0
+    assert counters.values["compressor_starts"] == 0
+
+
+async def test_counters_and_a_fault_are_there_for_the_next_daemon(tmp_path: Path):
+    kept = KeptFile(tmp_path, lambda function, *arguments: function(*arguments), Hub(), WallClock())
+    last = Kept(counters={"flap_cycles": 3.0}, latch=Latch(rule="folder_lost", text="it is gone", since_ns=5))
+    kept.note(Kept(counters={"flap_cycles": 1.0}))
+    kept.note(last)
+    await kept.close()
+    assert kept_in(tmp_path) == last
+    (tmp_path / "daemon.json").write_text("{")
+    assert kept_in(tmp_path) == Kept()  # a damaged file is no reason not to open a stand
+    assert kept_in(tmp_path / "nowhere") == Kept()
+
+
+async def test_a_disk_that_refuses_is_an_event(tmp_path: Path):
+    def refused(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    hub, events = Hub(), list[Event]()
+    hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
+    kept = KeptFile(tmp_path, refused, hub, WallClock())
+    kept.note(Kept())
+    await kept.close()
+    assert [event.kind for event in events] == ["daemon_not_kept"]
+
+
+@pytest.fixture
+def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """The service manager's socket."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as found:
+        found.bind(str(tmp_path / "notify"))
+        found.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield found
+
+
+def test_the_service_manager_is_told_in_lines(manager: socket.socket, monkeypatch: pytest.MonkeyPatch):
+    systemd.tell(systemd.READY, "STATUS=idle")
+    assert manager.recv(1000) == b"READY=1\nSTATUS=idle"
+    systemd.tell(systemd.extended(60.0))
+    assert manager.recv(1000) == b"EXTEND_TIMEOUT_USEC=60000000"
+    monkeypatch.setenv("WATCHDOG_USEC", "30000000")
+    assert systemd.watchdog_s() == 30.0
+    monkeypatch.setenv("WATCHDOG_PID", "1")  # somebody else's
+    assert systemd.watchdog_s() is None
+
+
+def test_without_a_service_manager_nobody_is_told(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    monkeypatch.delenv("WATCHDOG_USEC", raising=False)
+    systemd.tell(systemd.READY)
+    assert systemd.watchdog_s() is None
