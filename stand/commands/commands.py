@@ -15,6 +15,7 @@ app = lazy_app(
         "demo": Lazy(_RUN, "Run a simulated thermal cycle, fit the drift, and print what compensation gains."),
         "run": Lazy(_RUN, "Run a recipe and record it."),
         "serve": Lazy("stand.commands.serve_cli", "Own a stand for days: its queue, its page, devices by hand."),
+        "service": Lazy("stand.commands.service_cli", "The daemon as a systemd service, with udev rules."),
         "resume": Lazy(_RUN, "Resume a run that was killed or interrupted, in its session."),
         "status": Lazy(_CONTROL, "What the running session is doing."),
         "watch": Lazy(_CONTROL, "What happens, as it happens."),

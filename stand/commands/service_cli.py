@@ -1,0 +1,121 @@
+"""`stand service`: the daemon as a systemd service, and the device files that it needs."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.files import write_whole
+from stand.config.stand_config import StandConfig, load_config, packaged
+
+app = typer.Typer(add_completion=False)
+
+UNITS, RULES = Path("etc/systemd/system"), Path("etc/udev/rules.d/60-thermostand.rules")
+_STOP_S, _WATCHDOG_S = 60, 60  # it asks for more time while the stand is being made safe
+
+
+@app.callback()
+def service() -> None:
+    """The daemon as a service of this machine.
+
+    Example: stand service install laboratory.yaml
+    """
+
+
+@app.command()
+def install(
+    config: Annotated[str, typer.Argument(help="The stand's configuration file.")],
+    user: Annotated[str, typer.Option(help="The user it runs as, who owns the sessions.")] = "",
+    port: Annotated[int | None, typer.Option(help="As of `stand serve`.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Write the files; without it they are only shown.")] = False,
+    root: Annotated[Path, typer.Option(help="Where the machine's folders are.", hidden=True)] = Path("/"),
+) -> None:
+    """Show, and with --yes write, a systemd unit for `stand serve` and udev rules for its devices.
+
+    Example: sudo stand service install laboratory.yaml --user operator --yes
+    """
+    with one_line_errors():
+        path = packaged("", config).absolute()
+        stand = load_config(path)
+        name = user or os.environ.get("SUDO_USER") or os.environ.get("USER") or "root"
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}", name):
+            raise ConfigError(f"--user {name}: expected the name of a user")
+        files = {root / UNITS / f"{unit_name(stand)}.service": unit(path, stand, name, port), root / RULES: rules(name)}
+        for file, text in files.items():
+            typer.echo(f"# {file}\n{text}")
+        if not yes:
+            typer.echo("nothing was written; --yes writes these files", err=True)
+            return
+        for file, text in files.items():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(file, text)
+        typer.echo(
+            f"written; now: systemctl daemon-reload && systemctl enable --now {unit_name(stand)}; "
+            "udevadm control --reload && udevadm trigger",
+            err=True,
+        )
+
+
+def unit_name(stand: StandConfig) -> str:
+    """Of the service."""
+    return f"thermostand-{re.sub(r'[^A-Za-z0-9_.-]+', '-', stand.name)}"
+
+
+def unit(config: Path, stand: StandConfig, user: str, port: int | None) -> str:
+    """The unit: restarted when it dies, watched, and given the time that making safe takes."""
+    arguments = [sys.executable, "-m", "stand.cli", "serve", str(config)]
+    arguments += [] if port is None else ["--port", str(port)]
+    return f"""[Unit]
+Description=Thermal stand {_of_unit(stand.name)}
+After=network-online.target time-sync.target
+Wants=network-online.target
+
+[Service]
+Type=notify
+NotifyAccess=main
+User={user}
+WorkingDirectory={_of_unit(str(config.parent))}
+ExecStart={" ".join(map(_quoted, arguments))}
+Restart=on-failure
+RestartSec=10
+WatchdogSec={_WATCHDOG_S}
+TimeoutStartSec=180
+TimeoutStopSec={_STOP_S}
+KillMode=mixed
+RuntimeDirectory=lock/thermostand
+RuntimeDirectoryMode=0700
+RuntimeDirectoryPreserve=yes
+Nice=-5
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def rules(user: str) -> str:
+    """The flap's USB controller and the stages' serial ports belong to the user; stages keep a name of their own."""
+    return f"""# The flap: Pololu Jrk, by USB
+SUBSYSTEM=="usb", ATTR{{idVendor}}=="1ffb", OWNER="{user}", MODE="0660"
+# Stages: XIMC controllers, as /dev/ximc/SERIAL (hexadecimal)
+SUBSYSTEM=="tty", ATTRS{{idVendor}}=="1cbe", ATTRS{{idProduct}}=="0007", OWNER="{user}", MODE="0660", \\
+  SYMLINK+="ximc/%s{{serial}}"
+# Serial adapters of the Modbus bus
+SUBSYSTEM=="tty", SUBSYSTEMS=="usb", OWNER="{user}", MODE="0660"
+"""
+
+
+def _quoted(argument: str) -> str:
+    """As systemd reads a command line."""
+    return f'"{_of_unit(argument)}"' if re.search(r"[\s\"'\\]", argument) else _of_unit(argument)
+
+
+def _of_unit(text: str) -> str:
+    """Percent signs are specifiers there, and a dollar begins a variable."""
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$").replace("\n", " ")

@@ -1,0 +1,43 @@
+"""`stand service install` shows a unit and rules, and writes them when it is told to."""
+
+import configparser
+import shlex
+from pathlib import Path
+
+from typer.testing import CliRunner, Result
+
+from stand.commands.commands import app
+from stand.config.stand_config import packaged
+
+CONFIG = packaged("", "simulated")
+
+
+def installed(*options: str) -> Result:
+    return CliRunner().invoke(app, ["service", "install", str(CONFIG), *options])
+
+
+def test_the_files_are_shown_and_not_written_without_a_yes(tmp_path: Path):
+    shown = installed("--root", str(tmp_path), "--user", "operator")
+    assert shown.exit_code == 0
+    assert "Type=notify" in shown.stdout
+    assert "nothing was written" in shown.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_unit_starts_the_daemon_and_gives_it_time_to_make_safe(tmp_path: Path):
+    assert installed("--root", str(tmp_path), "--user", "operator", "--port", "8080", "--yes").exit_code == 0
+    unit = configparser.ConfigParser(interpolation=None, strict=False)
+    unit.optionxform = str  # pyright: ignore[reportAttributeAccessIssue] - as its documentation says
+    unit.read(tmp_path / "etc/systemd/system/thermostand-simulated-stand.service")
+    command = shlex.split(unit["Service"]["ExecStart"])
+    assert command[1:] == ["-m", "stand.cli", "serve", str(CONFIG.absolute()), "--port", "8080"]
+    assert unit["Service"]["User"] == "operator"
+    assert int(unit["Service"]["WatchdogSec"]) == 60
+    rules = (tmp_path / "etc/udev/rules.d/60-thermostand.rules").read_text()
+    assert 'ATTR{idVendor}=="1ffb", OWNER="operator"' in rules
+    assert 'SYMLINK+="ximc/%s{serial}"' in rules
+
+
+def test_a_user_is_a_name(tmp_path: Path):
+    assert installed("--root", str(tmp_path), "--user", "a\nExecStart=b", "--yes").exit_code == 2
+    assert list(tmp_path.iterdir()) == []
