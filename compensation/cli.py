@@ -19,6 +19,9 @@ app = lazy_app(
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
         "export": Lazy(_APPLY, "Write the model for other programs: JSON, and a module that needs numpy only."),
         "calibrate": Lazy("compensation.commands.calibration_cli", "Calibrate the camera: pinhole and ray model."),
+        "calibrate-photographs": Lazy(
+            "compensation.commands.photographs_cli", "Calibrate a camera from photographs of a board in any poses."
+        ),
         "validate": Lazy("compensation.commands.validate_cli", "How far the target seems to move in space."),
         "budget": Lazy("compensation.commands.budget_cli", "The stand's error budget, in um and px."),
     },

@@ -138,7 +138,7 @@ def problem_of(
         sigma_mm=board.sigma_mm,
         freed=freed,
         errors_sigma=np.where(freed, sigma_vector, 1.0),
-        lens_sigma=_lens_sigma(lens),
+        lens_sigma=lens_sigma(lens),
     )
 
 
@@ -150,7 +150,7 @@ def _seen_points(scene: Scene, problem: Problem) -> Float:
     return turned + translations[problem.position]
 
 
-def _lens_sigma(lens: Pinhole) -> Float:
+def lens_sigma(lens: Pinhole) -> Float:
     """Weak priors of the distortion: each term moves the image's corner by a part of its radius.
 
     They bound only combinations that the markers do not see, such as k1 against k4.

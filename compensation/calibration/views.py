@@ -1,0 +1,259 @@
+"""A camera calibrated from pictures of a board in any poses: held in the hand, or on a stand nobody measures.
+
+    minimise  sum |W (project(R_v X + t_v) - centre)|^2 + sum ((X - X0)/s_X)^2
+
+The board's points X are adjusted within the uncertainty s_X of print and flatness, so that a warped board does not
+become a distorted lens; every view has a pose of its own. What noise and board do not explain is a discrepancy in px,
+with which chi^2 is 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from compensation.calibration.board import Board
+from compensation.calibration.bundle import lens_sigma
+from compensation.calibration.eccentricity import shifts_by_camera, shifts_by_homography
+from compensation.calibration.errors import CalibrationError
+from compensation.calibration.least_squares import Float, Solution, minimise, whiteners
+from compensation.calibration.opencv import calibrate_opencv
+from compensation.calibration.pinhole import Pinhole
+from compensation.calibration.pose import find_pose
+from compensation.calibration.rotation import crosses
+
+POSE = 6
+"""Parameters of a view: a turn (rad) and a shift (mm), in the camera's frame."""
+LEAST_VIEWS = 5
+LEAST_MARKERS = 12
+_LEAST_TILT_DEG = 10.0
+_ROUNDS = 10
+_OUTLIER = 6.0
+_MOST_OUTLIERS = 0.02
+_SETTLED = 0.02
+_FOLDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """P pictures with the N markers of a board. centres_px (P, N, 2): of the outlines, NaN where not seen.
+    covariance_px2 (P, N, 2, 2). image_size: (width, height), px."""
+
+    centres_px: Float
+    covariance_px2: Float
+    image_size: tuple[int, int]
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(P, N): markers with a centre."""
+        return np.isfinite(self.centres_px[:, :, 0])
+
+    def part(self, chosen: NDArray[np.bool_]) -> Views:
+        """The pictures chosen (P,)."""
+        return Views(self.centres_px[chosen], self.covariance_px2[chosen], self.image_size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posed:
+    """Camera, rotations (P, 3, 3) and translations (P, 3), mm, of the views, and board points (N, 3), mm."""
+
+    lens: Pinhole
+    rotations: Float
+    translations_mm: Float
+    points_mm: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewCalibration:
+    """covariance: of a step of lens, views and board points, in this order. residuals_px (P, N, 2): computed minus
+    measured, NaN where not used. discrepancy_px: what noise and board leave unexplained per coordinate."""
+
+    scene: Posed
+    board: Board
+    covariance: Float
+    residuals_px: Float
+    discrepancy_px: float
+
+    @property
+    def lens_sigma(self) -> Float:
+        """Standard uncertainty of each entry of the lens's vector."""
+        return np.sqrt(np.diag(self.covariance)[: len(self.scene.lens.vector)])
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual per coordinate."""
+        return float(np.sqrt(np.nanmean(self.residuals_px**2)))
+
+    @property
+    def warp_mm(self) -> float:
+        """How far the adjusted markers are out of their best plane, root mean square, mm."""
+        points = self.scene.points_mm
+        design = np.column_stack([np.ones(len(points)), points[:, :2]])
+        height = points[:, 2] - design @ np.linalg.lstsq(design, points[:, 2], rcond=None)[0]
+        return float(np.sqrt(np.mean(height**2)))
+
+    @property
+    def adjusted_board(self) -> Board:
+        """The board as the calibration leaves it."""
+        sigma = np.sqrt(np.diag(self.covariance)[-self.scene.points_mm.size :]).reshape(-1, 3)
+        return Board(self.scene.points_mm, sigma, self.board.diameters_mm)
+
+
+def calibrate_views(views: Views, board: Board) -> ViewCalibration:
+    """Brown's pinhole from views of a board; OpenCV gives the start.
+
+    Rounds follow until the eccentricity of the discs, the outliers and the discrepancy are settled. CalibrationError
+    when the views are too few or too alike to determine a camera.
+    """
+    if len(views.centres_px) < LEAST_VIEWS:
+        raise CalibrationError(f"{len(views.centres_px)} pictures show the target, {LEAST_VIEWS} are needed")
+    homographic = [shifts_by_homography(one, board.points_mm, board.diameters_mm) for one in views.centres_px]
+    start = calibrate_opencv(views.centres_px - np.array(homographic), board.points_mm, views.image_size)
+    _require_tilt(start.rotations)
+    scene = Posed(start.lens, start.rotations, start.translations_mm, board.points_mm)
+    used, discrepancy_px = views.seen, 0.0
+    solution, residuals, chi2 = _round(scene, views, used, board, discrepancy_px)
+    for _ in range(_ROUNDS):
+        # Of the start the discs' eccentricities are only roughly right: there is always a second round.
+        explained = chi2 <= 1 + _SETTLED and (discrepancy_px == 0 or chi2 >= 1 - _SETTLED)
+        before = used
+        if explained:
+            used = _inliers(residuals, views, discrepancy_px)
+        else:
+            discrepancy_px = _next_discrepancy(views, discrepancy_px, chi2)
+        solution, residuals, chi2 = _round(solution.state, views, used, board, discrepancy_px)
+        if explained and np.array_equal(before, used):
+            break
+    kept = np.where(used[:, :, None], residuals, np.nan)
+    return ViewCalibration(solution.state, board, solution.covariance, kept, discrepancy_px)
+
+
+def _round(
+    scene: Posed, views: Views, used: NDArray[np.bool_], board: Board, discrepancy_px: float
+) -> tuple[Solution[Posed], Float, float]:
+    """The fit with the eccentricities of `scene`, its residuals (P, N, 2), px, and chi^2 per degree of freedom."""
+    shifts = shifts_by_camera(
+        scene.lens.project, scene.rotations, scene.translations_mm, scene.points_mm, board.diameters_mm
+    )
+    problem = _problem(views, shifts, used, board, discrepancy_px, scene.lens)
+    solution = minimise(scene, problem.residuals, problem.jacobian, problem.stepped)
+    chi2 = solution.cost / (problem.count - len(solution.covariance))
+    return solution, _residuals(solution.state, views.centres_px - shifts), chi2
+
+
+def cross_validated_px(views: Views, board: Board) -> float:
+    """Root mean square residual per coordinate of pictures that the calibration has not seen, about the poses found
+    from them, corrected for the poses' six degrees of freedom."""
+    fold = np.arange(len(views.centres_px)) % _FOLDS
+    squares: list[float] = []
+    for number in range(_FOLDS):
+        found = calibrate_views(views.part(fold != number), board)
+        held = views.part(fold == number)
+        for centres, covariance in zip(held.centres_px, held.covariance_px2, strict=True):
+            pose = find_pose(found.scene.lens, found.adjusted_board, centres, covariance)
+            residuals = pose.residuals_px[np.isfinite(centres[:, 0])]
+            squares.append(float(np.sum(residuals**2)) / (residuals.size - POSE))
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _require_tilt(rotations: Float) -> None:
+    """CalibrationError when the board was parallel to itself in all pictures: focal length and distance are
+    then one."""
+    normals = rotations[:, :, 2]
+    apart_deg = np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max()
+    if apart_deg < _LEAST_TILT_DEG:
+        raise CalibrationError(
+            f"the target is tilted by {apart_deg:.0f} deg between the pictures, {_LEAST_TILT_DEG:g} are needed to tell "
+            "focal length from distance: tilt it by 20 to 40 deg, to all sides"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """The whitened problem: M used markers, in view[m] of board point marker[m]."""
+
+    view: NDArray[np.int64]
+    marker: NDArray[np.int64]
+    centres_px: Float
+    whitener: Float
+    prior_mm: Float
+    sigma_mm: Float
+    lens_sigma: Float
+
+    @property
+    def count(self) -> int:
+        return 2 * len(self.view) + len(self.lens_sigma) + self.prior_mm.size
+
+    def residuals(self, scene: Posed) -> Float:
+        off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(self._points(scene)[1]) - self.centres_px)
+        board = (scene.points_mm - self.prior_mm) / self.sigma_mm
+        return np.concatenate([off.ravel(), scene.lens.distortion / self.lens_sigma, board.ravel()])
+
+    def jacobian(self, scene: Posed) -> Float:
+        turned, seen = self._points(scene)
+        lens, rows = len(scene.lens.vector), len(self.view)
+        first_point = lens + POSE * len(scene.rotations)
+        count = first_point + scene.points_mm.size
+        by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
+        slopes = np.zeros((rows, 2, count))
+        slopes[:, :, :lens] = self.whitener @ scene.lens.vector_jacobian(seen)
+        each = np.arange(rows)[:, None]
+        pose = np.concatenate([-by_point @ crosses(turned), by_point], axis=2)
+        slopes[each, :, lens + POSE * self.view[:, None] + np.arange(POSE)] = np.swapaxes(pose, 1, 2)
+        points = by_point @ scene.rotations[self.view]
+        slopes[each, :, first_point + 3 * self.marker[:, None] + np.arange(3)] = np.swapaxes(points, 1, 2)
+        priors = np.zeros((len(self.lens_sigma) + self.prior_mm.size, count))
+        known = len(self.lens_sigma)
+        priors[range(known), range(lens - known, lens)] = 1 / self.lens_sigma
+        priors[range(known, len(priors)), range(first_point, count)] = 1 / self.sigma_mm.ravel()
+        return np.concatenate([slopes.reshape(-1, count), priors])
+
+    def stepped(self, scene: Posed, change: Float) -> Posed:
+        lens = len(scene.lens.vector)
+        poses = change[lens : len(change) - scene.points_mm.size].reshape(-1, POSE)
+        return Posed(
+            scene.lens.stepped(change[:lens]),
+            Rotation.from_rotvec(poses[:, :3]).as_matrix() @ scene.rotations,
+            scene.translations_mm + poses[:, 3:],
+            scene.points_mm + change[-scene.points_mm.size :].reshape(-1, 3),
+        )
+
+    def _points(self, scene: Posed) -> tuple[Float, Float]:
+        """(M, 3) each: the used markers turned as in their views, and in the camera's frame."""
+        turned = np.einsum("mij,mj->mi", scene.rotations[self.view], scene.points_mm[self.marker])
+        return turned, turned + scene.translations_mm[self.view]
+
+
+def _problem(
+    views: Views, shifts_px: Float, used: NDArray[np.bool_], board: Board, discrepancy_px: float, lens: Pinhole
+) -> _Problem:
+    view, marker = np.nonzero(used)
+    covariance = views.covariance_px2[used] + discrepancy_px**2 * np.eye(2)
+    centres = (views.centres_px - shifts_px)[used]
+    return _Problem(view, marker, centres, whiteners(covariance), board.points_mm, board.sigma_mm, lens_sigma(lens))
+
+
+def _residuals(scene: Posed, discs_px: Float) -> Float:
+    seen = np.einsum("pij,nj->pni", scene.rotations, scene.points_mm) + scene.translations_mm[:, None]
+    return scene.lens.project(seen) - discs_px
+
+
+def _inliers(residuals_px: Float, views: Views, discrepancy_px: float) -> NDArray[np.bool_]:
+    """Markers not far outside the scatter, unless those that are would be too many for accidents."""
+    seen = views.seen
+    covariance = views.covariance_px2[seen] + discrepancy_px**2 * np.eye(2)
+    off = residuals_px[seen]
+    lengths = np.sqrt(np.einsum("mi,mij,mj->m", off, np.linalg.inv(covariance), off))
+    inliers = seen.copy()
+    if np.mean(lengths > _OUTLIER) <= _MOST_OUTLIERS:
+        inliers[seen] = lengths <= _OUTLIER
+    return inliers
+
+
+def _next_discrepancy(views: Views, discrepancy_px: float, chi2: float) -> float:
+    """The discrepancy with which chi^2 would be 1 if the residuals stayed as they are."""
+    sigma2 = float(np.nanmean(np.diagonal(views.covariance_px2, axis1=2, axis2=3)))
+    return float(np.sqrt(max(0.0, (sigma2 + discrepancy_px**2) * chi2 - sigma2)))
