@@ -59,6 +59,7 @@ class CameraSettings(Polled):
     pixel; none the whole sensor. trigger: one frame per software trigger, or frames at frame_rate_hz all the time
     (constant self-heating). has_temperature: whether it measures its own temperature; false must be stated, a run needs
     no GOOD one then. boot_s: from its supply being switched on until it answers.
+    ambient_degC: the lowest and the highest air that its data sheet allows; no set-point goes outside.
     """
 
     address: str
@@ -71,6 +72,7 @@ class CameraSettings(Polled):
     frame_rate_hz: float = Field(default=2.0, gt=0, le=1000)
     has_temperature: bool = True
     boot_s: float = Field(default=8.0, ge=0, le=600)
+    ambient_degC: Range | None = None
     equilibrium: EquilibriumSettings = EquilibriumSettings()
 
 

@@ -128,7 +128,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces
         state_file = config.recording.directory / "compressor.json"
     permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, config.compressor)
-    chamber = ChamberLimits(config.limits.chamber_degC, permits, config.guard.heater_renew_s, state_file)
+    chamber = ChamberLimits(config.set_points_degC, permits, config.guard.heater_renew_s, state_file)
     boots_s = [camera.boot_s for camera in config.cameras.values()]
     equilibrium = config.camera.equilibrium if config.camera is not None else EquilibriumSettings()
     supply = SupplyLimits(max(boots_s, default=0.0), config.guard.heater_hold_s, equilibrium)

@@ -26,6 +26,7 @@ from foundation.addresses import TcpAddress
 from foundation.documents import Document, load_document
 from foundation.errors import ConfigError
 from stand.config.alerts import AlertsConfig
+from stand.config.dew import DewConfig, EndingConfig
 from stand.config.guard import GuardConfig
 from stand.config.interface import InterfaceConfig
 from stand.config.looks import ChamberConfig
@@ -131,6 +132,8 @@ class StandConfig(Document):
     recording: RecordingConfig = RecordingConfig()
     alerts: AlertsConfig = AlertsConfig()
     interface: InterfaceConfig = InterfaceConfig()
+    dew: DewConfig | None = None
+    ending: EndingConfig = EndingConfig()
     simulation: SimulationConfig | None = None
 
     @model_validator(mode="before")
@@ -183,6 +186,11 @@ class StandConfig(Document):
                 f"guard.heat_max_Wh_per_h {guard.heat_max_Wh_per_h:g} is never reached by a heater of "
                 f"{self.chamber.heater_W:g} W (chamber.heater_W); take about 0.7 of its power"
             )
+        low_degC, high_degC = self.set_points_degC
+        if low_degC >= high_degC:
+            yield "limits.chamber_degC and the ambient_degC of the cameras have no temperature in common"
+        if self.dew is not None and self.dew.humidity_percent is not None and "laboratory" not in self.thermometers:
+            yield "dew.humidity_percent needs a thermometer named laboratory; give dew.dew_point_degC instead"
         for name, limit_degC in (("granite", guard.max_granite_degC), ("camera", guard.max_camera_degC)):
             if limit_degC < highest_degC:  # they follow the air
                 yield f"guard.max_{name}_degC {limit_degC} is below the upper limits.chamber_degC"
@@ -199,6 +207,12 @@ class StandConfig(Document):
         slowest_s = max(self.regulator.poll_s, self.relays.poll_s)
         if slowest_s * 2 > guard.keys_s:
             yield f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)"
+
+    @property
+    def set_points_degC(self) -> tuple[float, float]:
+        """The lowest and the highest set-point that the stand and all its cameras may be given."""
+        ranges = [self.limits.chamber_degC, *(each.ambient_degC for each in self.cameras.values() if each.ambient_degC)]
+        return max(low for low, _ in ranges), min(high for _, high in ranges)
 
     def accepted(self) -> dict[str, float]:
         """The values outside their safe ranges, which guard.accept names, by their paths."""

@@ -193,6 +193,19 @@ def _check(planned: PlannedStep, config: StandConfig) -> None:
         low, high = config.limits.chamber_degC
         if not low <= step.chamber_degC <= high:
             raise ConfigError(f"{where}: {step.chamber_degC} degC is outside limits.chamber_degC {low}..{high}")
+        for name, camera in config.cameras.items():
+            low, high = camera.ambient_degC or (low, high)
+            if not low <= step.chamber_degC <= high:
+                raise ConfigError(
+                    f"{where}: {step.chamber_degC} degC is outside cameras.{name}.ambient_degC {low}..{high}"
+                )
+    if isinstance(step, Capture | SoakUntilSettled) and config.dew is not None:
+        lowest_degC = config.dew.lowest_degC(math.nan)
+        if step.chamber_degC < lowest_degC:
+            raise ConfigError(
+                f"{where}: at {step.chamber_degC} degC the open flap lets the laboratory's air in, whose dew point "
+                f"with dew.margin_K is {lowest_degC:g} degC; leave the set-point out, or dry the air and change dew"
+            )
     if isinstance(step, MoveTo | CheckHome):
         try:
             axis = axis_of(config, step.axis)

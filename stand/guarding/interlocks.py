@@ -156,6 +156,23 @@ def stage_alarm(position: str) -> Rule:
     return rule
 
 
+def dewed(flap: str, channels: tuple[str, ...], laboratory: str, lowest_degC: Callable[[float], float]) -> Rule:
+    """The flap is open while one of the channels is below what water of the laboratory's air would settle on."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        if not value_of(readings, flap) > _OPEN_ABOVE:
+            return None
+        limit_degC = lowest_degC(value_of(readings, laboratory))
+        for channel in channels:
+            value_degC = value_of(readings, channel)
+            if value_degC < limit_degC:
+                limit = f"and water may settle below {limit_degC:.1f} degC"
+                return Fault("dew", f"{channel} is {value_degC:.2f} degC with the flap open, {limit}")
+        return None
+
+    return rule
+
+
 def contact(channel: str, fault_when: float, text: str) -> Rule:
     """A contact of the stand reads `fault_when` (0 open, 1 closed)."""
 

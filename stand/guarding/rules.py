@@ -19,6 +19,7 @@ from stand.guarding.interlocks import (
     Watch,
     camera_temperature_bad,
     contact,
+    dewed,
     disagreement,
     flap_open,
     folder_lost,
@@ -91,6 +92,7 @@ def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
         *_independent(config),
         *_operations(config, announced),
         *_contacts(config),
+        *_dew(config),
     )
 
 
@@ -188,6 +190,21 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
         Watch(frames_stopped(lambda: announced.frames_stopped), limits.disk_low_s, "hold"),
         Watch(paused(lambda: announced.is_paused), 3600.0 * limits.pause_limit_h, "hold"),
     )
+
+
+def cold_parts(config: StandConfig) -> tuple[str, ...]:
+    """What water would settle on first: the target, the granite it stands on without a thermometer of its own, and the
+    cameras."""
+    target = "thermometers.artifact" if "artifact" in config.thermometers else GRANITE
+    return (target, *(f"{name}.temperature" for name in config.cameras))
+
+
+def _dew(config: StandConfig) -> tuple[Watch, ...]:
+    """Water on lens or target ends a night's work without a sign; making safe closes the flap."""
+    dew = config.dew
+    if dew is None:
+        return ()
+    return (Watch(dewed(FLAP, cold_parts(config), LABORATORY, dew.lowest_degC), dew.flap_s, "hold"),)
 
 
 def _contacts(config: StandConfig) -> tuple[Watch, ...]:

@@ -39,6 +39,7 @@ from stand.running.run_desk import RunDesk
 from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
+from stand.running.to_ambient import to_ambient
 from stand.serving.api.server import Interface, serve
 from stand.serving.eta_slip import EtaSlip
 
@@ -125,6 +126,8 @@ class Guest:
                     )
                 stop.started()
                 await watched(executor.run(), [*house.tasks, recording, *watchers])
+                at_last = to_ambient(assembly.stand, assembly.hub, assembly.clock, assembly.config)
+                await watched(at_last, [*house.tasks, recording, *watchers])
                 ended = Ended(0, "complete", "complete")
             except BaseException as error:
                 ended = _ending(stop.fault, error)

@@ -1,0 +1,76 @@
+"""The end of a run whose plan is done: the chamber comes back to the laboratory's temperature, so that whoever opens it
+finds nothing cold that water would settle on, and nothing hot.
+
+It remembers nothing: what is read says whether it is done. A run that is resumed here goes on with it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceError
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.config.stand_config import StandConfig
+from stand.fault import value_of
+from stand.gate import INTERLOCK
+from stand.guarding.rules import AIR, LABORATORY, cold_parts
+from stand.interlock import Interlocked
+from stand.stand import Stand
+
+_LOOK_S = 10.0
+_AGAIN_S = 60.0  # after a device that did not do as it was told
+_FOLLOWS_K = 1.0  # the set-point follows the laboratory in such steps
+
+
+async def to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandConfig) -> None:
+    """Until it is done, `ending.max_s` are over, or it is cancelled; a hold is waited for. Events: `to_ambient`, and
+    `at_ambient` or `not_at_ambient` (a warning). Nothing happens on a stand that is there, or is not asked to."""
+    lacks = _lacks(hub, config)
+    if not config.ending.to_ambient or not lacks:
+        return
+    set_point_degC = _ambient_degC(hub, config)
+    text = f"the plan is done; back to {set_point_degC:.1f} degC: {lacks}"
+    hub.publish(Event(clock.now_ns(), "info", "to_ambient", text, {"ambient_degC": set_point_degC}))
+    until_ns, running_degC = clock.now_ns() + seconds_ns(config.ending.max_s), math.nan
+    while (lacks := _lacks(hub, config)) and clock.now_ns() < until_ns:
+        if INTERLOCK in stand.gate.reasons:
+            running_degC = math.nan  # the guard has stopped the chamber
+        await stand.gate.passed()
+        set_point_degC, wait_s = _ambient_degC(hub, config), _LOOK_S
+        if not abs(set_point_degC - running_degC) <= _FOLLOWS_K:
+            try:
+                await stand.imaging.close_flap()
+                await stand.chamber.start(set_point_degC)
+                running_degC = set_point_degC
+            except (DeviceError, Interlocked):  # the guard says what is wrong, and holds
+                wait_s = _AGAIN_S
+        await clock.sleep_until(clock.now_ns() + seconds_ns(wait_s))
+    if lacks:
+        text = f"after {config.ending.max_s / 60:.0f} min {lacks}; open the chamber with care"
+        hub.publish(Event(clock.now_ns(), "warning", "not_at_ambient", text))
+    else:
+        hub.publish(Event(clock.now_ns(), "info", "at_ambient", "the chamber is at the laboratory's temperature"))
+    await stand.chamber.stop()
+
+
+def _ambient_degC(hub: Hub, config: StandConfig) -> float:
+    """Where to, within the stand's limits."""
+    measured_degC = value_of(hub, LABORATORY)
+    low_degC, high_degC = config.set_points_degC
+    wanted_degC = config.ending.ambient_degC if math.isnan(measured_degC) else measured_degC
+    return min(max(wanted_degC, low_degC), high_degC)
+
+
+def _lacks(hub: Hub, config: StandConfig) -> str:
+    """What is not there yet, in words; "" when all is. What cannot be read is not waited for."""
+    ambient_degC, band_K = _ambient_degC(hub, config), config.ending.band_K
+    air_degC = value_of(hub, AIR)
+    if abs(air_degC - ambient_degC) > band_K:
+        return f"the air is {air_degC:.1f} degC"
+    dew_degC = math.nan if config.dew is None else config.dew.lowest_degC(value_of(hub, LABORATORY))
+    lowest_degC = ambient_degC - band_K if math.isnan(dew_degC) else min(dew_degC, ambient_degC)
+    cold = [(value_of(hub, channel), channel) for channel in cold_parts(config)]
+    value_degC, channel = min((each for each in cold if each[0] < lowest_degC), default=(math.nan, ""))
+    return f"{channel} is {value_degC:.1f} degC, and may have to be {lowest_degC:.1f}" if channel else ""

@@ -1,0 +1,110 @@
+"""Dew: the formula against a table, the rule of the guard, and plans that would go below it."""
+
+import math
+from pathlib import Path
+
+import pytest
+import yaml
+
+from foundation.clock import seconds_ns
+from foundation.errors import ConfigError
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Reading
+from stand.config.dew import DewConfig, dew_point_degC
+from stand.config.stand_config import load_config, packaged
+from stand.fault import Fault
+from stand.guarding.rules import Announcements, watches
+from stand.running.order import load_order
+
+
+@pytest.mark.parametrize(
+    ("air_degC", "humidity_percent", "expected_degC"),
+    [(20.0, 50.0, 9.3), (25.0, 60.0, 16.7), (24.0, 40.0, 9.6), (10.0, 100.0, 10.0), (30.0, 80.0, 26.2)],
+)
+def test_the_dew_point_is_that_of_the_tables(air_degC: float, humidity_percent: float, expected_degC: float):
+    """DIN 4108-3, table of dew points of humid air."""
+    assert dew_point_degC(air_degC, humidity_percent) == pytest.approx(expected_degC, abs=0.1)
+
+
+def test_what_is_not_known_is_not_known():
+    assert math.isnan(dew_point_degC(math.nan, 50.0))
+    assert math.isnan(DewConfig(humidity_percent=50).lowest_degC(math.nan))
+    assert DewConfig(dew_point_degC=12, margin_K=2).lowest_degC(math.nan) == 14
+
+
+def stand(folder: Path, **sections: object) -> Path:
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    for name, section in sections.items():
+        data[name] = {**data.get(name, {}), **section} if isinstance(section, dict) else section
+    (folder / "stand.yaml").write_text(yaml.safe_dump(data))
+    return folder / "stand.yaml"
+
+
+def camera(**settings: object) -> dict[str, object]:
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    return {"camera": {**data["cameras"]["camera"], **settings}}
+
+
+@pytest.mark.parametrize(
+    ("sections", "sentence"),
+    [
+        ({"dew": {}}, "give dew_point_degC or humidity_percent, one of them"),
+        ({"dew": {"dew_point_degC": 10, "humidity_percent": 50}}, "give dew_point_degC or humidity_percent"),
+        ({"cameras": camera(ambient_degC=[60, 70])}, "have no temperature in common"),
+    ],
+)
+def test_sections_that_cannot_be_are_refused(tmp_path: Path, sections: dict[str, object], sentence: str):
+    with pytest.raises(ConfigError, match=sentence):
+        load_config(stand(tmp_path, **sections))
+
+
+def test_a_plan_that_captures_below_the_dew_point_is_refused(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"at 10\.0 degC the open flap .* dew point with dew.margin_K is 13 degC"):
+        load_order("demo", str(stand(tmp_path, dew={"dew_point_degC": 12})))
+    load_order("demo", str(stand(tmp_path, dew={"dew_point_degC": 8})))
+    load_order("demo", str(stand(tmp_path, dew={"humidity_percent": 90})))  # not known before it is measured
+
+
+def test_no_set_point_is_outside_of_what_a_camera_allows(tmp_path: Path):
+    config = stand(tmp_path, cameras=camera(ambient_degC=[0, 50]))
+    assert load_config(config).set_points_degC[1] == 50
+    with pytest.raises(ConfigError, match=r"52\.0 degC is outside cameras.camera.ambient_degC 0\.0\.\.50\.0"):
+        load_order("demo", str(config))
+
+
+class Night:
+    """The guard's rules over a hub, the laboratory at 24 degC and 50 %: its dew point is 12.9 degC."""
+
+    def __init__(self, folder: Path):
+        self.hub = Hub()
+        config = load_config(stand(folder, dew={"humidity_percent": 50, "margin_K": 1, "flap_s": 10}))
+        self.watches = watches(config, Announcements())
+
+    def look(self, at_s: float, flap: float, target_degC: float, camera_degC: float = 40.0) -> list[Fault]:
+        values = {
+            "flap.position": flap,
+            "thermometers.artifact": target_degC,
+            "thermometers.laboratory": 24.0,
+            "camera.temperature": camera_degC,
+        }
+        time_ns = seconds_ns(at_s)
+        self.hub.publish(
+            Batch("all", time_ns, tuple(Reading(name, value, "1", time_ns) for name, value in values.items()))
+        )
+        found = [watch.check(self.hub, time_ns) for watch in self.watches]
+        return [fault for fault in found if fault is not None and fault.rule == "dew"]
+
+
+def test_an_open_flap_over_a_cold_target_holds_and_a_closed_one_does_not(tmp_path: Path):
+    night = Night(tmp_path)
+    assert [night.look(at_s, 0.0, 10.0) for at_s in (0, 20)] == [[], []]
+    assert [night.look(at_s, 1.0, 14.2) for at_s in (21, 40)] == [[], []]
+    assert night.look(50, 1.0, 13.5) == []
+    (fault,) = night.look(61, 1.0, 13.5)
+    assert fault.action == "hold"
+    assert fault.text.startswith(
+        "thermometers.artifact is 13.50 degC with the flap open, and water may settle below 13.9"
+    )
+    assert night.look(62, 0.0, 13.5) == []
+    assert [len(night.look(at_s, 1.0, 20.0, 5.0)) for at_s in (70, 81)] == [0, 1]
