@@ -35,28 +35,19 @@ def observations_of(
 ) -> Observations:
     """F frames of N markers of one camera.
 
-    centres_px (F, N, 2): (x, y), NaN where a marker is missing. camera_degC (F,): the camera's own temperature; a frame
-    where it is NaN is not used. time_ns (F,): middle of the exposure, ascending; else a frame a second. chamber_degC
-    (F,): the set-point, whose frames are left out together to choose a model; else camera_degC in whole degrees. role
-    (F,): of experiments.steps.Role; else `reference` at the set-point nearest to reference_degC (else that of the first
-    frame) and `fit` at the others. air: (time_ns, degC), both (A,), of the air near the camera, for the thermal form.
-    sigma_px: standard uncertainty of a coordinate, where there is no covariance_px2 (F, N, 2, 2). image_size: (width,
-    height); else what holds the centres. ValueError when shapes do not agree.
+    centres_px (F, N, 2): (x, y), NaN where a marker is missing. camera_degC (F,): the camera's own, NaN: the frame is
+    not used. time_ns (F,): middle of the exposure, ascending; else a frame a second. chamber_degC (F,): the set-point,
+    whose frames are left out together to choose a model; else camera_degC in whole degrees. role (F,): of
+    experiments.steps.Role; else `reference` at the set-point nearest to reference_degC (else that of the first frame)
+    and `fit` at the others. air: (time_ns, degC), both (A,), near the camera, for the thermal form. sigma_px: standard
+    uncertainty of a coordinate, where there is no covariance_px2 (F, N, 2, 2). image_size: (width, height), else what
+    holds the centres. ValueError when shapes do not agree.
     """
-    centres = np.array(centres_px, np.float64)
-    camera = np.array(camera_degC, np.float64)
-    if centres.ndim != 3 or centres.shape[2] != 2 or camera.shape != centres.shape[:1] or not len(camera):
-        raise ValueError(f"centres are (F, N, 2) and temperatures (F,), not {centres.shape} and {camera.shape}")
+    centres, camera = _seen(centres_px, camera_degC)
     frames, count = centres.shape[:2]
     covariance = np.eye(2) * sigma_px**2 if covariance_px2 is None else np.array(covariance_px2, np.float64)
-    instants = np.arange(frames) * NS_PER_S if time_ns is None else np.array(time_ns, np.int64)
-    chamber = np.round(camera) if chamber_degC is None else np.array(chamber_degC, np.float64)
-    roles = _roles(chamber, reference_degC) if role is None else np.array(role, np.str_)
-    for what, column in (("time_ns", instants), ("chamber_degC", chamber), ("role", roles)):
-        if column.shape != (frames,):
-            raise ValueError(f"{what} has shape {column.shape}, not ({frames},)")
-    missing = np.isnan(centres).any(axis=2) | np.isnan(camera)[:, None]
-    size = image_size or (math.ceil(np.nanmax(centres[..., 0])) + 1, math.ceil(np.nanmax(centres[..., 1])) + 1)
+    instants, chamber, roles = _columns(camera, time_ns, chamber_degC, role, reference_degC)
+    missing, size = np.isnan(centres).any(axis=2) | np.isnan(camera)[:, None], image_size or _size_of(centres)
     history = None if air is None else _history(air, instants, camera)
     return Observations(
         target=target or _unnamed(count),
@@ -70,18 +61,51 @@ def observations_of(
         step_id=("",) * frames,
         chamber_degC=chamber,
         camera_degC=camera,
-        air_degC=np.full(frames, np.nan)
-        if history is None
-        else interpolated(history.ambient_ns, history.ambient_degC, instants),
+        air_degC=_air_at(history, instants),
         centres_px=np.where(missing[..., None], np.nan, centres),
         covariance_px2=np.where(missing[..., None, None], np.nan, covariance),
         flags=np.zeros((frames, count), np.uint8),
-        reasons=tuple(
-            _reason(degC, unseen)
-            for degC, unseen in zip(camera.tolist(), np.all(missing, axis=1).tolist(), strict=True)
-        ),
+        reasons=tuple(map(_reason, camera.tolist(), np.all(missing, axis=1).tolist())),
         histories=() if history is None else (history,),
     )
+
+
+def _seen(centres_px: ArrayLike, camera_degC: ArrayLike) -> tuple[Float, Float]:
+    """Centres (F, N, 2) and temperatures (F,); ValueError when they are not."""
+    centres, camera = np.array(centres_px, np.float64), np.array(camera_degC, np.float64)
+    if centres.ndim != 3 or centres.shape[2] != 2 or camera.shape != centres.shape[:1] or not len(camera):
+        raise ValueError(f"centres are (F, N, 2) and temperatures (F,), not {centres.shape} and {camera.shape}")
+    return centres, camera
+
+
+def _columns(
+    camera_degC: Float,
+    time_ns: ArrayLike | None,
+    chamber_degC: ArrayLike | None,
+    role: ArrayLike | None,
+    reference_degC: float | None,
+) -> tuple[NDArray[np.int64], Float, NDArray[np.str_]]:
+    """Instants, set-points and roles (F,) of the frames, as given or as supposed; ValueError when one is not (F,)."""
+    frames = len(camera_degC)
+    instants = np.arange(frames) * NS_PER_S if time_ns is None else np.array(time_ns, np.int64)
+    chamber = np.round(camera_degC) if chamber_degC is None else np.array(chamber_degC, np.float64)
+    roles = _roles(chamber, reference_degC) if role is None else np.array(role, np.str_)
+    for what, column in (("time_ns", instants), ("chamber_degC", chamber), ("role", roles)):
+        if column.shape != (frames,):
+            raise ValueError(f"{what} has shape {column.shape}, not ({frames},)")
+    return instants, chamber, roles
+
+
+def _size_of(centres_px: Float) -> tuple[int, int]:
+    """(width, height) of an image that holds all centres (F, N, 2)."""
+    return math.ceil(np.nanmax(centres_px[..., 0])) + 1, math.ceil(np.nanmax(centres_px[..., 1])) + 1
+
+
+def _air_at(history: History | None, time_ns: NDArray[np.int64]) -> Float:
+    """The air's temperature at these instants, NaN where it is not known."""
+    if history is None:
+        return np.full(len(time_ns), np.nan)
+    return interpolated(history.ambient_ns, history.ambient_degC, time_ns)
 
 
 def _reason(camera_degC: float, unseen: bool) -> str:

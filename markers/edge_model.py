@@ -151,10 +151,8 @@ def _derivatives(block: Float, size: int, p: Float, scale: float, noise: Varianc
         rise = contrast * density * per_sigma * root
         block[(_PIXEL + RESIDUAL) * _BLOCK + k] = residual
         block[(_PIXEL + RISE) * _BLOCK + k] = rise
-        squares += weight * residual * residual
-        weights += weight
-        root *= share
-        rise *= share
+        squares, weights = squares + weight * residual * residual, weights + weight
+        root, rise = root * share, rise * share
         bend = rise * scale * per_length
         block[CX * _BLOCK + k] = -rise * nx
         block[CY * _BLOCK + k] = -rise * ny

@@ -14,6 +14,8 @@ _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera
 # In tests/system, whose long runs have each a laboratory of its own, the tests are dealt out one by one but for those
 # of a file that makes something once for all of them.
 _DEALT_OUT = PurePath("tests/system")
+# What compiles the marker fit goes first: the workers that need it later find it kept, instead of waiting for it.
+_FIRST = {"tests/compensation/test_markers.py"}
 _TOGETHER = {"tests/system/test_camera_wire.py", "tests/system/test_kill_recording.py"}
 
 
@@ -49,8 +51,13 @@ def _unit(nodeid: str) -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The long ones first: those that wait in real time leave the processors to others, and no worker ends with one."""
-    items.sort(key=lambda item: PurePath(item.nodeid.partition("::")[0]).parent != _DEALT_OUT)
+    """The long ones early: those that wait in real time leave the processors to others, and no worker ends with one."""
+
+    def turn(item: pytest.Item) -> int:
+        file = item.nodeid.partition("::")[0]
+        return 0 if file in _FIRST else 1 if PurePath(file).parent == _DEALT_OUT else 2
+
+    items.sort(key=turn)
 
 
 @pytest.hookimpl(optionalhook=True)

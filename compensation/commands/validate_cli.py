@@ -62,11 +62,7 @@ def validate_session(
     -o validation.html
     """
     with one_line_errors():
-        beside = out.with_suffix(".json")
-        if beside == out:
-            raise ConfigError(f"{out}: the page is HTML, and a JSON file is written beside it; name it .html")
-        for path in (out, beside):
-            check_writable(path)
+        beside = _numbers_beside(out)
         file, drift = CameraFile.load(camera), load_model(model)
         geometry = None if budget is None else load_geometry(budget)
         observations = observe(
@@ -90,3 +86,13 @@ def validate_session(
         write_whole(out, validation_page(found))
         write_whole(beside, as_json(found))
         typer.echo(summary(found))
+
+
+def _numbers_beside(page: Path) -> Path:
+    """Where the numbers go; ConfigError when that is the page, or one of the two cannot be written."""
+    beside = page.with_suffix(".json")
+    if beside == page:
+        raise ConfigError(f"{page}: the page is HTML, and a JSON file is written beside it; name it .html")
+    for path in (page, beside):
+        check_writable(path)
+    return beside

@@ -102,7 +102,11 @@ class FakeCamera:
             threading.Thread(target=self._serve, name=f"gvcp {address}", daemon=True),
             threading.Thread(target=self._expose, name=f"camera {address}", daemon=True),
         ]
-        self._effects: dict[str, Callable[[int], None]] = {
+        self._effects = self._effects_by_feature()
+
+    def _effects_by_feature(self) -> dict[str, Callable[[int], None]]:
+        """What writing a feature does at an instant, ns."""
+        return {
             "AcquisitionStart": self._schedule.start,
             "AcquisitionStop": lambda now_ns: self._schedule.stop(),
             "TriggerSoftware": self._trigger,
