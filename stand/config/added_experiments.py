@@ -30,6 +30,11 @@ def added_names() -> list[str]:
     return sorted({point.name for point in entry_points(group=GROUP)})
 
 
+def package_of(name: str) -> str:
+    """The package that adds the experiment `name`, and its version, as in `acme-experiments 1.2`."""
+    return _package(_only(name))
+
+
 def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
     """The steps of the experiment `name` of another package; ValueError, or ValidationError with the parameter's place,
     when it is not there, refuses its parameters, or makes what is no plan."""
@@ -99,7 +104,6 @@ def _within(name: str, error: ValidationError) -> ValidationError:
 
 
 def _package(point: EntryPoint) -> str:
-    """As in `acme-experiments 1.2`."""
     return f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.value
 
 

@@ -16,7 +16,7 @@ from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
 from experiments.written import Place, PlanError, StepEntries, Written, set_point_after, unknown, written_steps
 from foundation.documents import Document
-from stand.config.added_experiments import added_names, added_steps
+from stand.config.added_experiments import added_names, added_steps, package_of
 
 _MADE_BY: Mapping[str, Callable[..., Iterable[Step]]] = {
     "warm_up": warm_up,
@@ -66,6 +66,11 @@ class Experiment(Document):
         """How many captures the entry asks for, the reference frames of a cycle and written steps apart."""
         return sum(getattr(parameters, "visits", 0) for parameters in self._given.values())
 
+    @property
+    def package(self) -> str:
+        """The package that adds the entry's experiment, and its version; "" for our own."""
+        return package_of(self._added[0]) if self._added[0] else ""
+
     def sequence(self, place: Place = (), at_degC: float | None = None) -> Generator[Written, None, None]:
         """The steps of this entry, which stands at `place`; at_degC: the set-point before them."""
         if self.steps is not None:
@@ -112,6 +117,11 @@ class Recipe(Document):
     def plan(self) -> Iterator[PlannedStep]:
         """Every step in order, numbered and identified."""
         return number_steps(written.step for written in self._written())
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Those of other people that the plan depends on, with their versions."""
+        return tuple(sorted({experiment.package for experiment in self.experiments} - {""}))
 
     def _written(self) -> Iterator[Written]:
         at_degC: float | None = None

@@ -219,9 +219,11 @@ class Guest:
 
     def _begin_data(self) -> dict[str, object]:
         """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For
-        counts of what is done: how many steps and frames the plan has."""
+        counts of what is done: how many steps and frames the plan has. Which packages have made steps of it."""
         plan, boot = plan_hash(self.job.order.recipe.plan()), boot_of(self._assembly.clock)
         data: dict[str, object] = {**self.log.state.size, "plan": plan, "seed": self.job.seed}
+        if packages := self.job.order.recipe.packages:
+            data["packages"] = packages
         return data if boot is None else {**data, "boot_id": boot.id}
 
     def _first_entries(self) -> tuple[Written, ...]:

@@ -53,6 +53,12 @@ def test_the_example_is_planned_as_those_of_the_house_are():
 
 
 @pytest.mark.usefixtures("staircase")
+def test_a_recipe_knows_which_packages_it_depends_on():
+    assert recipe("staircase:").packages == ("thermostand-staircase 1.0",)
+    assert recipe("warm_up: {}").packages == ()
+
+
+@pytest.mark.usefixtures("staircase")
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [

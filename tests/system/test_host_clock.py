@@ -38,8 +38,7 @@ experiments:
 """
 BRIEF = """
 name: brief
-experiments:
-  - thermal_cycle: {equilibrium_s: 3.5, set_points_degC: [26], dwell_s: 0.5, reference_frames: 1}
+steps: [start_chamber: 26, soak: 3.5, stop_chamber]
 """
 LIMIT_S = 90.0  # of real time for what should take a few seconds
 

@@ -44,6 +44,24 @@ def break_now(order: Order, name: str, value: object) -> None:
         assert b"error" not in lines.readline()
 
 
+async def test_a_session_says_which_package_has_made_steps_of_its_plan(
+    tmp_path: Path, order: Callable[..., Order], monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "acme.py").write_text(
+        "from experiments.steps import CloseFlap\nfrom pydantic import BaseModel\n"
+        "class P(BaseModel): pass\ndef shut(p: P): yield CloseFlap()\n"
+    )
+    info = tmp_path / "acme-1.2.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.2\n")
+    (info / "entry_points.txt").write_text("[thermostand.experiments]\nshut = acme:shut\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    ordered = order("name: shut\nexperiments: [shut: {}]\n")
+    session = Session.open(await run_virtual(ordered, tmp_path / "out", None, ignore))
+    (start,) = [event for event in session.events() if event.kind == "run.start"]
+    assert start.data["packages"] == ["acme 1.2"]
+
+
 async def test_somebody_is_told_of_a_step_that_fails(tmp_path: Path, order: Callable[..., Order]):
     told, ordered = tmp_path / "told", order(SHORTER)
     watch = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
