@@ -17,9 +17,10 @@ import math
 
 import numpy as np
 
-PLACE, CAMERA, AMBIENT, SWITCHED_ON, HISTORY = 1, 2, 4, 8, 16
+PLACE, CAMERA, AMBIENT, SWITCHED_ON, HISTORY, STATE = 1, 2, 4, 8, 16, 32
 """Flags: the point is outside the markers' hull; the camera's temperature, the air's temperature or its rate of change
-are outside the calibrated range; the camera was switched on too recently; it has not been followed for long enough."""
+are outside the calibrated range; the camera was switched on too recently; it has not been followed for long enough;
+each is in its range, but not in this combination."""
 
 RATE_TAU_S = 600.0
 """The ambient's rate of change is that of its 10 min lag."""
@@ -29,7 +30,7 @@ _COLD_K = 3.0
 """A camera this close to the air around it has been off for long: nothing of it is warm."""
 _UNPOWERED_TAU_S = 900.0
 """An unpowered camera reports no temperature; its excess over the air is assumed to decay so until it does."""
-_SPAN_K, _MARGIN, _HULL_MARGIN_PX, _SWITCHED_ON_S = 20.0, 0.02, 1.0, 1.0
+_SPAN_K, _MARGIN, _HULL_MARGIN_PX, _SWITCHED_ON_S, _MORE_LEVERAGE = 20.0, 0.02, 1.0, 1.0, 3.0
 
 
 class ThermalState:
@@ -118,7 +119,8 @@ class Drift:
     @property
     def memory_s(self):
         """How long it must have been fed to be right, s; 0 for a form without memory."""
-        return SETTLED_TAUS * max(self._model.get("taus_s", []), default=0.0)
+        longest_s = SETTLED_TAUS * max(self._model.get("taus_s", []), default=0.0)
+        return self._model.get("history_s", longest_s)
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """As ThermalState.advance."""
@@ -132,7 +134,7 @@ class Drift:
             return self._polynomial(points_px) @ self._coefficients.T
         if not self._state.begun:
             return np.full_like(points_px, np.nan)
-        amounts = self._coefficients @ (self._features() - np.array(self._model["reference_features"]))
+        amounts = self._coefficients @ self._away()
         return self._moved(points_px, amounts)
 
     def correct(self, points_px):
@@ -181,6 +183,10 @@ class Drift:
             )
         return np.array(values)
 
+    def _away(self):
+        """The features minus those of the reference."""
+        return self._features() - np.array(self._model["reference_features"])
+
     def _moved(self, points_px, amounts):
         """Eight infinitesimal motions of a homography: shift, affine, perspective."""
         width, height = self._model["image_size_px"]
@@ -195,11 +201,14 @@ class Drift:
         if self._model["form"] == "paper":
             return found
         if not self._state.begun:
-            return CAMERA | AMBIENT | SWITCHED_ON | HISTORY
+            return CAMERA | AMBIENT | SWITCHED_ON | HISTORY | STATE
         found |= _beyond(self._state.rate_K_per_h, self._limits("rate_range_K_per_h", 1.0), AMBIENT)
         least_on_s = self._model["least_on_s"]
         least_on_s = math.inf if least_on_s is None else least_on_s - _SWITCHED_ON_S
         found |= _beyond(self._state.on_s, (least_on_s, math.inf), SWITCHED_ON)
+        if self._model.get("leverage") is not None:
+            away, matrix = self._away(), np.array(self._model["leverage_matrix"])
+            found |= _beyond(away @ matrix @ away, (0.0, _MORE_LEVERAGE * self._model["leverage"]), STATE)
         if self._model["taus_s"]:
             found |= _beyond(self._state.ambient_lag[-1], self._limits("ambient_range_degC"), AMBIENT)
         return found | _beyond(self._state.settled_s, (self.memory_s, math.inf), HISTORY)

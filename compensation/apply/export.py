@@ -68,4 +68,7 @@ def _thermal(model: ThermalModel) -> dict[str, object]:
         "ambient_range_degC": valid.ambient_degC,
         "rate_range_K_per_h": valid.rate_K_per_h,
         "least_on_s": None if math.isinf(valid.least_on_s) else valid.least_on_s,
+        "leverage": None if math.isinf(valid.leverage) else valid.leverage,
+        "leverage_matrix": model.leverage_matrix.tolist(),
+        "history_s": model.history_s,
     }

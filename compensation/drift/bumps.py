@@ -37,7 +37,7 @@ _TERMS = (
 )
 _FORGOTTEN_S = (900.0, 3600.0, 14400.0)
 """How what was before the record fades, when nobody knows it."""
-_GAIN, _GAIN_MARKER = 18.0, 25.0
+_GAIN, _GAIN_MARKER = 22.0, 25.0
 """Log likelihood that a step has to explain, chosen on nights of drawn cameras without any: see the tests."""
 _LEAST_PX = 0.020
 _MOST = 6

@@ -23,13 +23,15 @@ paper's form and leaves the thermal one without an answer (NaN)."""
 class Outside(IntFlag):
     """Why a correction is an extrapolation. PLACE: beyond the hull of the markers (plus 1 px). CAMERA: the camera's
     temperature. AMBIENT: the air's, or how fast it changes. SWITCHED_ON: the camera was switched on more recently than
-    ever in the calibration. HISTORY: the record does not reach back far enough, or has a gap."""
+    ever in the calibration. HISTORY: the record does not reach back far enough, or has a gap. STATE: each of these is
+    in its range, but not in this combination."""
 
     PLACE = 1
     CAMERA = 2
     AMBIENT = 4
     SWITCHED_ON = 8
     HISTORY = 16
+    STATE = 32
 
 
 class DriftModel(Protocol):

@@ -88,6 +88,8 @@ class ThermalFile(_File):
     ambient_range_degC: Pair
     rate_range_K_per_h: Pair
     least_on_s: float | None
+    leverage_px2: float | None = None
+    history_s: float | None = None
     other: PaperFile | None = None
 
 
@@ -178,8 +180,14 @@ def _thermal_fields(model: ThermalModel) -> dict[str, object]:
         "coefficient_covariance_px2": model.coefficient_covariance.tolist(),
         "ambient_range_degC": model.valid.ambient_degC,
         "rate_range_K_per_h": model.valid.rate_K_per_h,
-        "least_on_s": None if math.isinf(model.valid.least_on_s) else model.valid.least_on_s,
+        "least_on_s": _finite(model.valid.least_on_s),
+        "leverage_px2": _finite(model.valid.leverage),
+        "history_s": model.valid.history_s,
     }
+
+
+def _finite(value: float) -> float | None:
+    return None if math.isinf(value) else value
 
 
 def _paper(file: PaperFile) -> PaperModel:
@@ -220,6 +228,8 @@ def _thermal(file: ThermalFile) -> ThermalModel:
             ambient_degC=file.ambient_range_degC,
             rate_K_per_h=file.rate_range_K_per_h,
             least_on_s=math.inf if file.least_on_s is None else file.least_on_s,
+            leverage=math.inf if file.leverage_px2 is None else file.leverage_px2,
+            history_s=file.history_s,
         ),
         has_warm_up=file.has_warm_up,
         candidates=file.candidates,

@@ -14,6 +14,7 @@ import numpy as np
 from compensation.history.states import Float, Memory, States
 
 MOTIONS = 8
+_QUICK_S = 240.0
 _SPAN_K = 20.0
 """Temperatures are scaled by this, so that all features are about 1."""
 
@@ -52,9 +53,10 @@ class Origin:
 
 
 def memory_of(terms: tuple[Term, ...], self_heating_K: float) -> Memory:
-    """What the terms need remembered."""
+    """What the terms need remembered, and one lag of the ambient in any case: its range is part of where a model holds,
+    also where a warm-up has shown the camera at every temperature."""
     plays = {term.parameter for term in terms if term.kind is Kind.PLAY}
-    taus = {term.parameter for term in terms if term.kind is not Kind.PLAY and term.parameter > 0}
+    taus = {term.parameter for term in terms if term.kind is not Kind.PLAY and term.parameter > 0} or {_QUICK_S}
     return Memory(tuple(sorted(taus)), tuple(sorted(plays)), self_heating_K)
 
 

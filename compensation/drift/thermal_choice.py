@@ -5,7 +5,7 @@ In use is the simplest family within one standard error of the best; of two as s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,16 @@ from compensation.drift.terms import MOTIONS, Kind, motions
 from compensation.drift.thermal_fit import RIDGE, RIDGE_WITH_PLAYS, Equations, equations, solve_thermal
 from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
 from compensation.drift.training import Training, self_heating_K, training
+from compensation.drift_runtime import SETTLED_TAUS
 from compensation.history.states import Float, Memory
 from compensation.observations import Observations
 from experiments.steps import Role
 from foundation.errors import SessionError
 
 _FEWEST_FOLDS = 3
+_GUESSED = {Kind.AMBIENT_LAG: 0.25, Kind.CAMERA_LAG: 0.25, Kind.CAMERA_LAG_SQUARE: 0.25, Kind.POWER_LAG: 0.5}
+"""How wrong the first guess of a feature may be: 5 K of 20, half of the self-heating."""
+_LEAST_PX, _STEP_S = 0.001, 300.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +159,7 @@ def _model(problem: _Problem, one: _Tried, heating_K: float, candidates: tuple[C
     solution = solve_thermal(problem.whole, columns, one.ridge)
     count = MOTIONS * len(columns)
     camera_degC = _extent(trained.states.camera_degC[np.unique(trained.rows.frame)])
-    return ThermalModel(
+    found = ThermalModel(
         facts=facts_of(observations, trained.fold_rows, camera_degC, trained.origin.camera_degC),
         terms=one.terms,
         reference_ambient_degC=trained.origin.ambient_degC,
@@ -168,6 +172,26 @@ def _model(problem: _Problem, one: _Tried, heating_K: float, candidates: tuple[C
         has_warm_up=any(term.kind is Kind.POWER_LAG for term in trained.terms),
         candidates=candidates,
     )
+    return replace(found, valid=replace(found.valid, leverage=_leverage(found, trained), history_s=_history_s(found)))
+
+
+def _leverage(model: ThermalModel, trained: Training) -> float:
+    """The largest of a training state."""
+    return float(model.leverage(trained.states.where(np.unique(trained.rows.frame))).max())
+
+
+def _history_s(model: ThermalModel) -> float:
+    """How long until what was guessed of the thermal state moves the image by less than the model is uncertain."""
+    limit_px = max(float(np.hypot(*model.discrepancy_px)), _LEAST_PX)
+    moved = motions(model.facts.hull_px, model.facts.image_size)
+    lags = [index for index, term in enumerate(model.terms) if term.kind in _GUESSED]
+    sizes_px = np.array([np.linalg.norm(moved @ model.coefficients[:, k], axis=1).mean() for k in lags])
+    sizes_px *= [_GUESSED[model.terms[k].kind] for k in lags]
+    taus_s = np.array([model.terms[k].parameter for k in lags])
+    for after_s in np.arange(0.0, SETTLED_TAUS * max(taus_s, default=0.0), _STEP_S).tolist():
+        if np.sqrt(((sizes_px * np.exp(-after_s / taus_s)) ** 2).sum()) < limit_px:
+            return float(after_s)
+    return float(SETTLED_TAUS * max(taus_s, default=0.0))
 
 
 def _range(trained: Training, terms: Terms) -> ThermalRange:

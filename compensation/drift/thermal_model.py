@@ -7,6 +7,7 @@ compensation/drift/thermal_choice.py makes the model.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,10 +24,11 @@ from compensation.drift.drift_model import (
     states_of,
 )
 from compensation.drift.facts import ModelFacts
-from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
+from compensation.drift.terms import MOTIONS, Kind, Origin, Term, features, memory_of, motions
 from compensation.drift_runtime import SETTLED_TAUS
 from compensation.history.states import Float, Memory, States
 
+_MORE_LEVERAGE = 3.0
 _MARGIN = 0.02
 """Of a calibrated range: it is known to no better than the noise of its ends."""
 
@@ -34,11 +36,15 @@ _MARGIN = 0.02
 @dataclass(frozen=True, slots=True, eq=False)
 class ThermalRange:
     """What the calibration covered besides the camera's temperature: the slowest lag of the ambient, how fast the
-    ambient changed, K/h, and the shortest time since the camera was switched on, s."""
+    ambient changed, K/h, and the shortest time since the camera was switched on, s. leverage: the largest of a training
+    state, inf in models that do not know it. history_s: how long a state must have been followed after a guess until
+    what is left of it does not matter; None: three of the longest time constants."""
 
     ambient_degC: Pair
     rate_K_per_h: Pair
     least_on_s: float
+    leverage: float = math.inf
+    history_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,12 +98,14 @@ class ThermalModel:
         return xy_px + self.shift(xy_px, state)
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
-        """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself."""
+        """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself. What
+        the form leaves unexplained is taken to grow with the leverage, beyond that of the training states."""
         found = self._features(state, len(xy_px))
         terms = motions(xy_px, self.facts.image_size)[:, :, :, None] * found[:, None, None, :]
         terms = terms.reshape(len(xy_px), 2, -1)
         of_coefficients = (terms @ self.coefficient_covariance) @ terms.transpose(0, 2, 1)
-        return of_coefficients + np.diag(self.discrepancy_px**2)
+        more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0)
+        return of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside."""
@@ -107,6 +115,26 @@ class ThermalModel:
     def inside(self, xy_px: Float, state: Situation) -> Mask:
         """(N,): whether points and states are in the calibrated range: no flag."""
         return self.flags(xy_px, state) == 0
+
+    @property
+    def history_s(self) -> float:
+        """How long a camera must be followed after a guess of its state."""
+        longest_s = SETTLED_TAUS * max(self.memory.taus_s, default=0.0)
+        return longest_s if self.valid.history_s is None else min(self.valid.history_s, longest_s)
+
+    @property
+    def leverage_matrix(self) -> Float:
+        """(H, H), px^2: what the coefficients' covariance makes of the features of a state, for the shift along I and
+        J."""
+        count = len(self.terms)
+        blocks = self.coefficient_covariance.reshape(MOTIONS, count, MOTIONS, count)
+        return blocks[0, :, 0] + blocks[1, :, 1]
+
+    def leverage(self, state: States) -> Float:
+        """(N,), px^2: how far a state is from those of the fit, in terms of what they determine (the diagonal of the
+        hat matrix, with the scale of the covariance)."""
+        found = self._features(state, len(state.camera_degC))
+        return np.einsum("nk,kl,nl->n", found, self.leverage_matrix, found)
 
     def _features(self, state: Situation, count: int) -> Float:
         states = states_of(state, count, self.memory)
@@ -120,7 +148,8 @@ class ThermalModel:
         found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
         if self.memory.taus_s:
             found |= range_flags(states.ambient_lag_degC[:, -1], _widened(valid.ambient_degC), Outside.AMBIENT)
-        needed_s = SETTLED_TAUS * max(self.memory.taus_s, default=0.0)
+        found |= range_flags(self.leverage(states), (0.0, _MORE_LEVERAGE * valid.leverage), Outside.STATE)
+        needed_s = self.history_s
         return found | range_flags(states.settled_s, (needed_s, np.inf), Outside.HISTORY)
 
 

@@ -1,0 +1,70 @@
+"""A model asked for temperatures it was not fitted to: it says so, and its interval grows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensation.drift.choosing import fit
+from compensation.drift.drift_model import Outside
+from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.training import frame_states
+from compensation.observations import Float
+from experiments.steps import Role
+
+from .drawn_cameras import drawn_camera
+from .drawn_nights import Night, cycle, night, reference, warm_up
+
+NARROW_DEGC = (27, 31, 34, 38, 41, 45, 41, 38, 34, 31, 27, 24, 20, 17, 20, 24)
+FAR_DEGC = (52, 48, 14, 10)
+
+
+@pytest.fixture(scope="module", params=[2, 5])
+def seed(request: pytest.FixtureRequest) -> int:
+    return int(request.param)
+
+
+def narrow(seed: int) -> ThermalModel:
+    made = night(drawn_camera(seed), [*warm_up(), *reference(), *cycle(NARROW_DEGC, (20, 34, 41))], seed)
+    model = fit(made.observed, form="thermal")
+    assert isinstance(model, ThermalModel)
+    return model
+
+
+def far(seed: int) -> Night:
+    return night(drawn_camera(seed), [*warm_up(), *reference(), *cycle(FAR_DEGC, FAR_DEGC)], seed + 50)
+
+
+def asked(model: ThermalModel, made: Night) -> tuple[Float, Float, Float]:
+    """Deviations and variances (F, 54, 2), and flags (F,), of the validation frames."""
+    observed, truth = made.observed, made.truth_px
+    place_px = truth[observed.of(Role.REFERENCE)].mean(axis=0)
+    states = frame_states(observed, model.memory)
+    frames = np.flatnonzero(observed.of(Role.VALIDATION)).tolist()
+    each = [states.where(np.array([k])) for k in frames]
+    left = [place_px - model.correct(truth[k], state) for k, state in zip(frames, each, strict=True)]
+    claimed = [model.covariance(truth[k], state) for k, state in zip(frames, each, strict=True)]
+    flags = [model.flags(truth[k][26:27], state)[0] for k, state in zip(frames, each, strict=True)]
+    return np.array(left), np.diagonal(np.array(claimed), axis1=2, axis2=3), np.array(flags)
+
+
+def test_a_set_point_that_was_not_fitted_is_flagged_and_less_certain(seed: int) -> None:
+    model = narrow(seed)
+    _, variance, flags = asked(model, far(seed))
+    assert (flags != 0).all()
+    assert variance.mean() > 1.5 * (model.discrepancy_px**2).mean()
+
+
+def test_few_held_out_set_points_between_fitted_ones_are_flagged(seed: int) -> None:
+    made = night(drawn_camera(seed), [*warm_up(), *reference(), *cycle(NARROW_DEGC, (20, 34, 41))], seed)
+    model = fit(made.observed, form="thermal")
+    assert isinstance(model, ThermalModel)
+    flags = asked(model, made)[2].astype(int)
+    assert ((flags & int(Outside.STATE | Outside.CAMERA)) == 0).mean() > 0.8
+
+
+def test_a_form_without_lags_knows_the_range_of_the_air() -> None:
+    model = narrow(2)
+    assert model.memory.taus_s
+    assert model.valid.ambient_degC[0] > 16
+    assert model.valid.ambient_degC[1] < 46
