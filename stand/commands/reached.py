@@ -14,6 +14,9 @@ DirectoryArgument = Annotated[
     Path | None,
     typer.Argument(metavar="[DIR]", help="A session, or a folder of sessions; else recording.directory of --config."),
 ]
+DirectoryOption = Annotated[
+    Path | None, typer.Option("--dir", help="The daemon's folder of sessions; else recording.directory of --config.")
+]
 ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
 UrlOption = Annotated[

@@ -1,0 +1,47 @@
+"""`stand submit` and `stand device`, against a desk in this process, over its socket and by TCP with a token."""
+
+import asyncio
+import json
+from pathlib import Path
+
+from typer.testing import CliRunner, Result
+
+from stand.commands.order_cli import app
+from stand.serving.api.server import Interface
+from tests.stand.a_desk import ADesk, served
+from tests.stand.test_interface_access import free_port
+
+TOKEN = "correct-horse-battery-staple"
+
+
+async def invoke(*arguments: object) -> Result:
+    return await asyncio.to_thread(CliRunner().invoke, app, [str(argument) for argument in arguments])
+
+
+async def test_a_run_is_submitted_once_for_each_key(tmp_path: Path):
+    recipe = tmp_path / "night.yaml"
+    recipe.write_text("name: night\n")
+    async with served(ADesk(), tmp_path / "sessions") as desk:
+        there = ("--dir", tmp_path / "sessions")
+        assert (await invoke("submit", recipe, *there, "--key", "monday")).stdout == "1\n"
+        assert (await invoke("submit", recipe, *there, "--key", "monday")).stdout == "1\n"
+        other = await invoke("submit", "demo", *there, "--key", "monday")
+        assert (other.exit_code, "was used for another run" in other.stderr) == (1, True)
+        assert json.loads((await invoke("submit", "demo", *there, "--json")).stdout)["recipe"] == "demo"
+    assert [run.recipe for run in desk.queue] == ["written", "demo"]
+
+
+async def test_a_device_is_told_something_over_the_network(tmp_path: Path):
+    port, token = free_port(), tmp_path / "token"
+    token.write_text(TOKEN)
+    interface = Interface(tmp_path, port=port, tokens={"rose": TOKEN})
+    async with served(ADesk(), tmp_path / "sessions", interface) as desk:
+        there = ("--url", f"http://127.0.0.1:{port}", "--token-file", token)
+        assert (await invoke("device", *there)).stdout == "flap (flap)\n"
+        assert (await invoke("device", "flap", "move", "to=0.5", "how=gently", *there)).stdout == "flap: move\n"
+        nothing = await invoke("device", "lid", "open", *there)
+        assert (nothing.exit_code, "no such device" in nothing.stderr) == (1, True)
+        assert (await invoke("device", "flap", "move", "to", *there)).exit_code == 2
+    who, verb, arguments = desk.orders[0]
+    assert (who.name, who.how, verb) == ("rose", "token", "device")
+    assert arguments == {"name": "flap", "verb": "move", "arguments": {"to": 0.5, "how": "gently"}}
