@@ -23,6 +23,7 @@ from tests.bench import (
     markers,
     modbus,
     night,
+    page,
     photographs,
     pipeline,
     reading,
@@ -59,6 +60,7 @@ BENCHMARKS = {
     "identification": identification.figures,
     "simulator": simulator.figures,
     "start": start.figures,
+    "page": page.figures,
 }
 
 

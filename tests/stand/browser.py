@@ -49,6 +49,7 @@ async def a_page(chromium, port: int, view: str = "now", size=DESKTOP, scheme="l
     try:
         await page.goto(f"http://127.0.0.1:{port}/#{view}")
         yield page
-        assert [error for error in errors if not error.startswith(_EXPECTED)] == []
+        if unexpected := [error for error in errors if not error.startswith(_EXPECTED)]:
+            pytest.fail(f"the page's console: {unexpected}")
     finally:
         await context.close()

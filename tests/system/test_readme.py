@@ -33,6 +33,7 @@ QUICK = (
 NOT_RUN = {
     "stand run overnight --virtual-time --report",
     "stand simulate",
+    "stand serve --port 8080",
     "stand run warm-up",
     "stand run warm-up --attended",
     "stand status",

@@ -85,6 +85,7 @@ export class Devices {
     counters.forEach(([, value], index) => say(this.counters.children[2 * index + 1], number(value, Number.isInteger(value) ? 0 : 1)));
   }
 
+  soon() { this.load(); }
   event() {}
   close() { this.closed = true; clearInterval(this.timer); }
 }

@@ -169,6 +169,7 @@ export class CameraView {
   }
 
   update() {}
+  soon() { this.frame.soon(); }
   event() { this.frame.soon(); }
   close() { this.frame.close(); }
 }

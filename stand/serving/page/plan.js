@@ -153,8 +153,9 @@ export class Plan {
     line.setAttribute("aria-label", steps.length ? `Time line of the plan: ${count} of ${steps.length} steps are done` : "Time line: there is no plan");
   }
 
-  event(event) { if (event.kind === "step" || event.kind === "plan_changed") { clearTimeout(this.soon); this.soon = setTimeout(() => this.refresh(), 200); } }
-  close() { this.closed = true; clearInterval(this.timer); clearTimeout(this.soon); this.resizing.disconnect(); }
+  soon() { this.refresh(); }
+  event(event) { if (event.kind === "step" || event.kind === "plan_changed") { clearTimeout(this.later); this.later = setTimeout(() => this.refresh(), 200); } }
+  close() { this.closed = true; clearInterval(this.timer); clearTimeout(this.later); this.resizing.disconnect(); }
 }
 
 const earned = (step) => {
