@@ -72,5 +72,5 @@ def _parsed(text: str, begin_ns: int, stand_ns: Callable[[int], int]) -> int:
     try:
         instant = instant.astimezone(UTC)  # one without a zone is local
     except (OverflowError, ValueError, OSError):
-        instant = instant.replace(tzinfo=UTC)
+        return _LAST_NS + 1
     return stand_ns((instant - _EPOCH) // timedelta(microseconds=1) * _NS_PER_US)

@@ -16,6 +16,16 @@ DISK_LOW = "disk_low"  # until frames can be recorded again
 NOT_RECORDED = "not_recorded"  # until the disk takes telemetry again
 STOPPING = "stopping"  # the run is being ended; cleared when it is over
 
+# The same in words, for people.
+IN_WORDS = {
+    OPERATOR: "an operator's pause",
+    INTERLOCK: "a rule of the guard, until an operator clears it",
+    CAMERA_LOST: "a camera that does not answer",
+    DISK_LOW: "a disk that takes no frames",
+    NOT_RECORDED: "a disk that takes no telemetry",
+    STOPPING: "the end of the run",
+}
+
 
 class Gate:
     """Awaited before each action, and within dwells and captures. Reasons are independent: none clears another."""

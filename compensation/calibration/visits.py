@@ -44,7 +44,7 @@ def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, V
         elif mark.kind == "Capture" and mark.parameters.get("role") in roles and mark.state is StepState.STARTED:
             role = str(mark.parameters["role"])
             if not all(axis in sent for axis in AXES):
-                raise SessionError(f"step {mark.index}: a {role} capture, but no move of both axes before it")
+                raise SessionError(f"step {mark.index + 1}: a {role} capture, but no move of both axes before it")
             visits[mark.step_id] = Visit(role, dict(sent), dict(since_ns), {})
     return visits
 

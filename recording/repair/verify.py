@@ -343,7 +343,7 @@ def _frames_lost(contents: Contents) -> Iterator[Finding]:
     dropped: Counter[str] = Counter()
     for _, meta in contents.metas:
         dropped[meta.step_id] += meta.dropped
-    steps = {mark.step_id: f"step {mark.index} ({mark.kind})" for mark in contents.marks}
+    steps = {mark.step_id: f"step {mark.index + 1} ({mark.kind})" for mark in contents.marks}
     for step_id, count in dropped.items():
         if count:
             lost = "1 frame" if count == 1 else f"{count} frames"

@@ -213,9 +213,17 @@ def _say(server: Server, answer: Mapping[str, object], text: str, *, as_json: bo
 def _show(server: Server, state: StandState, *, as_json: bool) -> None:
     if as_json:
         run = {} if state.run is None else state.run.model_dump(mode="json")
-        typer.echo(json.dumps({**run, "session": server.name, "stand": state.model_dump(mode="json")}, indent=2))
+        typer.echo(
+            json.dumps(
+                {**run, "session": run.get("session") or server.name, "stand": state.model_dump(mode="json")}, indent=2
+            )
+        )
         return
-    for line in idle_lines(server.name, state) if state.run is None else status_lines(server.name, state.run):
+    for line in (
+        idle_lines(server.name, state)
+        if state.run is None
+        else status_lines(state.run.session or server.name, state.run)
+    ):
         typer.echo(line)
     if state.prompt is not None:
         typer.echo(_row("asks", f"{state.prompt.text}; `stand continue` when it is done"))
@@ -227,7 +235,7 @@ def _show_plan(server: Server, *, as_json: bool) -> None:
         typer.echo(json.dumps(steps, indent=2))
         return
     for step in steps:
-        typer.echo(one_line(f"{step['index']:>5}  {str(step['standing']).replace('_', ' '):<10}  {step['text']}"))
+        typer.echo(one_line(f"{_number(step):>5}  {str(step['standing']).replace('_', ' '):<10}  {step['text']}"))
 
 
 def _step_id(server: Server, step: str) -> str:
@@ -235,9 +243,14 @@ def _step_id(server: Server, step: str) -> str:
     if not step.isdecimal():
         return step
     for planned in cast("list[Answer]", server.request("GET", f"{API}/plan")):
-        if planned["index"] == int(step):
+        if _number(planned) == int(step):
             return str(planned["step_id"])
     raise ConfigError(f"the plan has no step {step}; `stand status --plan` shows those there are")
+
+
+def _number(planned: Answer) -> int:
+    """Of a step of the plan, as `stand status` counts: 1 is the first."""
+    return cast("int", planned["index"]) + 1
 
 
 def _event_line(event: Mapping[str, object]) -> str:

@@ -92,7 +92,7 @@ def simulate(
 def _line(step: PricedStep) -> str:
     planned = step.planned
     return (
-        f"{planned.index:4d}  {planned.step_id}  {kind_of(planned.step):<16s}"
+        f"{planned.index + 1:4d}  {planned.step_id}  {kind_of(planned.step):<16s}"
         f"{parameters_text(parameters_of(planned.step)):<72s}{_hours(step.duration_s):>12s}"
         + (f"{step.frames:6d} frames {step.size_bytes / 1e6:8.1f} MB" if step.frames else "")
         + (f"   in band after {_hours(step.in_band_after_s)}" if step.in_band_after_s else "")

@@ -197,7 +197,7 @@ def _replay_progress(seen: Glance, session: Session) -> Generator[Callable[[Hub]
             at = utc.date_time(item.time_ns)
             report((item.time_ns - begin_ns) / NS_PER_S, at)
             if isinstance(item, StepMark):
-                typer.echo(f"{at}  step {item.index} {one_line(item.kind)} {item.state}")
+                typer.echo(f"{at}  step {item.index + 1} {one_line(item.kind)} {item.state}")
             elif isinstance(item, Event):
                 typer.echo(f"{at}  {one_line(f'{item.level} {item.kind}: {item.text}')}")
 
@@ -256,7 +256,7 @@ def trim_session(
     end: Annotated[str | None, typer.Option("--to", metavar="T", help="Not included; else the session's end.")] = None,
     incomplete: IncompleteOption = False,
 ) -> None:
-    """A part of a session as a new one. +1h30m counts from the session's start; step:12 is when step 12 began.
+    """A part of a session as a new one. +1h30m counts from the session's start; step:12 is when step 12 began (1 is the first).
 
     Example: stand session trim sessions/20260101T180000Z-thermal-cycle --out part --from step:12 --to +5h
     """
@@ -283,7 +283,7 @@ def _instant(text: str, session: Session, seen: Glance) -> int:
     step = re.fullmatch(r"step:(\d+)", text)
     if step is None:
         return parse_instant(text, seen.begin_ns or 0, session.utc.stand_ns)
-    begun = (mark.time_ns for mark in session.steps() if mark.index == int(step[1]))
+    begun = (mark.time_ns for mark in session.steps() if mark.index + 1 == int(step[1]))
     time_ns = next(begun, None)
     if time_ns is None:
         raise ConfigError(f"{text}: the session has no step {step[1]}")

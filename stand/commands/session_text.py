@@ -173,7 +173,7 @@ def _capture(step: Step, utc: UtcOffsets) -> str:
     told = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
     asked = step.parameters.get("frames", "?")
     begun = utc.date_time(step.begin_ns)
-    return f"{'':<{_LABEL}}step {step.index:<4d} {step.frames} of {asked} frames from {begun}  {told}"
+    return f"{'':<{_LABEL}}step {step.index + 1:<4d} {step.frames} of {asked} frames from {begun}  {told}"
 
 
 def _temperatures(temperatures: Sequence[Temperature]) -> Iterator[str]:

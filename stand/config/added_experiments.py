@@ -48,7 +48,7 @@ def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
         steps = tuple(islice(cast("Iterable[object]", make(checked)), MOST_STEPS + 1))
     except Exception as error:  # another package's code may raise anything
         raise ValueError(f"{name}: {_package(point)} makes no steps of these ({_told(error)})") from error
-    faults = (f"step {number} {fault}" for number, step in enumerate(steps) if (fault := _fault(step)))
+    faults = (f"step {number} {fault}" for number, step in enumerate(steps, 1) if (fault := _fault(step)))
     if fault := next(faults, ""):
         raise ValueError(f"{name}: {_package(point)} makes a step that cannot be done: {fault}; correct the package")
     return cast("tuple[Step, ...]", steps)

@@ -188,7 +188,7 @@ def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
 
 def _check(planned: PlannedStep, config: StandConfig) -> None:
     step = planned.step
-    where = f"step {planned.index} ({kind_of(step)})"
+    where = f"step {planned.index + 1} ({kind_of(step)})"
     if isinstance(step, StartChamber | SetTemperature):
         low, high = config.limits.chamber_degC
         if not low <= step.chamber_degC <= high:

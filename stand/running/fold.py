@@ -119,12 +119,13 @@ def refusal(state: RunState, change: Change) -> str:
     if isinstance(change, Edited):
         first = _first_free(state)
         if not first <= change.from_index <= len(state.plan):
-            return f"the steps from {first} to {len(state.plan)} can be replaced, not those from {change.from_index}"
+            wanted = change.from_index + 1
+            return f"the steps from number {first + 1} on can be replaced, not those from number {wanted} on"
         return ""
     planned = state.step(change.step_id)
     if planned is None:
         return f"the plan has no step {change.step_id}"
-    name = f"step {planned.index} ({kind_of(planned.step)})"
+    name = f"step {planned.index + 1} ({kind_of(planned.step)})"
     if change.step_id in state.done:
         return f"{name} is done"
     if isinstance(change, Extended):
@@ -140,9 +141,9 @@ def refusal(state: RunState, change: Change) -> str:
 def change_text(state: RunState, change: Change) -> str:
     """The change of a plan, in words."""
     if isinstance(change, Edited):
-        return f"the steps from {change.from_index} on are replaced by {len(change.by)} others by an operator"
+        return f"the steps from number {change.from_index + 1} on are replaced by {len(change.by)} others by an operator"
     planned = state.step(change.step_id)
-    name = change.step_id if planned is None else f"step {planned.index} ({kind_of(planned.step)})"
+    name = change.step_id if planned is None else f"step {planned.index + 1} ({kind_of(planned.step)})"
     if isinstance(change, Extended):
         return f"{name} takes {change.by_s:g} s longer, by an operator"
     return f"{name} is left out, by an operator"

@@ -29,7 +29,7 @@ from recording.writing.disk import JOURNAL_LINE, Disk
 from recording.writing.home import FolderLost
 from recording.writing.locks import lock
 from stand.fault import Fault
-from stand.gate import INTERLOCK, STOPPING
+from stand.gate import IN_WORDS, INTERLOCK, STOPPING
 from stand.running.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encode_line
 from stand.running.fold import after
 from stand.running.state import RunState
@@ -356,8 +356,11 @@ class Logbook:
         """A listener of the gate; the end of a run is published separately."""
         if reason == STOPPING:
             return
-        level, kind = ("warning", "held") if held else ("info", "released")
-        self.tell(level, kind, reason, {"reason": reason})
+        cause = IN_WORDS.get(reason, reason)
+        if held:
+            self.tell("warning", "held", f"held by {cause}", {"reason": reason})
+        else:
+            self.tell("info", "released", f"no longer held by {cause}", {"reason": reason})
         now_ns = self._clock.now_ns()
         if reason == INTERLOCK and not held:
             self._note(Cleared(now_ns))

@@ -83,7 +83,7 @@ def check_plan(plan: Iterable[PlannedStep], config: StandConfig) -> None:
         for _ in checked(Written((each.index,), each.step) for each in planned):
             pass
     except PlanError as error:
-        raise ConfigError(f"step {error.place[0]}: {error}") from error
+        raise ConfigError(f"step {int(error.place[0]) + 1}: {error}") from error
     price(planned, config)
 
 

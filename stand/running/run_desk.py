@@ -168,7 +168,9 @@ class RunDesk:
         by = [step_of(step.kind, dict(step.parameters)) for step in steps]
         await self.executor.edit(from_index, by)
         data: dict[str, JsonValue] = {"from_index": from_index, "steps": len(by)}
-        return self._done(who, "edit", data, f"the steps from {from_index} on are replaced by {len(by)} others")
+        return self._done(
+            who, "edit", data, f"the steps from number {from_index + 1} on are replaced by {len(by)} others"
+        )
 
     async def submit(self, who: Who, order: RunRequest, key: str = "") -> QueuedRun:
         """Conflict: there is no queue."""

@@ -310,7 +310,7 @@ async def test_losses_the_recording_tells_of_are_notes(tmp_path):
 
     directory = await recorded(tmp_path / "s", items)
     assert errors(directory) == []
-    assert notes(directory) == ["note: 2 frames of step 4 (Capture) lost by the camera or its wire"]
+    assert notes(directory) == ["note: 2 frames of step 5 (Capture) lost by the camera or its wire"]
 
 
 async def test_frames_the_recorder_says_it_lost_are_notes(tmp_path):

@@ -112,7 +112,7 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         assert nothing.exit_code == 1
         assert "nothing to clear" in nothing.stderr
         assert "when the step under way is done" in (await invoke("pause", tmp_path, "--at-next-step")).stdout
-        assert (await invoke("skip", "0", tmp_path)).stdout == f"{path}: step 0 is left out\n"
+        assert (await invoke("skip", "1", tmp_path)).stdout == f"{path}: step 1 is left out\n"
         assert (await invoke("extend", "0-soak", "30", tmp_path)).stdout == f"{path}: step 0-soak takes 30 min longer\n"
         assert (await invoke("skip", "7", tmp_path)).exit_code == 2
         assert json.loads((await invoke("stop", path, "--json")).stdout)["verb"] == "stop"
@@ -132,7 +132,7 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
 async def test_the_plan_and_what_happens_are_shown(tmp_path: Path):
     path = session(tmp_path, "night")
     async with served(ADesk(run=STATUS), path):
-        assert (await invoke("status", path, "--plan")).stdout == "    0  waiting     Soak\n"
+        assert (await invoke("status", path, "--plan")).stdout == "    1  waiting     Soak\n"
 
 
 @pytest.mark.parametrize(("moving", "said"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "nothing")])

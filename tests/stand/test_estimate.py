@@ -210,7 +210,7 @@ def test_a_soak_until_settled_is_priced_by_the_chamber_and_the_camera(config: St
 
 @pytest.mark.parametrize("step", [MoveTo("vertical", 1.0), CheckHome("vertical")])
 def test_an_axis_that_the_stand_lacks_is_refused(config: StandConfig, step: Step):
-    with pytest.raises(ConfigError, match=r"step 0 .*no axis 'vertical', only linear, rotary"):
+    with pytest.raises(ConfigError, match=r"step 1 .*no axis 'vertical', only linear, rotary"):
         price(planned(step), config)
 
 

@@ -131,7 +131,7 @@ def test_a_cool_down_and_a_prompt_under_way_are_left_out_and_others_end_by_thems
     here.call(lambda: here.stand.gate.clear(OPERATOR))
     here.do(here.executor.skip(ID[6]))
     passes_until(here, "CheckHome", 0.2)
-    with pytest.raises(ConfigError, match=r"step 7 \(CheckHome\) is under way and ends by itself"):
+    with pytest.raises(ConfigError, match=r"step 8 \(CheckHome\) is under way and ends by itself"):
         here.do(here.executor.skip(ID[7]))
     here.passes(10.0)
     assert here.run.done()
@@ -240,18 +240,18 @@ BEGUN = fold(PLAN, [Step(0, ID[0], "started"), Step(0, ID[0], "done"), Step(0, I
     [
         (Skipped(0, ID[1]), ""),
         (Skipped(0, ID[3]), ""),
-        (Skipped(0, ID[0]), "step 0 (StartChamber) is done"),
-        (Skipped(0, ID[2]), "step 2 (OpenFlap) sets up what later steps rely on; replace those from it on"),
+        (Skipped(0, ID[0]), "step 1 (StartChamber) is done"),
+        (Skipped(0, ID[2]), "step 3 (OpenFlap) sets up what later steps rely on; replace those from it on"),
         (Skipped(0, "x"), "the plan has no step x"),
         (Extended(0, ID[1], 1.0), ""),
-        (Extended(0, ID[3], 1.0), "step 3 (Capture) is no soak"),
-        (Extended(0, ID[1], -1.0), "step 1 (Soak) cannot be extended by -1 s"),
-        (Extended(0, ID[1], math.inf), "step 1 (Soak) cannot be extended by inf s"),
-        (Extended(0, ID[1], math.nan), "step 1 (Soak) cannot be extended by nan s"),
+        (Extended(0, ID[3], 1.0), "step 4 (Capture) is no soak"),
+        (Extended(0, ID[1], -1.0), "step 2 (Soak) cannot be extended by -1 s"),
+        (Extended(0, ID[1], math.inf), "step 2 (Soak) cannot be extended by inf s"),
+        (Extended(0, ID[1], math.nan), "step 2 (Soak) cannot be extended by nan s"),
         (Edited(0, 2, []), ""),
         (Edited(0, 9, []), ""),
-        (Edited(0, 1, []), "the steps from 2 to 9 can be replaced, not those from 1"),
-        (Edited(0, 10, []), "the steps from 2 to 9 can be replaced, not those from 10"),
+        (Edited(0, 1, []), "the steps from number 3 on can be replaced, not those from number 2 on"),
+        (Edited(0, 10, []), "the steps from number 3 on can be replaced, not those from number 11 on"),
     ],
 )
 def test_what_cannot_be_changed_says_why_and_changes_nothing(change: Change, why: str):

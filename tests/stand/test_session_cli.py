@@ -225,7 +225,7 @@ def test_info_says_what_is_unfinished_and_what_to_do(session: Path):
 def test_verify_tells_what_was_lost_before_the_recording_and_that_the_session_is_sound(session: Path):
     lines = ask("verify", session).stdout.splitlines()
     assert lines[:-1] == [
-        f"note: 1 frame of step {k} (Capture) lost by the camera or its wire" for k in range(1, 12, 2)
+        f"note: 1 frame of step {k} (Capture) lost by the camera or its wire" for k in range(2, 13, 2)
     ]
     assert lines[-1].startswith("files sound; run interrupted; 7 segments, 143 messages, 12 frames, ")
 
@@ -279,8 +279,8 @@ def test_a_replay_is_recorded_with_the_same_items(session: Path, tmp_path: Path,
 def test_a_replay_prints_steps_and_events_as_they_come(session: Path, speed: str):
     lines = ask("replay", session, "--speed", speed).stdout.splitlines()
     assert lines[:3] == [
-        "2026-01-01 18:00:00  step 0 Capture started",
-        "2026-01-01 18:00:00  step 0 Capture done",
+        "2026-01-01 18:00:00  step 1 Capture started",
+        "2026-01-01 18:00:00  step 1 Capture done",
         "2026-01-01 18:00:00  warning note: half second 0, 5 µm",
     ]
     assert len(lines) == 3 * COUNT
@@ -317,7 +317,7 @@ def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):
     parts = {
         "offset": ("--from", "+1s", "--to", "+3s"),
         "time": ("--from", "2026-01-01T18:00:01.073456", "--to", "2026-01-01T18:00:03.073456"),
-        "step": ("--from", "step:2", "--to", "step:6"),
+        "step": ("--from", "step:3", "--to", "step:7"),
     }
     for name, times in parts.items():
         assert ask("trim", session, "--out", tmp_path / name, *times).stdout.strip() == str(tmp_path / name)
