@@ -4,8 +4,10 @@
     detection = detect(image, target, previous=detection)     # next frames: fit from the frame before
 
 Pixels: integer coordinates are pixel centres, (0, 0) is the first one, x to the right, y down; arrays [row, column].
-The centre is that of the ellipse in the image. For a tilted target this is not the image of the disc's centre (about
-40 mpx for 8 mm discs at 1 m and 30 deg); the difference is constant while only the temperature changes.
+The centre is that of the outline in the image, an ellipse: in a Detection, in the drift model, and as an observation of
+a calibration. For a tilted target, or under distortion, this is not the image of the disc's centre (about 40 mpx for
+8 mm discs at 1 m and 30 deg). Drift leaves the difference as it is, to first order; calibration and poses compute it
+from the camera; for everything else `eccentricity.disc_centres` takes it off by what the markers show.
 """
 
 from __future__ import annotations

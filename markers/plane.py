@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -63,31 +65,36 @@ def roll_deg(homography: Float, target: Target) -> float:
 
 
 def expected_px(target_mm: Float, centres_px: Float, homography: Float) -> Float:
-    """Where each marker (N, 2) belongs: the homography, bent by a polynomial that follows the others' deviations.
+    """Where each marker (N, 2) belongs, by `to_image`; centres_px: NaN where unknown."""
+    return to_image(target_mm, centres_px, homography)(target_mm)
+
+
+def to_image(target_mm: Float, centres_px: Float, homography: Float) -> Callable[[Float], Float]:
+    """The map from points of the target's plane (K, 2), mm, to px: the homography, bent by a polynomial that follows
+    the deviations of the known among centres_px (N, 2).
 
     A wide lens puts markers of the corners a fifth of a pitch off any homography, smoothly; clutter and misfits are
-    off by themselves, and weigh little (Cauchy). centres_px: NaN where unknown; below 20 known ones nothing is bent.
+    off by themselves, and weigh little (Cauchy). Below 20 known ones nothing is bent.
     """
-    straight = project(homography, target_mm)
     known = np.isfinite(centres_px[:, 0])
     degree = next((degree for degree, least in _LEAST_FOR_DEGREE.items() if known.sum() >= least), None)
     if degree is None:
-        return straight
-    design = _monomials(target_mm, degree)
-    deviation = centres_px[known] - straight[known]
+        return lambda points_mm: project(homography, points_mm)
+    low, high = target_mm.min(axis=0), target_mm.max(axis=0)
+    design = _monomials(target_mm[known], low, high, degree)
+    deviation = centres_px[known] - project(homography, target_mm[known])
     weight = np.ones(len(deviation))
     bend = np.zeros((design.shape[1], 2))
     for _ in range(_ROUNDS):
         root = np.sqrt(weight)[:, None]
-        bend = np.linalg.lstsq(design[known] * root, deviation * root, rcond=None)[0]
-        off = np.linalg.norm(deviation - design[known] @ bend, axis=1)
+        bend = np.linalg.lstsq(design * root, deviation * root, rcond=None)[0]
+        off = np.linalg.norm(deviation - design @ bend, axis=1)
         scatter_px = 2 * max(_SIGMA_OF_MEDIAN * float(np.median(off)), 0.1)
         weight = 1 / (1 + (off / scatter_px) ** 2)
-    return straight + design @ bend
+    return lambda points_mm: project(homography, points_mm) + _monomials(points_mm, low, high, degree) @ bend
 
 
-def _monomials(points: Float, degree: int) -> Float:
-    """x^i y^j, i + j <= degree, of points (N, 2) scaled to -1..1; shape (N, terms)."""
-    low, high = points.min(axis=0), points.max(axis=0)
+def _monomials(points: Float, low: Float, high: Float, degree: int) -> Float:
+    """x^i y^j, i + j <= degree, of points (K, 2) scaled so that low and high are -1 and 1; shape (K, terms)."""
     x, y = ((2 * points - low - high) / (high - low)).T
     return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)

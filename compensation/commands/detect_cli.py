@@ -48,8 +48,8 @@ def detect_images(
 ) -> None:
     """Find the target's markers: a CSV row per marker and image, with covariance and flags.
 
-    x_px, y_px is the centre of the marker's outline in the image; disc_x_px, disc_y_px the image of the disc's centre,
-    by the homography of the target: use it for positions in space, or where the target is tilted.
+    x_px, y_px is the centre of the marker's outline in the image, which is what the drift model and a calibration take;
+    disc_x_px, disc_y_px is the image of the disc's own centre: use it for positions in space by other programs.
 
     Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
     """

@@ -43,7 +43,8 @@ def calibrate_photographs(
 
     Tilt the target by 20 to 40 deg to all sides, at several distances, and let it reach the picture's corners. The
     focus and the aperture must stay as they are. printing_error_mm and flatness_mm of the target file say how far its
-    markers may be from where they should be: a sheet of paper needs tenths of a mm.
+    markers may be from where they should be: a sheet of paper needs tenths of a mm. What is measured are the centres of
+    the outlines; the difference to the discs' own centres is computed from the camera.
 
     Example: compensate calibrate-photographs photos/*.jpg --target my-target.yaml --export exports
     """

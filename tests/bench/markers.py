@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from markers.detection import Detection, Flag, Noise, detect
+from markers.eccentricity import disc_centres_px
 from markers.target import Target, load_target
 from stand.config.stand_config import packaged
 from tests.bench.figures import (
@@ -31,7 +32,7 @@ from tests.bench.figures import (
     skipped,
 )
 from tests.bench.marker_peers import STRONGEST, Float, Image, Peer, opencv_peers, scikit_image_peers
-from tests.compensation.rendered import Scene, photograph, render, shaded_light, true_centres_px
+from tests.compensation.rendered import Scene, photograph, project, render, shaded_light, true_centres_px
 
 ROUNDS = 5
 FRAMES = 4
@@ -117,6 +118,7 @@ def figures(directory: Path) -> list[Figure]:
             lines += _honesty(name, found, truth)
         else:
             lines += _limits(name, case, clean, found, truth, target)
+            lines.append(_discs(name, case, found, target))
         lines += _beside(name, case, images, found, truth, peers)
     if not scikit_image_peers():
         lines.append(skipped("markers, scikit-image", "it is not installed"))
@@ -162,6 +164,14 @@ def _limits(name: str, case: Case, clean: Float, found: list[Detection], truth: 
         at_most(0.1, absolute(f"{name}: bias", "mpx RMS", [_rms_mpx([fine.centres_px], truth)])),
         at_most(0.1, absolute(f"{name}: predicted over actual sigma, off 1", "", [abs(sigma_mpx / error_mpx - 1)])),
     ]
+
+
+def _discs(name: str, case: Case, found: list[Detection], target: Target) -> Figure:
+    """Error of the images of the discs' own centres against the limit of the outlines'."""
+    middles = project(case.scene, case.scene.discs_mm()[:, :2])
+    error_mpx = _rms_mpx([disc_centres_px(detection, target) for detection in found], middles)
+    limit = side_by_side(f"{name}: discs' centres", "mpx RMS", "Cramer-Rao limit", [error_mpx], [case.limit_mpx])
+    return ratio_at_most(2.5 if case.scene.k1 else 1.2, limit)
 
 
 def _honesty(name: str, found: list[Detection], truth: Float) -> list[Figure]:
