@@ -74,7 +74,7 @@ def _segment_file(path: Path) -> SegmentFile | None:
 def is_locked(path: Path) -> bool:
     """A living recorder holds its file locked. Our own lock is shared and released at once: nothing waits for it."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe of that name must not block
     except PermissionError:  # recorded by another user: whether that process still lives is unknown
         return False
     try:

@@ -141,7 +141,9 @@ def refusal(state: RunState, change: Change) -> str:
 def change_text(state: RunState, change: Change) -> str:
     """The change of a plan, in words."""
     if isinstance(change, Edited):
-        return f"the steps from number {change.from_index + 1} on are replaced by {len(change.by)} others by an operator"
+        return (
+            f"the steps from number {change.from_index + 1} on are replaced by {len(change.by)} others by an operator"
+        )
     planned = state.step(change.step_id)
     name = change.step_id if planned is None else f"step {planned.index + 1} ({kind_of(planned.step)})"
     if isinstance(change, Extended):
