@@ -227,6 +227,15 @@ def test_a_session_without_any_drift_is_reported_all_the_same(role: str):
     assert f"({12 + 8} {role})" in text
 
 
+@pytest.mark.parametrize("role", ["fit", "other"])
+def test_frames_of_ones_own_steps_without_a_reference_are_shown_over_time(role: str):
+    own = warm_up_only(roles=(role,))
+    text = report_page(own, None, None)
+    assert not can_be_fitted(own)
+    assert headings(text) == ["Result", "Drift over time", "Recorded data"]
+    assert f"({12 + 8} {role})" in text
+
+
 def test_a_long_warm_up_does_not_make_a_large_page():
     text = report_page(warm_up_only(3600), None, None)
     assert len(text.encode()) < 1_000_000
