@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -56,8 +57,22 @@ def lazy_app(help_text: str, commands: Mapping[str, Lazy]) -> typer.Typer:
             return super().resolve_command(ctx, args)
 
     app = typer.Typer(cls=Commands, no_args_is_help=True, add_completion=False, help=help_text)
-    app.callback()(lambda: None)  # typer refuses an application with neither commands nor a callback
+    app.callback()(_root)  # typer refuses an application with neither commands nor a callback
     return app
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"thermostand {importlib.metadata.version('thermostand')}")
+        raise typer.Exit
+
+
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and end.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    """What both command lines take before a command."""
 
 
 def _imported(module: str, name: str) -> Any:

@@ -27,6 +27,8 @@ app = lazy_app(
         "stop": Lazy(_CONTROL, "Make the stand safe and end the run, as Ctrl-C does."),
         "submit": Lazy("stand.commands.order_cli", "Queue a run of the stand's daemon."),
         "device": Lazy("stand.commands.order_cli", "Tell a device something by hand, between runs."),
+        "recipes": Lazy("stand.commands.installed_cli", "The installed recipes."),
+        "configs": Lazy("stand.commands.installed_cli", "The installed stands' files."),
         "config": Lazy("stand.commands.config_cli", "Configuration files: JSON Schemas for editors, older versions."),
         "queue": Lazy("stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
         "alert": Lazy("stand.commands.alert_cli", "Alerts to people elsewhere: test them."),

@@ -74,7 +74,8 @@ def run(
     ] = "simulated",
     out: Annotated[Path | None, typer.Option(help="Where the session goes; else recording.directory.")] = None,
     virtual_time: Annotated[
-        bool, typer.Option("--virtual-time", help="As fast as it goes, with a simulated laboratory of its own.")
+        bool,
+        typer.Option("--virtual-time", help="In a simulated laboratory, as fast as it goes; for any stand's file."),
     ] = False,
     seed: Annotated[int | None, typer.Option(help="The simulated laboratory's seed (with --virtual-time).")] = None,
     attended: AttendedOption = False,

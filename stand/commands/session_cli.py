@@ -256,7 +256,7 @@ def trim_session(
     end: Annotated[str | None, typer.Option("--to", metavar="T", help="Not included; else the session's end.")] = None,
     incomplete: IncompleteOption = False,
 ) -> None:
-    """A part of a session as a new one. +1h30m counts from the session's start; step:12 is when step 12 began (1 is the first).
+    """A part of a session as a new one. +1h30m counts from the session's start; step:12 is when step 12 began (from 1).
 
     Example: stand session trim sessions/20260101T180000Z-thermal-cycle --out part --from step:12 --to +5h
     """

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
-from foundation.errors import ConfigError, SessionError, StandError, StandTripped
+from foundation.errors import SessionError, StandError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.progress import late_progress
@@ -27,6 +27,7 @@ from stand.running.claim import claimed
 from stand.running.guest import Guest, Job
 from stand.running.house import House, Time, opened
 from stand.running.order import Order
+from stand.running.rehearsal import rehearsed
 from stand.running.resume import Interruption
 from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory
 from stand.running.stop import Interrupted, Stop
@@ -49,14 +50,16 @@ async def run_virtual(
 ) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
+    Of a real stand's file the devices are replaced (rehearsal.py).
     The laboratory takes free addresses, not the configured ones: any number of virtual runs go side by side.
     The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start;
     `begun` gets the folder as soon as a run that is killed could be resumed in it.
     Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
     """
+    order = rehearsed(order)
     simulation = order.config.simulation
     if simulation is None:
-        raise ConfigError(f"{order.config.name}: virtual time needs a `simulation` section")
+        raise ValueError("a rehearsal has a simulated laboratory")
     return await _run_virtual(Job(order, out, seed, watch, begun), seconds_ns(simulation.start.timestamp()))
 
 

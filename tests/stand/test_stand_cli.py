@@ -92,7 +92,6 @@ def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(
         (["demo", "--out", "."], "a demo needs a folder of its own name"),
         (["plan", "two\nlines"], "two\\nlines: no such file"),
         (["plan", "x" * 300], "cannot be looked up (File name too long)"),
-        (["run", "demo", "--config", "laboratory", "--virtual-time"], "virtual time needs a `simulation` section"),
         (["simulate", "laboratory"], "no `simulation` section"),
     ],
 )

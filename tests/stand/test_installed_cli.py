@@ -1,0 +1,31 @@
+"""What is installed is listed, and both programs say their version."""
+
+import importlib.metadata
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from compensation.cli import app as compensate
+from stand.commands.commands import app as stand
+from stand.config.stand_config import packaged
+
+
+def ask(app, *words: str) -> str:
+    result = CliRunner().invoke(app, list(words))
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.mark.parametrize("app", [stand, compensate])
+def test_the_version_is_told(app):
+    assert ask(app, "--version") == f"thermostand {importlib.metadata.version('thermostand')}\n"
+
+
+def test_each_recipe_and_each_stand_is_listed_by_the_name_that_commands_take():
+    lines = ask(stand, "recipes").splitlines()
+    assert any(line.startswith("thermal-cycle ") and "Two cycles over 10..52 degC" in line for line in lines)
+    for each in json.loads(ask(stand, "recipes", "--json")):
+        assert str(packaged("recipes", each["name"])) == each["path"]
+    assert [line.split()[0] for line in ask(stand, "configs").splitlines()] == ["laboratory", "simulated"]
+    assert json.loads(ask(stand, "configs", "--json"))[1]["text"] == "simulated-stand"

@@ -1,0 +1,66 @@
+"""Anybody's stand in virtual time: limits, thermometers, axes, contacts and recipe are kept, the devices simulated."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from foundation.errors import ConfigError
+from recording.reading.run_word import Run
+from recording.reading.session import Session
+from stand.config.stand_config import StandConfig, packaged
+from stand.running.order import load_order
+from stand.running.rehearsal import rehearsed
+from stand.running.run import run_virtual
+
+RECIPE = "name: short\nsteps:\n  - start_chamber: 26\n  - soak: 300\n  - stop_chamber\n"
+
+
+def real_stand(folder: Path, **changes: object) -> Path:
+    """The installed laboratory's file with a few things that only this one has, and no camera."""
+    data = yaml.safe_load(packaged("", "laboratory").read_text())
+    data["limits"]["chamber_degC"] = [12, 48]
+    data["guard"]["notify"] = ["/bin/true"]
+    data |= {"cameras": {}, **changes}
+    (folder / "stand.yaml").write_text(yaml.safe_dump(data))
+    (folder / "short.yaml").write_text(RECIPE)
+    return folder / "stand.yaml"
+
+
+async def test_the_rehearsal_of_a_real_stand_runs_and_is_recorded_as_simulated(tmp_path: Path):
+    order = load_order(str(tmp_path / "short.yaml"), str(real_stand(tmp_path)))
+    session = Session.open(await run_virtual(order, tmp_path / "out", 3, lambda hub: None))
+    assert (session.run, session.metadata["simulated"]) == (Run.COMPLETE, "true")
+    attached = StandConfig.model_validate(yaml.safe_load(session.attachments["config.yaml"]))
+    assert attached.simulation is not None
+    assert attached.limits.chamber_degC == (12, 48)
+    assert attached.thermometers == order.config.thermometers
+    assert session.attachments["config.yaml"].startswith("# A rehearsal of this stand's file")
+
+
+def test_what_is_kept_and_what_is_replaced(tmp_path: Path):
+    laboratory = yaml.safe_load(packaged("", "laboratory").read_text())
+    path = real_stand(tmp_path, cameras=laboratory["cameras"])
+    order = load_order(str(tmp_path / "short.yaml"), str(path))
+    found = rehearsed(order)
+    own, there = order.config, found.config
+    assert there.model_dump(include={"name", "limits", "thermometers", "dew", "ending", "target", "chamber"}) == (
+        own.model_dump(include={"name", "limits", "thermometers", "dew", "ending", "target", "chamber"})
+    )
+    assert {name: axis.limits for name, axis in there.axes.items()} == {
+        name: axis.limits for name, axis in own.axes.items()
+    }
+    assert there.camera is not None
+    assert own.camera is not None
+    assert (there.camera.exposure_s, there.camera.serial_number) == (own.camera.exposure_s, own.camera.serial_number)
+    assert there.bus.address.startswith("tcp:127.0.0.1")
+    assert (there.guard.notify, there.compressor.state_file) == ((), None)
+    assert rehearsed(found) == found
+
+
+def test_an_axis_that_the_laboratory_does_not_have_is_told(tmp_path: Path):
+    data = yaml.safe_load(packaged("", "laboratory").read_text())
+    axes = {"linear": data["axes"]["linear"], "tilt": data["axes"]["rotary"]}
+    path = real_stand(tmp_path, axes=axes)
+    with pytest.raises(ConfigError, match="the simulated laboratory has no axis tilt, only linear, rotary"):
+        rehearsed(load_order(str(tmp_path / "short.yaml"), str(path)))
