@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -132,16 +132,24 @@ class PageRoom:
         @router.get("/api/v1/sessions/{name}/history", response_model=Curves)
         async def of_session(name: SessionName, points: Points = 1200) -> Response:
             """The same of a recorded session, from its beginning to its end."""
-            return _json((await self._read(name, _LIMIT_S, session_columns, points)).as_json())
+            return _json((await self._read(name, _LIMIT_S, self._viewing.ask, session_columns, points)).as_json())
 
         @router.get("/api/v1/sessions/{name}/drift", response_model=DriftOfSession)
         async def drift(name: SessionName) -> Response:
             """How the markers of a recorded session moved, from at most 120 of its frames; the first time this takes
             up to minutes."""
-            found = await self._read(name, _DRIFT_LIMIT_S, session_drift, self._viewing.target_text)
+            viewing = self._viewing
+            found = await self._read(name, _DRIFT_LIMIT_S, viewing.search, session_drift, viewing.target_text)
             return _json(asdict(found))
 
-    async def _read(self, name: str, limit_s: float, function: Callable[..., Any], argument: object) -> Any:
+    async def _read(
+        self,
+        name: str,
+        limit_s: float,
+        ask: Callable[..., Awaitable[Any]],
+        function: Callable[..., Any],
+        argument: object,
+    ) -> Any:
         """What `function` finds in a session; kept until the session has changed."""
         path = await asyncio.to_thread(session_in, self._viewing.sessions, name)
         try:
@@ -152,7 +160,7 @@ class PageRoom:
         if key not in self._read_already:
             try:
                 async with asyncio.timeout(limit_s):
-                    found = await self._viewing.ask(function, str(path), argument)
+                    found = await ask(function, str(path), argument)
             except TimeoutError:
                 raise NoAnswer(f"{path.name} could not be read within {limit_s:g} s") from None
             except OSError as error:

@@ -29,7 +29,7 @@ _WAITING = 20_000  # items; the thread takes them every second
 _TAKE_S = 1.0
 _SOONEST_S = 0.4  # between two frames that are looked at
 _AGAIN_S = 30.0  # before a process that has ended is started again
-_LOOK, _READ = "look", "read"
+_LOOK, _READ, _SEARCH = "look", "read", "search"  # what is asked for on one line never waits for another's
 _ENDED = "the process that looks at frames for the page has ended"
 _RUN_START = "run.start"
 
@@ -98,6 +98,10 @@ class Viewing:
         """`function(*args)` in the process at the lowest priority; OSError when that has ended."""
         return await asyncio.to_thread(self._started().line(_READ).run, function, *args)
 
+    async def search(self, function: Callable[..., Any], *args: object) -> Any:
+        """The same for what takes minutes."""
+        return await asyncio.to_thread(self._started().line(_SEARCH).run, function, *args)
+
     async def _keep(self) -> None:
         try:
             await self._remember()
@@ -153,7 +157,7 @@ class Viewing:
     def _started(self) -> Helper:
         """The process; the target is known to it from the first frame on."""
         if self._helper is None:
-            self._helper, self._knows_target = Helper(MODULE, (_LOOK, _READ), _ENDED), False
+            self._helper, self._knows_target = Helper(MODULE, (_LOOK, _READ, _SEARCH), _ENDED), False
         return self._helper
 
     async def _previewer(self) -> Line:

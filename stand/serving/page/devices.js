@@ -1,5 +1,6 @@
 // Devices by hand, through the same gate as a run; while a run owns the stand they take no orders.
 import { command, get, tell } from "./api.js";
+import { look_of } from "./channels.js";
 import { fill, h, number, say, unit_of, words } from "./dom.js";
 
 export class Devices {
@@ -73,7 +74,7 @@ export class Devices {
       const key = rows.join();
       if (values.dataset.key !== key) {
         values.dataset.key = key;
-        fill(values, rows.map((channel) => [h("dt", {}, words(channel.split(".").slice(1).join("."))), h("dd", {}, "")]));
+        fill(values, rows.map((channel) => [h("dt", {}, look_of(channel).name), h("dd", {}, "")]));
       }
       rows.forEach((channel, index) => {
         const reading = state.readings[channel];
