@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
 
@@ -34,6 +35,7 @@ ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model fi
 CameraOption = Annotated[
     float | None, typer.Option("--camera-degC", help="The camera's own temperature, where it was not recorded.")
 ]
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 INDEX_COLUMNS = ("image", "frame", "time_ns", "camera_degC", "outside")
 
 
@@ -43,7 +45,10 @@ def apply_model(
     source: Annotated[Path, typer.Argument(metavar="POINTS.csv|IMAGE|SESSION", help="What is to be corrected.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write; of a session a new folder.")],
     session: Annotated[
-        Path | None, typer.Option(help="Of points with time_ns: the session that recorded the camera then.")
+        Path | None, typer.Option(help="Of points with time_ns, or an image: the session that recorded the camera.")
+    ] = None,
+    time: Annotated[
+        str | None, typer.Option(help="Of an image: when it was taken, UTC (2026-01-01T18:00:00) or time_ns.")
     ] = None,
     camera_degC: CameraOption = None,
     frames: Annotated[
@@ -64,23 +69,58 @@ def apply_model(
     with one_line_errors():
         used = load_model(model)
         if source.is_dir():
-            _refuse(("--session", session), ("--camera-degC", camera_degC), why="a session has temperatures of its own")
+            _refuse(
+                ("--session", session),
+                ("--camera-degC", camera_degC),
+                ("--time", time),
+                why="a session has temperatures of its own",
+            )
             _correct_session(used, open_whole(source, said_if(incomplete)), out, frames, form)
         elif source.suffix.lower() == ".csv":
             _refuse(("--frames", frames), why="it selects frames of a session")
+            _refuse(("--time", time), why="the points have a column time_ns")
             check_writable(out)
             recorded = None if session is None else open_whole(session, said_if(incomplete))
             _correct_points(used, source, out, recorded, camera_degC)
         else:
-            _refuse(("--session", session), ("--frames", frames), why="one image has --camera-degC only")
-            if camera_degC is None:
-                raise ConfigError(f"{source}: give the camera's temperature with --camera-degC")
+            _refuse(("--frames", frames), why="it selects frames of a session")
+            recorded = None if session is None else open_whole(session, said_if(incomplete))
+            used, states = _of_image(used, source, recorded, time, camera_degC)
             check_writable(out)
             image = read_image(source)
-            used = _without_history(used)
-            states = States.at_degC(camera_degC, 1, used.memory)
             write_image(out, corrected_image(image, used, states), form, image.dtype)
             _warn(middle_flags(used, states))
+
+
+def _of_image(
+    model: DriftModel, source: Path, session: Session | None, time: str | None, camera_degC: float | None
+) -> tuple[DriftModel, States]:
+    """The form for one image, and the thermal state it was taken in."""
+    if session is None:
+        _refuse(("--time", time), why="it is an instant of a session; give --session as well")
+        if camera_degC is None:
+            raise ConfigError(f"{source}: give the camera's temperature with --camera-degC, or --session and --time")
+        used = _without_history(model)
+        return used, States.at_degC(camera_degC, 1, used.memory)
+    _refuse(("--camera-degC", camera_degC), why="the session has it")
+    if time is None:
+        raise ConfigError(f"{source}: say with --time when this image was taken in the session")
+    states = _recorded_states(model, session, [_instant_ns(time, session)])
+    if np.isnan(model.shift(np.zeros((1, 2)), states)).all():
+        raise SessionError(f"{source}: {session.path} does not tell the camera's state at {time}")
+    return model, states
+
+
+def _instant_ns(text: str, session: Session) -> int:
+    """time_ns as it is; UTC by the session's clock."""
+    if text.isdecimal():
+        return int(text)
+    try:
+        utc = datetime.fromisoformat(text)
+    except ValueError:
+        raise ConfigError(f"--time {text}: give time_ns, or UTC such as 2026-01-01T18:00:00") from None
+    utc = utc if utc.tzinfo else utc.replace(tzinfo=UTC)
+    return session.utc.stand_ns(round((utc - _EPOCH) / timedelta(microseconds=1)) * 1000)
 
 
 @app.command("export")

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from compensation.centres_table import observations_of_table
 from compensation.commands.budget_cli import budgets_of_sessions
 from compensation.commands.options import (
     AcrossGap,
@@ -24,11 +25,12 @@ from compensation.drift.evaluation import evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
 from compensation.finding.found import finder
-from compensation.observations import observe
+from compensation.observations import Observations, observe
 from compensation.reporting.extras import Extras
 from compensation.reporting.report import NoModel, can_be_scored, check_report_writable, fitted, write_report
 from compensation.reporting.table_positions import table_positions
 from compensation.validation3d.reading import load_validation
+from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
 from foundation.progress import progress
@@ -48,7 +50,10 @@ FormOption = Annotated[
 
 @app.command()
 def fit(
-    sessions: Sessions,
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(metavar="SESSION...|CENTRES.csv", help="Folders of recorded sessions, or a table of centres."),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
     form: FormOption = None,
     degree: DegreeOption = None,
@@ -61,25 +66,40 @@ def fit(
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
+    A table has a row for each centre: frame, marker, x_px, y_px, camera_degC, and where known time_ns, chamber_degC,
+    role, air_degC, var_x_px2, cov_xy_px2, var_y_px2. It needs no session and no stand.
+
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
     with one_line_errors():
         check_request(degree, form)
         check_writable(out)
-        found_by = finder(workers, cluster, use_cache=cache)
-        observations = observe(
-            sessions,
-            progress,
-            named_target(target),
-            found_by,
-            across_gap=across_gap,
-            incomplete=said_if(incomplete),
-        )
+        if any(path.suffix.lower() == ".csv" for path in sessions):
+            observations = _of_table(sessions)
+        else:
+            observations = observe(
+                sessions,
+                progress,
+                named_target(target),
+                finder(workers, cluster, use_cache=cache),
+                across_gap=across_gap,
+                incomplete=said_if(incomplete),
+            )
         model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
         save_model(model, out)
         typer.echo(f"{model.form}: {model.title}")
+        for bump in model.facts.bumps:
+            utc = next(facts.utc for facts in observations.sessions if facts.session_id == bump.session_id)
+            when = f"{utc.date_time(bump.after_ns)} and {utc.date_time(bump.before_ns)}"
+            typer.echo(f"bump in {bump.session_id} between {when}: {bump.text}; fitted around it")
         typer.echo(table(evaluation))
+
+
+def _of_table(paths: list[Path]) -> Observations:
+    if len(paths) > 1:
+        raise ConfigError(f"{paths[1]}: a table of centres is fitted by itself; give one file, or sessions")
+    return observations_of_table(paths[0])
 
 
 @app.command()

@@ -364,3 +364,21 @@ def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_
 def test_export_says_what_it_has_written(files: dict[str, Path], tmp_path: Path):
     printed = run("export", files["thermal"], "-o", tmp_path / "a" / "b")
     assert printed.split() == [str(tmp_path / "a" / "b" / name) for name in ("drift.json", "drift_runtime.py")]
+
+
+def test_an_exported_image_is_corrected_as_the_session_is_at_its_time(
+    recorded: Recorded, files: dict[str, Path], tmp_path: Path
+):
+    session, out = Session.open(recorded.path), tmp_path / "out.tiff"
+    frame, photo = session.frame(6), tmp_path / "photo.png"
+    cv2.imwrite(str(photo), frame.image)
+    for name in ("paper", "thermal"):
+        run("apply", files[name], recorded.path, "-o", tmp_path / name, "--frames", "6:7")
+        run("apply", files[name], photo, "--session", recorded.path, "--time", frame.time_ns, "-o", out)
+        assert out.read_bytes() == (tmp_path / name / "000006.tiff").read_bytes()
+    for given, says in (
+        (("--session", recorded.path), "say with --time"),
+        (("--time", frame.time_ns, "--camera-degC", 40), "give --session as well"),
+        (("--session", recorded.path, "--time", "noon"), "give time_ns, or UTC"),
+    ):
+        assert says in run("apply", files["paper"], photo, *given, "-o", tmp_path / "none.tiff", status=2)
