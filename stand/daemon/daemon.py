@@ -103,6 +103,12 @@ class Daemon:
         if self._leaving.is_set():
             self._assembly.stand.safety.give_up()
 
+    def note(self) -> None:
+        """Counters and fault are kept for the next start."""
+        fault = self.house.latched
+        latch = None if fault is None else Latch(rule=fault.rule, text=fault.text, since_ns=self.house.fault_ns)
+        self._keep.note(Kept(counters=dict(self.counters.values), latch=latch))
+
     def clear_queue(self) -> None:
         """What halted it has been looked into."""
         self._beside(self._clear_queue())
@@ -143,7 +149,7 @@ class Daemon:
         async with AsyncExitStack() as stack:
             stack.push_async_callback(cancelled, self._extending)
             stack.push_async_callback(self._keep.close)
-            stack.callback(self._note)
+            stack.callback(self.note)
             await self._record_house()
             stack.push_async_callback(self._end_record)
             stack.push_async_callback(self.house.close)
@@ -236,7 +242,7 @@ class Daemon:
         finally:
             await self._record_house()
             self.has_guest = False
-            self._note()
+            self.note()
             systemd.tell("STATUS=idle")
 
     async def _record_house(self) -> None:
@@ -280,7 +286,7 @@ class Daemon:
                 await self._record_house()
             if self._clock.now_ns() - kept_ns >= _KEEP_EVERY_S * NS_PER_S:
                 kept_ns = self._clock.now_ns()
-                self._note()
+                self.note()
 
     def _needs_record(self) -> bool:
         """A new one: at midnight, and when the last one has ended by itself and nobody has to look at that first; what
@@ -333,12 +339,7 @@ class Daemon:
     def _follow(self, item: Item) -> None:
         """The hub's subscriber: what has tripped is kept at once."""
         if isinstance(item, Event) and (item.kind.startswith("guard.") or item.kind in ("command", "hold_ended")):
-            self._note()
-
-    def _note(self) -> None:
-        fault = self.house.latched
-        latch = None if fault is None else Latch(rule=fault.rule, text=fault.text, since_ns=self.house.fault_ns)
-        self._keep.note(Kept(counters=dict(self.counters.values), latch=latch))
+            self.note()
 
     def _say(self, line: str) -> None:
         self._tell("info", "queue", line)

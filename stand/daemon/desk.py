@@ -85,6 +85,7 @@ class DaemonDesk:
             self._refuse(who, "clear", {}, "there is nothing to clear: no interlock holds this stand")
         self._tell(who, "clear", {})
         gate.clear(INTERLOCK)
+        daemon.note()
         if daemon.house.latched is None:
             daemon.clear_queue()
         again = daemon.house.latched

@@ -1,24 +1,33 @@
 """A stand that is served for days, over real wires, its socket and the command line: runs are guests, and what is done
 by hand between them goes through the same gate."""
 
+import asyncio
+import gc
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
 import yaml
 
+from foundation.clock import WallClock
 from foundation.errors import SessionError
+from foundation.hub import Hub
 from recording.reading.session import Session
-from stand.config.stand_config import load_config
+from stand.config.stand_config import load_config, packaged
+from stand.daemon.desk import DaemonDesk
+from stand.daemon.serve import serve as serve_stand
+from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
-from stand.serving.desk import StandState
+from stand.serving.desk import Conflict, RunRequest, StandState, Who
 from tests.system.conftest import require_aravis
 from tests.system.test_real_time import BRIEF
+from tests.system.test_two_runs import Laboratory
 
 LIMIT_S = 120.0  # for a busy machine
 LONG = BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600").replace("[26]", "[40]")
@@ -170,13 +179,24 @@ def test_a_stop_ends_the_run_and_leaves_the_daemon_with_a_safe_stand(serve: Call
     served.until(lambda state: states_of(state) == ["failed", "done"])
 
 
-def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(serve: Callable[[], Served]):
+async def heater_goes_off(config_file: Path) -> None:
+    async with Laboratory(config_file) as laboratory:
+        end_s = time.monotonic() + LIMIT_S
+        while await laboratory.heater_is_on():
+            assert time.monotonic() < end_s
+            await asyncio.sleep(0.2)
+
+
+def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
+    serve: Callable[[], Served], laboratory: Path
+):
     served = serve()
     served.until(is_idle)
     served.submit(LONG.replace("3600", "20"))
     served.until(lambda state: state.run is not None and state.readings["relays.heater_enable"].value == 1)
     served.process.send_signal(signal.SIGKILL)
     served.process.wait()
+    asyncio.run(heater_goes_off(laboratory))  # nobody is there to switch it
     again = serve()
     offered = again.until(is_idle)
     assert states_of(offered) == ["interrupted"]
@@ -269,3 +289,43 @@ def test_stand_run_goes_through_the_daemon_that_has_the_stand(serve: Callable[[]
     assert halted.queue_halted  # who presses stop does not want the next one to begin
     served.post("run/clear")
     served.until(lambda state: states_of(state) == ["done", "failed", "done"])
+
+
+async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heated_without_a_record(
+    laboratory: Path, tmp_path: Path
+):
+    """In this process, in which the daemon's objects can be counted and its record taken away."""
+    config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
+    texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    subscribers: list[int] = []
+
+    async def until(desk: DaemonDesk, wanted: Callable[[StandState], bool]) -> None:
+        end_s = time.monotonic() + LIMIT_S
+        while not wanted(desk.state()):
+            assert time.monotonic() < end_s
+            await asyncio.sleep(0.05)
+
+    @asynccontextmanager
+    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+        daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
+
+        async def work() -> None:
+            for number in (1, 2):
+                await desk.submit(who, RunRequest(recipe_text=BRIEF))
+                await until(desk, lambda state, done=number: states_of(state) == ["done"] * done)
+                await until(desk, is_idle)
+                subscribers.append(len(getattr(hub, "_subscribers")))  # noqa: B009 - as above
+            gc.collect()
+            assert [found for found in gc.get_objects() if isinstance(found, Guest)] == []
+            await daemon.record.end()
+            with pytest.raises(Conflict, match="no heat without a recording"):
+                await desk.device(who, "regulator", "set", {"setpoint_degC": 30.0})
+            assert not desk.state().heater_permitted
+
+        working = asyncio.create_task(work())
+        working.add_done_callback(lambda _: daemon.leave())
+        yield
+        await working
+
+    await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
+    assert len(set(subscribers)) == 1
