@@ -1,0 +1,47 @@
+"""The documentation as a site: every link within it is there, and no page asks another server for anything."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stand.config.reference import reference
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out
+
+
+def test_each_page_is_made(site: Path):
+    pages = {path.name for path in site.glob("*.html")}
+    assert {path.with_suffix(".html").name for path in (ROOT / "docs").glob("*.md")} <= pages
+    assert {f"reference-{name}.html" for name in ("stand", "recipe", "registers", "target")} <= pages
+
+
+def test_no_page_loads_anything_from_elsewhere(site: Path):
+    loads = re.compile(
+        r"""<(?:script|img|iframe)[^>]+src="(https?:)?//|<link[^>]+rel="stylesheet"[^>]+href="(https?:)?//"""
+    )
+    assert [path.name for path in site.glob("*.html") if loads.search(path.read_text(encoding="utf-8"))] == []
+
+
+def test_the_reference_has_every_key_with_its_bounds():
+    schema = json.loads((ROOT / "configs" / "schema" / "stand.json").read_text())
+    page = reference("A stand's file", schema)
+    for key in schema["properties"]:
+        assert f"| `{key}` |" in page, key
+    assert "## GuardConfig" in page
+    assert "| `after_s` | number >= 0, <= 60 | `0.0` |" in page
+    assert "| `fault_when` | `open` or `closed` | `open` |" in page
