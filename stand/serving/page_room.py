@@ -19,7 +19,7 @@ from foundation.errors import ConfigError
 from recording.format.layout import TELEMETRY
 from stand.config.stand_config import packaged
 from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.api.recorded import SessionName, session_in
+from stand.serving.api.recorded import Disk, SessionName, session_in
 from stand.serving.api.stream import json_of
 from stand.serving.desk import Missing
 from stand.serving.history import MOST_POINTS
@@ -99,6 +99,7 @@ class PageRoom:
 
     def __init__(self, viewing: Viewing) -> None:
         self._viewing = viewing
+        self._disk = Disk()
         self._read_already: dict[tuple[object, ...], Any] = {}
         self._running: asyncio.Task[None] | None = None
 
@@ -151,11 +152,7 @@ class PageRoom:
         argument: object,
     ) -> Any:
         """What `function` finds in a session; kept until the session has changed."""
-        path = await asyncio.to_thread(session_in, self._viewing.sessions, name)
-        try:
-            changed_ns = (await asyncio.to_thread((path / TELEMETRY).stat)).st_mtime_ns
-        except OSError as error:
-            raise Missing(f"{path.name} has no telemetry ({error.strerror})") from None
+        path, changed_ns = await self._disk.ask(lambda: _changed(session_in(self._viewing.sessions, name)))
         key = (function.__name__, path.name, changed_ns, argument)
         if key not in self._read_already:
             try:
@@ -191,6 +188,14 @@ class PageRoom:
             if preview is None:
                 return Response(status_code=204)
             return Response(preview.jpeg, media_type="image/jpeg", headers={"x-time-ns": str(preview.time_ns)})
+
+
+def _changed(session: Path) -> tuple[Path, int]:
+    """The session, and when a segment was last added to it."""
+    try:
+        return session, (session / TELEMETRY).stat().st_mtime_ns
+    except OSError as error:
+        raise Missing(f"{session.name} has no telemetry ({error.strerror})") from None
 
 
 def _preview(viewing: Viewing, camera: str) -> Preview | None:

@@ -51,10 +51,11 @@ export class Sessions {
     actions.append(h("button", { type: "button", class: "small", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
     const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
     return h("tr", {}, h("td", {}, box),
-      h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)])),
+      h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)]),
+        (each.notes ?? []).map((note) => h("small", { class: "said" }, `${note.by ? `${note.by}: ` : ""}${note.text ?? note}`))),
       h("td", {}, each.recipe), h("td", {}, each.begin_ns ? day_clock(seconds(each.begin_ns, each.utc_offset_ns ?? 0)) : "–"), h("td", { class: "number" }, took),
       h("td", { class: "number" }, String(each.frames)), h("td", { class: "number" }, bytes(each.bytes ?? 0)), h("td", {}, each.run),
-      h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files), actions);
+      h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files, each.copies ? h("small", { class: "said" }, each.copies.length ? "archived" : "not archived") : null), actions);
   }
 
   note(each, place) {
