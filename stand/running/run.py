@@ -14,7 +14,7 @@ from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.progress import late_progress
 from foundation.tasks import cancelled, cause_of, failure_text
-from recording.repair.salvage import Salvaged, salvage_line, salvage_unfinished
+from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
 from recording.writing.disk import Disk
 from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from recording.writing.settings import SessionInfo
@@ -94,7 +94,7 @@ async def run_in(house: House, job: Job, stop: Stop) -> Path:
     hub.subscribe(early)
     try:
         job.watch(hub)
-        await _announce(job, house.assembly)
+        await _announce(job, house.assembly, has_own=True)
         directory = _directory(job, house.assembly.clock)
         async with _telling_failure(house.assembly, directory, stop), AsyncExitStack() as stack:
             disk = Disk()
@@ -168,10 +168,13 @@ def _directory(job: Job, clock: Clock) -> Path:
     return job.before.directory if job.before is not None else session_directory(job.out, job.order, clock)
 
 
-async def _announce(job: Job, assembly: Assembly) -> None:
-    """What the session has to say before anything moves; what earlier runs that were killed have left is completed."""
+async def _announce(job: Job, assembly: Assembly, *, has_own: bool = False) -> None:
+    """What the session has to say before anything moves; what earlier runs that were killed have left is completed.
+    has_own: what is being recorded now is the stand's own record, which need not be told."""
     hub, clock = assembly.hub, assembly.clock
     for segment in await _salvaged(job):
+        if has_own and segment.reason == BEING_RECORDED:
+            continue
         hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
     if accepted := job.order.config.accepted():
         hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))

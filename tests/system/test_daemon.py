@@ -162,7 +162,9 @@ def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve
     assert len(list(session.frames())) == 1
     for name in ("brief", "other"):
         (run,) = [path for path in served.out.iterdir() if path.name.endswith(f"-{name}")]
-        assert Session.open(run).events()[-1].data.get("status") == "complete"
+        events = Session.open(run).events()
+        assert events[-1].data.get("status") == "complete"
+        assert [event.text for event in events if event.kind == "salvaged"] == []
 
 
 def test_a_stop_ends_the_run_and_leaves_the_daemon_with_a_safe_stand(serve: Callable[[], Served]):
