@@ -40,7 +40,7 @@ from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.running.to_ambient import to_ambient
-from stand.serving.api.server import Interface, serve
+from stand.serving.api.server import Interface, preload, serve
 from stand.serving.eta_slip import EtaSlip
 
 # The recorder's events that hold a run, and those that let it continue.
@@ -106,6 +106,7 @@ class Guest:
         house, assembly, stop, log = self._house, self._assembly, self.stop, self.log
         house.guest, house.recorder = self, self.recorder
         house.prepare()
+        preload()
         target = parse_document(self.job.order.target_text, Target, "target.yaml")
         settling = SettlingWatch(assembly.stand, assembly.hub, assembly.clock, target)
         watchers: list[asyncio.Task[None]] = []

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import concurrent.futures
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -12,8 +13,9 @@ from fastapi import APIRouter, Response
 from fastapi import Path as FromPath
 from pydantic import BaseModel
 
+from foundation.errors import SessionError
 from recording.format.inventory import inventory
-from recording.reading.glance import Glance, glance
+from recording.reading.catalogue import Entry, catalogue, look_at
 from stand.config.recipe import Recipe
 from stand.config.stand_config import packaged
 from stand.serving.api.bridge import Bridge, NoAnswer
@@ -37,7 +39,7 @@ class RecipeEntry(BaseModel):
 
 class SessionEntry(BaseModel):
     """A recorded session. begin_ns, end_ns: of its first and last message, None when it holds none. run: how it ended;
-    files: whether they are sound; has_report: whether there is one to be read."""
+    files: whether they are sound; has_report: whether there is one to be read. copies: folders with a verified copy."""
 
     name: str
     recipe: str
@@ -52,20 +54,32 @@ class SessionEntry(BaseModel):
     troubles: list[str]
     missing: list[str]
     has_report: bool
+    tags: list[str]
+    notes: list[str]
+    copies: list[str]
 
 
 class Disk:
-    """One question to the disk at a time."""
+    """One question to the disk at a time, each in a thread that does not keep the process from ending: asyncio's own
+    threads would."""
 
     def __init__(self) -> None:
         self._lock = asyncio.Lock()
 
     async def ask(self, question: Callable[[], Result]) -> Result:
-        """Its answer; NoAnswer when the disk does not give it in time."""
+        """Its answer, or what it raises; NoAnswer when the disk does not give it in time."""
+        answer: concurrent.futures.Future[Result] = concurrent.futures.Future()
+
+        def ask_it() -> None:
+            try:
+                answer.set_result(question())
+            except BaseException as error:  # noqa: BLE001 - it belongs to who asked
+                answer.set_exception(error)
+
         try:
-            async with asyncio.timeout(_DISK_LIMIT_S):
-                async with self._lock:
-                    return await asyncio.shield(asyncio.to_thread(question))
+            async with asyncio.timeout(_DISK_LIMIT_S), self._lock:
+                threading.Thread(target=ask_it, name="disk", daemon=True).start()
+                return await asyncio.shield(asyncio.wrap_future(answer))
         except TimeoutError:
             raise NoAnswer(f"the disk has not answered within {_DISK_LIMIT_S:g} s") from None
 
@@ -106,7 +120,7 @@ def recorded(_: Bridge, folder: Path) -> APIRouter:
     @router.get("/sessions/{name}", response_model=SessionEntry)
     async def session(name: SessionName) -> SessionEntry:
         """One session."""
-        return await disk.ask(lambda: _entry(glance(session_in(folder, name))))
+        return await disk.ask(lambda: _entry(look_at(session_in(folder, name))))
 
     @router.get(
         "/sessions/{name}/report.html", response_class=Response, responses={200: {"content": {"text/html": {}}}}
@@ -127,16 +141,14 @@ def _recipes() -> list[RecipeEntry]:
 
 def _sessions(folder: Path) -> list[SessionEntry]:
     try:
-        names = sorted(entry.name for entry in os.scandir(folder) if entry.is_dir(follow_symlinks=False))
-    except OSError:
+        return [_entry(seen) for seen in catalogue(folder)]
+    except (OSError, SessionError):  # no such folder
         return []
-    found = [_entry(glance(folder / name)) for name in names if not name.startswith(".") and inventory(folder / name)]
-    return sorted(found, key=lambda entry: (entry.begin_ns or 0, entry.name))
 
 
-def _entry(seen: Glance) -> SessionEntry:
+def _entry(seen: Entry) -> SessionEntry:
     return SessionEntry(
-        name=seen.path.name.encode("utf-8", "replace").decode(),
+        name=seen.name.encode("utf-8", "replace").decode(),
         recipe=seen.metadata.get("recipe", ""),
         operator=seen.metadata.get("operator", ""),
         simulated=seen.simulated,
@@ -144,11 +156,14 @@ def _entry(seen: Glance) -> SessionEntry:
         end_ns=seen.end_ns,
         frames=seen.frames,
         bytes=seen.size_bytes,
-        run=str(seen.run),
-        files=str(seen.state),
+        run=seen.run,
+        files=seen.files,
         troubles=list(seen.troubles),
         missing=list(seen.missing),
         has_report=(seen.path / REPORT).is_file(),
+        tags=list(seen.tags),
+        notes=[note.text for note in seen.notes],
+        copies=[copy.to for copy in seen.copies],
     )
 
 

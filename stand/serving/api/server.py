@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import os
 import socket
 import threading
@@ -91,6 +92,16 @@ async def serve(
         with clock.hold():  # a client that does not read must not be where virtual time goes on
             await asyncio.to_thread(thread.end)
         presence.disappear()
+
+
+def preload() -> None:
+    """Begin to import what serving needs, which takes half a second or more, before there is anybody to serve."""
+
+    def load() -> None:
+        for name in ("app", "listening"):
+            importlib.import_module(f"stand.serving.api.{name}")
+
+    threading.Thread(target=load, name="interface-imports", daemon=True).start()
 
 
 def _tcp(host: str, port: int) -> socket.socket:
