@@ -24,6 +24,7 @@ from stand.serving.presence import Entry, Presence
 
 _LOOK_S = 1.0
 _CLOSE_LIMIT_S = 5.0
+_READY_LIMIT_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,8 @@ async def serve(
     try:
         thread.start()
         presence.identify()
+        with clock.hold():  # virtual time would be over before the first client is answered
+            await asyncio.to_thread(thread.is_ready.wait, _READY_LIMIT_S)
         yield presence
     finally:
         bridge.close()
@@ -142,6 +145,7 @@ class _Thread:
         self._report = report
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ended: asyncio.Event | None = None
+        self.is_ready = threading.Event()
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="interface", daemon=True)
 
@@ -163,6 +167,7 @@ class _Thread:
         except Exception as error:  # noqa: BLE001 - the run goes on without it
             self._report("no_control", f"the run cannot be queried or paused: {failure_text(error)}")
         finally:
+            self.is_ready.set()
             for door in self._doors.values():
                 door.close()
 
@@ -183,6 +188,7 @@ class _Thread:
             self._ended.set()
         for door, each in self._doors.items():
             listening.listen(door, each)
+        self.is_ready.set()
         working = [asyncio.create_task(stream.run()), asyncio.create_task(self._look_after(listening))]
         try:
             await self._ended.wait()
