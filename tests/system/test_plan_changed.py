@@ -57,9 +57,9 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
         (executor,) = executors
         await executor.skip(first.step_id)
         await executor.extend(soak.step_id, 60.0)
-        with pytest.raises(ConfigError, match=r"step 9.* 99 degC"):
+        with pytest.raises(ConfigError, match=r"step 10: a set-point of 99 degC"):
             await executor.edit(9, [SetTemperature(99.0)])
-        with pytest.raises(ConfigError, match=r"step 10: the flap is closed here, and fit frames show the target"):
+        with pytest.raises(ConfigError, match=r"step 11: the flap is closed here, and fit frames show the target"):
             await executor.edit(9, [SetTemperature(24.0), rest[1]])
         await executor.edit(other.index + 1, rest)
         (directory,) = out.iterdir()
