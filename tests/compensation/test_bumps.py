@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from compensation.drift.evaluation import evaluate
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.training import frame_states
 from compensation.observations import Mask, Observations
+from compensation.reporting.report import write_report
 from experiments.steps import Role
 
 from .drawn_cameras import Camera, drawn_camera
@@ -104,3 +106,14 @@ def test_a_few_frames_are_too_few_to_tell() -> None:
 
 def _only(made: Observations, keep: Mask) -> Observations:
     return replace(made, reasons=tuple("" if kept else "left out" for kept in keep.tolist()))
+
+
+def test_the_report_says_when_and_how_far(tmp_path: Path) -> None:
+    made = bumped(drawn_camera(0)).observed
+    model = fit(made)
+    write_report(tmp_path / "report.html", made, model, evaluate(model, made))
+    page, numbers = (tmp_path / "report.html").read_text(), json.loads((tmp_path / "report.json").read_text())
+    assert "moved in a step that no temperature explains" in page
+    (bump,) = numbers["bumps"]
+    assert bump["after"] < "2026-01-02T07:00:00" < bump["before"]
+    assert bump["motions_px"][:2] == pytest.approx(SHIFT_PX.tolist(), abs=0.01)
