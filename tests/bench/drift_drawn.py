@@ -77,9 +77,11 @@ def figures() -> Iterator[Figure]:
         scores: dict[str, list[Score]] = {form: [] for form in (*FORMS, "chosen")}
         for seed in range(CAMERAS):
             made = drawn_night(seed, unrepeating=group != "repeating")
-            for form in FORMS:
-                scores[form].append(score(fit(made.observed, form=form), made))
-            scores["chosen"].append(score(fit(made.observed), made))
+            chosen = fit(made.observed)
+            for model in (chosen, chosen.other):
+                if model is not None:
+                    scores[model.form].append(score(model, made))
+            scores["chosen"].append(scores[chosen.form][-1])
         yield from _table(group, goal_mpx, scores)
 
 
