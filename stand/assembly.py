@@ -10,11 +10,13 @@ from typing import Protocol, cast
 import usb.backend
 
 from drivers.devices.cameras import make_camera
+from drivers.devices.climate_chamber import ClimateChamber
 from drivers.devices.flap import Flap
 from drivers.devices.inputs import Inputs
-from drivers.devices.protocols import Sensor
+from drivers.devices.no_relays import NoRelays
+from drivers.devices.protocols import Controller, Sensor, Switches
 from drivers.devices.regulator import Regulator
-from drivers.devices.relays import Relays
+from drivers.devices.relays import Relays, RelaysSettings
 from drivers.devices.stage import Axis
 from drivers.devices.thermometers import Thermometers
 from drivers.settings import EquilibriumSettings, OnBus
@@ -36,6 +38,8 @@ from stand.imaging.camera_supply import SupplyLimits
 from stand.poller import Poller
 from stand.stand import Devices, Stand
 
+_NO_BOARD_POLL_S = 5.0
+
 
 @dataclass(frozen=True, slots=True)
 class Assembly:
@@ -53,9 +57,9 @@ class Assembly:
         """One per device, in the order in which they are read when several are due at one instant."""
         config, devices = self.config, self.devices
         timed: list[tuple[Sensor, float]] = [
-            (devices.regulator, config.regulator.poll_s),
+            (devices.regulator, config.controller.poll_s),
             (devices.thermometers, config.thermometer_module.poll_s),
-            (devices.relays, config.relays.poll_s),
+            (devices.relays, config.relays.poll_s if config.relays is not None else _NO_BOARD_POLL_S),
             *(
                 ((devices.inputs, config.inputs.poll_s),)
                 if devices.inputs is not None and config.inputs is not None
@@ -127,7 +131,8 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     state_file = config.compressor.state_file
     if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces
         state_file = config.recording.directory / "compressor.json"
-    permits = PermitLimits(config.guard.heater_hold_s, config.relays.self_test_s, config.compressor)
+    self_test_s = config.relays.self_test_s if config.relays is not None else 0.0
+    permits = PermitLimits(config.guard.heater_hold_s, self_test_s, config.compressor)
     chamber = ChamberLimits(config.set_points_degC, permits, config.guard.heater_renew_s, state_file)
     boots_s = [camera.boot_s for camera in config.cameras.values()]
     equilibrium = config.camera.equilibrium if config.camera is not None else EquilibriumSettings()
@@ -135,16 +140,29 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     return Assembly(config, hub, clock, bus, devices, Stand(devices, chamber, supply, hub, clock), notifier)
 
 
-def bus_units(config: StandConfig, bus: Bus, clock: Clock) -> tuple[Regulator, Relays, Thermometers]:
-    """The units on the bus; ConfigError when a register map is missing or wrong, or that of another kind of unit."""
+def bus_units(config: StandConfig, bus: Bus, clock: Clock) -> tuple[Controller, Switches, Thermometers]:
+    """Regulator or climate chamber, relays, thermometers; ConfigError when a register map is missing or wrong, or that
+    of another kind of unit."""
 
-    channels = {str(name): number for name, number in config.relays.channels.items()}
     module = _register_map("thermometer_module", config.thermometer_module)
     return (
-        Regulator("regulator", bus, _register_map("regulator", config.regulator), clock),
-        Relays("relays", bus, _register_map("relays", config.relays), channels),
+        _controller(config, bus, clock),
+        _switches(config.relays, bus, clock),
         Thermometers("thermometers", bus, module, config.thermometers, clock),
     )
+
+
+def _controller(config: StandConfig, bus: Bus, clock: Clock) -> Controller:
+    if isinstance(config.controller, OnBus):
+        return Regulator("regulator", bus, _register_map("regulator", config.controller), clock)
+    return ClimateChamber("regulator", config.controller, config.limits.chamber_degC, clock)
+
+
+def _switches(relays: RelaysSettings | None, bus: Bus, clock: Clock) -> Switches:
+    if relays is None:
+        return NoRelays("relays", clock)
+    channels = {str(name): number for name, number in relays.channels.items()}
+    return Relays("relays", bus, _register_map("relays", relays), channels)
 
 
 def inputs_of(config: StandConfig, bus: Bus, clock: Clock) -> Inputs | None:

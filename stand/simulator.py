@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from foundation.addresses import tcp_place
@@ -47,9 +47,10 @@ def laboratory_of(
         "chamber_seed": simulation.chamber_seed,
         "faults": list(simulation.faults),
         "bus": address_of(config.bus.address),
-        "regulator_unit": config.regulator.unit,
-        "relays_unit": config.relays.unit,
-        "relay_channels": dict(config.relays.channels),
+        "regulator_unit": config.regulator.unit if config.regulator is not None else None,
+        "chamber": _chamber_of(config, address_of),
+        "relays_unit": config.relays.unit if config.relays is not None else None,
+        "relay_channels": dict(config.relays.channels) if config.relays is not None else {},
         "inputs_unit": None if config.inputs is None else config.inputs.unit,
         "input_channels": {name: each.channel for name, each in config.inputs.contacts.items()}
         if config.inputs
@@ -74,6 +75,20 @@ def laboratory_of(
     }
 
 
+def _chamber_of(config: StandConfig, address_of: Callable[[str | None], str | None]) -> dict[str, object] | None:
+    """The fake of a climate chamber, whose controller allows what it should."""
+    chamber = config.climate_chamber
+    if chamber is None:
+        return None
+    known = chamber.model_dump()
+    return {
+        "protocol": known["protocol"],
+        "address": address_of(chamber.address),
+        "unit": known["unit"] or 1,
+        "limits_degC": list(chamber.limits_at_panel_degC or config.limits.chamber_degC),
+    }
+
+
 def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
     """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses)."""
     simulation = config.simulation
@@ -83,6 +98,8 @@ def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
         update={
             "bus": config.bus.model_copy(update={"address": addresses["bus"]}),
             "axes": axes,
+            "climate_chamber": config.climate_chamber
+            and config.climate_chamber.model_copy(update={"address": addresses["regulator"]}),
             "flap": config.flap.model_copy(update={"backend_address": addresses["flap"]}),
             "cameras": cameras,
             "simulation": simulation and simulation.model_copy(update={"control": addresses["control"]}),

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 from drivers.devices.flap import Flap
 from drivers.devices.inputs import Inputs
-from drivers.devices.protocols import Actuator, Camera
-from drivers.devices.regulator import Regulator
-from drivers.devices.relays import Relays
+from drivers.devices.protocols import Actuator, Camera, Controller, Switches
 from drivers.devices.stage import Axis
 from drivers.devices.thermometers import Thermometers
 from foundation.clock import Clock
@@ -32,8 +30,8 @@ _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor mus
 class Devices:
     """Everything the stand is made of."""
 
-    regulator: Regulator
-    relays: Relays
+    regulator: Controller
+    relays: Switches
     thermometers: Thermometers
     axes: Mapping[str, Axis]
     flap: Flap

@@ -42,6 +42,37 @@ class Actuator(Device, Protocol):
         ...
 
 
+class Controller(Sensor, Actuator, Protocol):
+    """What holds the chamber's temperature: a regulator, or a climate chamber with a controller of its own. Channels
+    pv, sp (degC), running, fault, and where it has outputs mv_heat, mv_cool (%)."""
+
+    async def set_temperature(self, degC: float) -> None:
+        """Send a set-point and read it back; Refused, or Occupied while a person has it."""
+        ...
+
+    async def run(self) -> None:
+        """Start control, confirmed."""
+        ...
+
+    async def stop(self) -> None:
+        """Stop control, confirmed."""
+        ...
+
+
+class Switches(Sensor, Actuator, Protocol):
+    """What enables heat and cold, and feeds the cameras. has_timer: a board drops what it holds by itself."""
+
+    has_timer: bool
+
+    async def switch(self, channel: str, on: bool) -> None:
+        """On or off, confirmed."""
+        ...
+
+    async def hold_on(self, channel: str, duration_s: float) -> None:
+        """On for so long from now."""
+        ...
+
+
 class Camera(Sensor, Protocol):
     """A camera; channels `<name>.image` and `<name>.temperature`. When it is lost, its calls raise Unreachable until it
     is opened again. `restarted`: why it has, or may have, restarted between the last open and the one before; "" if

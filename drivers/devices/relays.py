@@ -45,6 +45,8 @@ class RelaysSettings(OnBus):
 class Relays:
     """Named relays of one board. `channels`: name -> relay number, 0 being the first (point relay_0 of the map)."""
 
+    has_timer = True
+
     def __init__(self, name: str, bus: Bus, register_map: RegisterMap, channels: Mapping[str, int]) -> None:
         self.name = name
         self._unit = ModbusUnit(name, bus, register_map)

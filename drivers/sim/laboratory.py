@@ -5,17 +5,18 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.sim.camera import FakeCamera
+from drivers.sim.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
 from drivers.sim.faults import LinkFaults
 from drivers.sim.flap import FakeFlap
 from drivers.sim.link_faults import Link
-from drivers.sim.modbus import RtuEngine, TcpEngine
+from drivers.sim.modbus import RtuEngine, TcpEngine, Unit
 from drivers.sim.optics import true_centres_px
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.regulator import FakeRegulator
@@ -54,6 +55,16 @@ class EndpointSpec(Document):
     serial_number: str | None
 
 
+class ChamberUnitSpec(Document):
+    """A commercial climate chamber: its protocol, where it answers, and the set-points that its controller allows (by
+    default as the stand asks for)."""
+
+    protocol: Literal["espec", "cts", "ascii2"]
+    address: str
+    unit: int
+    limits_degC: tuple[float, float] | None = None
+
+
 class LaboratorySpec(Document):
     """What the simulator process reads on its standard input.
 
@@ -68,8 +79,9 @@ class LaboratorySpec(Document):
     laboratory_degC: float
     chamber_seed: int | None = None
     bus: str
-    regulator_unit: int
-    relays_unit: int
+    regulator_unit: int | None
+    chamber: ChamberUnitSpec | None = None
+    relays_unit: int | None
     relay_channels: dict[str, int]
     inputs_unit: int | None = None
     input_channels: dict[str, int] = Field(default_factory=dict[str, int])
@@ -81,6 +93,15 @@ class LaboratorySpec(Document):
     cameras: dict[str, EndpointSpec]
     camera_boot_s: float = Field(default=3.0, ge=0)
     faults: tuple[str, ...] = ()
+
+
+Found = TypeVar("Found")
+
+
+def _there(found: Found | None, what: str) -> Found:
+    if found is None:
+        raise ValueError(f"this laboratory has no {what}")
+    return found
 
 
 class Laboratory:
@@ -98,6 +119,7 @@ class Laboratory:
             seed=spec.seed,
             laboratory_degC=spec.laboratory_degC,
             chamber_seed=spec.chamber_seed,
+            camera_powered=spec.relays_unit is None,
         )
         self.plant = Plant(plant_spec, self._clock.now_ns())
         self._scene = Scene(SceneSpec(), spec.seed)
@@ -105,6 +127,9 @@ class Laboratory:
         self.cameras: dict[str, FakeCamera] = {}
         self.addresses: dict[str, str] = {}
         self._links: dict[str, Link] = {}
+        self._regulator: FakeRegulator | None = None
+        self._relays: FakeRelays | None = None
+        self._chamber: FakeClimateChamber | None = None
         self.ssr_welded_share = 0.0
         self.camera_sensor_degC: float | None = None
         self._closers: list[Callable[[], None]] = []
@@ -128,6 +153,21 @@ class Laboratory:
         if not self.cameras:
             raise ValueError("this laboratory has no camera")
         return self.cameras.get("camera") or next(iter(self.cameras.values()))
+
+    @property
+    def regulator(self) -> FakeRegulator:
+        """The regulator on the bus; ValueError when there is none."""
+        return _there(self._regulator, "regulator on its bus")
+
+    @property
+    def relays(self) -> FakeRelays:
+        """The relay board; ValueError when there is none."""
+        return _there(self._relays, "relay board")
+
+    @property
+    def chamber(self) -> FakeClimateChamber:
+        """The climate chamber with a controller of its own; ValueError when there is none."""
+        return _there(self._chamber, "climate chamber of its own")
 
     @property
     def now_ns(self) -> int:
@@ -182,18 +222,26 @@ class Laboratory:
 
     def _build(self) -> None:
         spec, plant, clock = self.spec, self.plant, self._clock
-        self.regulator = FakeRegulator(plant, clock, spec.regulator_unit)
+        units: list[Unit] = []
+        if spec.regulator_unit is not None:
+            self._regulator = FakeRegulator(plant, clock, spec.regulator_unit)
+            units.append(self._regulator)
+        if spec.chamber is not None:
+            self._chamber = self._climate_chamber(spec.chamber)
+            self._listen("regulator", spec.chamber.address, self._chamber.engine)
         plant.on_step.append(self._conduct)  # after the regulator's
-        self.relays = FakeRelays(plant, clock, spec.relays_unit, spec.relay_channels)
+        if spec.relays_unit is not None:
+            self._relays = FakeRelays(plant, clock, spec.relays_unit, spec.relay_channels)
+            units.append(self._relays)
         self.thermometers = FakeThermometers(
             plant, clock, spec.thermometers_unit, spec.thermometer_channels, seed=spec.seed
         )
-        units = [self.regulator, self.relays, self.thermometers]
-        self.inputs = self.relays  # a board that has both
+        units.append(self.thermometers)
+        self.inputs: FakeRelays | None = self._relays  # a board that has both
         if spec.inputs_unit not in (None, spec.relays_unit):
             self.inputs = FakeRelays(plant, clock, spec.inputs_unit, {})
             units.append(self.inputs)
-        if spec.inputs_unit is not None:
+        if spec.inputs_unit is not None and self.inputs is not None:
             self.inputs.closed_inputs = set(spec.inputs_closed)
         framing = RtuEngine if spec.bus.startswith("serial:") else TcpEngine
         self._listen("bus", spec.bus, lambda: framing(units))
@@ -215,6 +263,19 @@ class Laboratory:
             self._closers.append(camera.close)
             camera.start()
             self.cameras[name], self.addresses[name] = camera, camera.address
+
+    def _climate_chamber(self, spec: ChamberUnitSpec) -> FakeClimateChamber:
+        is_serial = spec.address.startswith("serial:")
+        match spec.protocol:
+            case "espec":
+                chamber: FakeClimateChamber = FakeEspec(self.plant, self._clock)
+            case "cts":
+                chamber = FakeCts(self.plant, self._clock, spec.unit, is_serial=is_serial)
+            case "ascii2":
+                chamber = FakeWeiss(self.plant, self._clock, spec.unit)
+        chamber.is_alone = self.spec.relays_unit is None
+        chamber.limits_degC = spec.limits_degC or chamber.limits_degC
+        return chamber
 
     def _camera_at(self, address: str, serial_number: str) -> FakeCamera:
         spec = self.spec

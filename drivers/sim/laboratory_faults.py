@@ -115,6 +115,11 @@ def _press_set_point(laboratory: Laboratory, value: object) -> None:
         laboratory.regulator.press_setpoint(float(str(value)))
 
 
+def _press_chamber(laboratory: Laboratory, value: object) -> None:
+    if value is not None:
+        laboratory.chamber.press_setpoint(float(str(value)))
+
+
 def _clamp_set_point(laboratory: Laboratory, value: object) -> None:
     limits = None if value is None else TypeAdapter(tuple[float, float]).validate_python(value)
     laboratory.regulator.setpoint_clamp_degC = limits
@@ -139,7 +144,7 @@ def _weld(laboratory: Laboratory, value: object) -> None:
 def _change_contact(laboratory: Laboratory, value: object) -> None:
     spec, closed = laboratory.spec, set(laboratory.spec.inputs_closed)
     changed = {spec.input_channels[str(value)]} if value else set[int]()
-    if spec.inputs_unit is not None:
+    if laboratory.inputs is not None and spec.inputs_unit is not None:
         laboratory.inputs.closed_inputs = closed ^ changed
 
 
@@ -180,11 +185,11 @@ def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
 
 def _link_faults() -> Iterator[tuple[str, Fault]]:
     """Every link has the same, `bus.drop`, `linear.drop`, ..."""
-    for link in ("bus", *_AXES):
+    for link in ("bus", "chamber", *_AXES):
         for kind, (worst, mended, text) in LINK_FAULTS.items():
 
             def apply(laboratory: Laboratory, value: object, link: str = link, kind: str = kind) -> None:
-                set_link_fault(laboratory.link(link), kind, value)
+                set_link_fault(laboratory.link("regulator" if link == "chamber" else link), kind, value)
 
             yield f"{link}.{kind}", Fault(apply, worst, mended, text, locks=False)
 
@@ -283,6 +288,19 @@ FAULTS: dict[str, Fault] = {
         _to(lambda lab: lab.thermometers, "no_fault_bits"), True, False, "unreadable: their values are STALE"
     ),
     "thermometers.wrong_type": Fault(_wrong_module, True, False, "a module with another range"),
+    # A climate chamber with a controller of its own.
+    "chamber.mute": Fault(_to(lambda lab: lab.chamber, "silent"), True, False, "it does not answer"),
+    "chamber.ignores_writes": Fault(_to(lambda lab: lab.chamber, "ignores_writes"), True, False, "not in remote"),
+    "chamber.protected": Fault(_to(lambda lab: lab.chamber, "protected"), True, False, "the panel refuses (ESPEC)"),
+    "chamber.clamps": Fault(_to(lambda lab: lab.chamber, "clamps"), True, False, "it cuts set-points silently"),
+    "chamber.alarm": Fault(_to(lambda lab: lab.chamber, "alarm", lambda value: str(value or "")), "31", "", "its code"),
+    "chamber.humidity": Fault(_to(lambda lab: lab.chamber, "humidity_on"), True, False, "it is on"),
+    "chamber.stuck_degC": Fault(
+        _to(lambda lab: lab.chamber, "stuck_degC", _number_or_none), 24.0, None, "its own sensor stays there"
+    ),
+    "chamber.set_point_degC": Fault(_press_chamber, 45.0, None, "somebody changes it at the panel"),
+    "chamber.stop_key": Fault(_once(lambda lab: lab.chamber.press_stop()), True, False, "somebody stops it"),
+    "chamber.restart": Fault(_once(lambda lab: lab.chamber.restart()), True, False, "a power failure: it is stopped"),
     # The plant, and the relays.
     "heater.cut_out": Fault(_to(lambda lab: lab.plant, "cut_out_open"), True, False, "the thermal cut-out is open"),
     "heater.welded_share": Fault(

@@ -39,10 +39,11 @@ class ByteLink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """Baud, data bits 8, parity N, stop bits."""
+    """Baud, data bits 8, stop bits, parity."""
 
     baud: int
     stopbits: int
+    parity: str = "N"
 
 
 def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
@@ -60,7 +61,13 @@ class _SerialLink:
         self._path = path
         try:
             self._port = serial.Serial(
-                path, settings.baud, stopbits=settings.stopbits, timeout=0, write_timeout=_WRITE_S, exclusive=True
+                path,
+                settings.baud,
+                parity=settings.parity,
+                stopbits=settings.stopbits,
+                timeout=0,
+                write_timeout=_WRITE_S,
+                exclusive=True,
             )
         except (OSError, termios.error) as error:
             raise Unreachable(device, f"cannot open {path}: {_why_closed(error)}") from error

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.devices.regulator import Regulator
-from drivers.devices.relays import Relays
+from drivers.devices.climate_chamber import ClimateChamber
+from drivers.devices.protocols import Controller, Switches
 from foundation.clock import Clock, boot_of, seconds_ns
 from foundation.errors import ConfigError, DeviceFault, Occupied
 from foundation.hub import Hub
@@ -38,8 +38,8 @@ class Chamber:
 
     def __init__(
         self,
-        regulator: Regulator,
-        relays: Relays,
+        regulator: Controller,
+        relays: Switches,
         limits: ChamberLimits,
         interlock: Interlock,
         coils_read: Callable[[Mapping[str, bool]], None],
@@ -47,6 +47,7 @@ class Chamber:
         clock: Clock,
     ) -> None:
         self._regulator = regulator
+        self._relays = relays
         self._limits = limits
         self._interlock = interlock
         self._hub = hub
@@ -93,9 +94,18 @@ class Chamber:
 
     async def test_dead_man(self) -> None:
         """Test the relay board's timer on the heater's relay while the regulator is stopped; DeviceFault when the
-        regulator gives heat all the same, or the board cannot be relied upon."""
+        regulator gives heat all the same, or the board cannot be relied upon. Event `no_dead_man` without a board."""
+        if not self._relays.has_timer:
+            return self._tell_dead_man()
         output = {reading.channel: reading.value for reading in await self._regulator.read()}
         name = self._regulator.name
         if not output.get(f"{name}.mv_heat", 0.0) <= 0:
             raise DeviceFault(name, f"is stopped and yet gives {output[f'{name}.mv_heat']:g} % heat; look at the unit")
         await self.permits.test_dead_man()
+
+    def _tell_dead_man(self) -> None:
+        """No board drops the heat when this daemon dies: what ends it then is recorded with the session."""
+        what = self._regulator.dead_man if isinstance(self._regulator, ClimateChamber) else "nothing"
+        text = f"no relay board guards the heat; when this computer dies, what ends it is {what}"
+        data: dict[str, object] = {"device": self._regulator.name, "ends_it": what}
+        self._hub.publish(Event(self._clock.now_ns(), "warning", "no_dead_man", text, data))

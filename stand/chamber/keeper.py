@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from drivers.devices.regulator import Regulator
+from drivers.devices.protocols import Controller
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError
 from foundation.hub import Hub
@@ -28,7 +28,7 @@ class Keeper:
     """
 
     permits: Permits
-    regulator: Regulator
+    regulator: Controller
     hub: Hub
     clock: Clock
     renew_s: float

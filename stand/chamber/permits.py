@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from drivers.devices.relays import Relays
+from drivers.devices.protocols import Switches
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault
 from foundation.hub import Hub
@@ -51,7 +51,7 @@ class Permits:
 
     def __init__(
         self,
-        relays: Relays,
+        relays: Switches,
         limits: PermitLimits,
         compressor: CompressorState,
         keep: Callable[[CompressorState], None],

@@ -14,6 +14,7 @@ from typing import Annotated, Literal, Self, cast
 from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
 from drivers.devices.cameras import AnyCameraSettings
+from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
 from drivers.devices.flap import FlapSettings
 from drivers.devices.inputs import InputsSettings
 from drivers.devices.relays import RelaysSettings
@@ -111,14 +112,16 @@ class SimulationConfig(Document):
 
 
 class StandConfig(Document):
-    """The whole file."""
+    """The whole file. What holds the chamber's temperature is a regulator with a relay board that enables its heat, or
+    a climate_chamber with a controller of its own, which needs none."""
 
     name: Line = Field(min_length=1)
     operator: Line = ""
     target: str
     bus: BusSettings
-    regulator: OnBus
-    relays: RelaysSettings
+    regulator: OnBus | None = None
+    climate_chamber: ClimateChamberSettings | None = None
+    relays: RelaysSettings | None = None
     thermometer_module: OnBus
     thermometers: dict[DeviceName, ThermometerSettings]
     axes: dict[DeviceName, AxisSettings] = Field(default_factory=dict)
@@ -151,17 +154,26 @@ class StandConfig(Document):
 
     def _faults(self) -> Iterator[str]:
         """What of one section does not fit another."""
+        yield from self._unfit_control()
         yield from self._unfit_devices()
         yield from self._unfit_limits()
         yield from self._unfit_periods()
 
+    def _unfit_control(self) -> Iterator[str]:
+        if (self.regulator is None) == (self.climate_chamber is None):
+            yield "a stand has either a regulator or a climate_chamber, which holds the chamber's temperature"
+        if self.regulator is not None and self.relays is None:
+            yield "relays is missing: a board has to enable the regulator's heat; only a climate_chamber needs none"
+
     def _unfit_devices(self) -> Iterator[str]:
-        units = [self.regulator.unit, self.relays.unit, self.thermometer_module.unit]
+        units = [each.unit for each in (self.regulator, self.relays, self.thermometer_module) if each is not None]
         if len(set(units)) < len(units):
             yield f"regulator, relays and thermometer_module need different units on one bus, not {units}"
-        if self.inputs is not None and self.inputs.unit in (self.regulator.unit, self.thermometer_module.unit):
+        others = [each.unit for each in (self.regulator, self.thermometer_module) if each is not None]
+        if self.inputs is not None and self.inputs.unit in others:
             yield "inputs.unit is that of the regulator or the thermometers; take the relay board's, or another"
         addresses = [self.bus.address, *(axis.address for axis in self.axes.values())]
+        addresses += [self.climate_chamber.address] if self.climate_chamber is not None else []
         addresses += [camera.address for camera in self.cameras.values()]
         if twice := [address for address in addresses if addresses.count(address) > 1]:
             yield f"bus, axes and cameras need addresses of their own, {twice[0]} is given twice"
@@ -174,7 +186,7 @@ class StandConfig(Document):
             yield "thermometers: two thermometers share one channel"
         if self.cameras and LEADING not in self.cameras:
             yield f"cameras: one of them has to be named {LEADING}: soaks, cool-downs and models go by its temperature"
-        if self.cameras and "camera_power" not in self.relays.channels:
+        if self.cameras and self.relays is not None and "camera_power" not in self.relays.channels:
             yield "relays.channels lacks camera_power, the supply of the cameras"
 
     def _unfit_limits(self) -> Iterator[str]:
@@ -199,12 +211,12 @@ class StandConfig(Document):
         guard, cameras_s = self.guard, [camera.poll_s for camera in self.cameras.values()]
         if self.flap.poll_s * 2 > guard.flap_open_s:
             yield f"guard.flap_open_s must be at least twice flap.poll_s ({self.flap.poll_s} s)"
-        slowest_s = max(self.regulator.poll_s, self.thermometer_module.poll_s, *cameras_s)
+        slowest_s = max(self.controller.poll_s, self.thermometer_module.poll_s, *cameras_s)
         if slowest_s * 2 > guard.stale_after_s:
             yield f"guard.stale_after_s must be at least twice the slowest safety poll ({slowest_s} s)"
         if max(cameras_s, default=0.0) * 2 > guard.camera_temperature_s:
             yield f"guard.camera_temperature_s must be at least twice the poll_s of each camera ({max(cameras_s)} s)"
-        slowest_s = max(self.regulator.poll_s, self.relays.poll_s)
+        slowest_s = max(self.controller.poll_s, self.relays.poll_s if self.relays is not None else 0.0)
         if slowest_s * 2 > guard.keys_s:
             yield f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)"
 
@@ -219,6 +231,15 @@ class StandConfig(Document):
         return outside(self, self.thermometers)
 
     @property
+    def controller(self) -> OnBus | ChamberUnitSettings:
+        """What holds the chamber's temperature."""
+        if self.regulator is not None:
+            return self.regulator
+        if self.climate_chamber is None:
+            raise ConfigError(f"{self.name}: neither a regulator nor a climate_chamber")
+        return self.climate_chamber
+
+    @property
     def camera(self) -> CameraSettings | None:
         """The leading camera: soaks, cool-downs and models go by its temperature. None on a stand without cameras."""
         return self.cameras.get(LEADING)
@@ -227,8 +248,8 @@ class StandConfig(Document):
 def load_config(path: Path) -> StandConfig:
     """The configuration file, checked. Register maps that lie beside it are named by their whole path."""
     config = load_document(path, StandConfig)
-    units: dict[str, OnBus] = {name: getattr(config, name) for name in MAPPED}
-    units |= {} if config.inputs is None else {"inputs": config.inputs}
+    named: dict[str, OnBus | None] = {name: getattr(config, name) for name in (*MAPPED, "inputs")}
+    units = {name: unit for name, unit in named.items() if unit is not None}
     return config.model_copy(
         update={
             name: unit.model_copy(update={"registers": _beside(path, unit.registers)}) for name, unit in units.items()

@@ -172,9 +172,9 @@ def _minutes(duration_s: float) -> str:
 
 
 def _messages_per_s(config: StandConfig) -> float:
-    polled = (config.regulator, config.relays, config.thermometer_module, config.flap)
+    polled = (config.regulator, config.climate_chamber, config.relays, config.thermometer_module, config.flap)
     polled = (*polled, *config.cameras.values(), *config.axes.values())
-    return sum(1.0 / device.poll_s for device in polled)
+    return sum(1.0 / device.poll_s for device in polled if device is not None)
 
 
 def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:

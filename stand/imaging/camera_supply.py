@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from drivers.devices.relays import CAMERA_POWER, Relays
+from drivers.devices.protocols import Switches
+from drivers.devices.relays import CAMERA_POWER
 from drivers.settings import EquilibriumSettings
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
@@ -44,7 +45,7 @@ class CameraSupply:
     def __init__(
         self,
         cameras: Cameras,
-        relays: Relays,
+        relays: Switches,
         limits: SupplyLimits,
         interlock: Interlock,
         gate: Gate,

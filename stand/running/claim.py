@@ -43,6 +43,8 @@ def addresses(config: StandConfig) -> tuple[Address, ...]:
     """
     flap, is_real = config.flap, config.simulation is None
     found = [Address("bus", place) for place in _places(config.bus.address)]
+    if config.climate_chamber is not None:
+        found += [Address("regulator", place) for place in _places(config.climate_chamber.address)]
     for name, axis in config.axes.items():
         found += [Address(name, place) for place in _places(axis.address)]
         if is_real:

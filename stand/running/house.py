@@ -290,7 +290,7 @@ async def _open(assembly: Assembly) -> None:
 
 async def _close(assembly: Assembly) -> None:
     devices = assembly.devices
-    for device in (*devices.cameras.values(), *devices.axes.values(), devices.flap):
+    for device in (*devices.cameras.values(), *devices.axes.values(), devices.flap, devices.regulator):
         with suppress(StandError):  # closing never decides a run, and one device must not keep the next from it
             await device.close()
     await assembly.bus.close()

@@ -64,7 +64,9 @@ def with_register_maps(order: Order) -> Order:
     unit."""
     texts: dict[str, str] = {}
     for name in MAPPED:
-        path = packaged("registers", getattr(order.config, name).registers, key=f"{name}.registers")
+        if (unit := getattr(order.config, name)) is None:
+            continue
+        path = packaged("registers", unit.registers, key=f"{name}.registers")
         texts[_REGISTERS.format(name)] = read_document(path)
     if order.config.inputs is not None:
         path = packaged("registers", order.config.inputs.registers, key="inputs.registers")

@@ -85,6 +85,7 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
     maps = {
         name: getattr(recorded, name).model_copy(update={"registers": getattr(simulated, name).registers})
         for name in ("regulator", "relays", "thermometer_module")
+        if getattr(recorded, name) is not None and getattr(simulated, name) is not None
     }
     if recorded.inputs is not None:
         maps["inputs"] = recorded.inputs.model_copy(update={"registers": "waveshare-inputs"})

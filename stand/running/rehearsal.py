@@ -30,8 +30,9 @@ def rehearsed(order: Order) -> Order:
         raise ConfigError(f"{config.name}: the simulated laboratory has no axis {strange[0]}, only {known}")
     update: dict[str, Any] = {
         "bus": there.bus,
-        "regulator": _at(config.regulator, there.regulator.registers),
-        "relays": _at(config.relays, there.relays.registers),
+        "regulator": config.regulator and _at(config.regulator, "omron-e5cc"),
+        "relays": config.relays and _at(config.relays, "waveshare-relay"),
+        "climate_chamber": config.climate_chamber and config.climate_chamber.model_copy(update={"address": _CHAMBER}),
         "thermometer_module": _at(config.thermometer_module, there.thermometer_module.registers),
         "inputs": config.inputs and _at(config.inputs, "waveshare-inputs"),
         "axes": {
@@ -49,6 +50,9 @@ def rehearsed(order: Order) -> Order:
     rehearsal = StandConfig.model_validate(config.model_copy(update=update).model_dump(mode="json", exclude_none=True))
     text = _HEAD + yaml.safe_dump(rehearsal.model_dump(mode="json", exclude_none=True), sort_keys=False)
     return with_register_maps(replace(order, config=rehearsal, config_text=text))
+
+
+_CHAMBER = "tcp:127.0.0.1:15023"
 
 
 def _at(unit: OnBus, registers: str) -> OnBus:

@@ -22,10 +22,14 @@ START_NS = 1_767_290_400_000_000_000
 S = 1_000_000_000
 
 
-@pytest.fixture
-def laboratory(tmp_path: Path) -> Iterator[Laboratory]:
+CHAMBER = {"protocol": "espec", "address": "tcp:127.0.0.1:0", "unit": 1, "limits_degC": [-10, 60]}
+
+
+@pytest.fixture(params=[None, CHAMBER], ids=["regulator", "chamber"])
+def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Laboratory]:
     config = load_config(packaged("", "simulated"))
     described = laboratory_of(config, virtual=True, seed=None, start_ns=START_NS, is_anywhere=True)
+    described["chamber"] = request.param  # beside the regulator, or nothing of its own
     described["axes"]["linear"]["address"] = f"serial:{tmp_path / 'linear'}"  # type: ignore[index]
     described["cameras"]["camera"]["address"] = camera_address()  # type: ignore[index]
     built = Laboratory(parse_document(json.dumps(described), LaboratorySpec, "laboratory"))
@@ -65,6 +69,10 @@ def test_what_is_no_fault_is_refused_by_a_sentence(text: str, word: str):
 
 def test_each_fault_of_the_table_is_set_and_mended(laboratory: Laboratory):
     for name, fault in FAULTS.items():
+        if name.startswith("chamber.") and laboratory.spec.chamber is None:
+            with pytest.raises(ValueError, match="has no"):
+                inject(laboratory, name, fault.worst)
+            continue
         inject(laboratory, name, fault.worst)
         inject(laboratory, name, fault.mended)
         assert fault.text, name

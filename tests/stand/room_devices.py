@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -67,6 +67,7 @@ class Regulator(Device):
 class Relays(Device):
     """What was held on stays on until it is switched."""
 
+    has_timer: ClassVar[bool] = True
     on: set[str] = field(default_factory=set)
 
     async def read(self):

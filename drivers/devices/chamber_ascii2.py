@@ -1,0 +1,132 @@
+"""Weiss and Voetsch, ASCII-2 (SIMPAC, SIMCON/32). Source: the maker's interface description by way of public drivers.
+
+    $01I -> 0050.0 0024.6 0080.0 0066.7 ... 01100000000000000000000000000000     nominal, actual pairs, 32 digits; CR
+    $01E 0050.0 0080.0 ... 01100000000000000000000000000000                      sets every field and bit at once
+
+There is no checksum, and a write that has no effect (EXTERN is off at the panel) is answered like one that has: what
+counts is what is read afterwards.
+"""
+
+from __future__ import annotations
+
+import re
+
+from drivers.devices.chamber_language import ChamberState
+from drivers.devices.chamber_settings import Ascii2Settings
+from drivers.wires.line_client import LineClient
+from drivers.wires.link import SerialSettings, open_link
+from foundation.errors import Unreachable
+
+_FIELD = re.compile(r"-?\d{3,4}\.\d")
+_DIGITS = re.compile(r"[01]{16,32}")
+
+
+def parse(heard: bytes) -> tuple[list[float], str] | None:
+    """The analog fields and the digits of a reply to I; None until it has come whole; ValueError when it is none."""
+    if not heard.endswith((b"\r", b"\n")):
+        return None
+    fields = heard.decode("ascii").split()
+    if len(fields) < 3 or not _DIGITS.fullmatch(fields[-1]):
+        raise ValueError("expected numbers, then digits")
+    if not all(_FIELD.fullmatch(field) and len(field) == 6 for field in fields[:-1]):
+        raise ValueError("expected numbers of 6 characters")
+    return [float(field) for field in fields[:-1]], fields[-1]
+
+
+def number(value: float) -> str:
+    """0025.0, -040.0."""
+    return f"{value:06.1f}"
+
+
+class Language:
+    """One Weiss or Voetsch chamber."""
+
+    resolution_K = 0.1
+    dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
+
+    def __init__(self, name: str, settings: Ascii2Settings) -> None:
+        self._settings = settings
+        line = SerialSettings(settings.baud, 1)
+        self._client = LineClient(
+            name,
+            lambda: open_link(name, settings.address, line),
+            settings.timeout_s,
+            settings.gap_s,
+            is_kept=settings.address.startswith("serial:"),
+        )
+
+    @property
+    def connected(self) -> bool:
+        """The link of the last request still stands."""
+        return self._client.connected
+
+    def close(self) -> None:
+        """Let go of the link."""
+        self._client.close()
+
+    def identity(self) -> str:
+        """It says nothing of itself in this language; `$01?` describes its fields."""
+        return ""
+
+    def limits_degC(self) -> tuple[float, float] | None:
+        """The description has them in a form of its own, which differs."""
+        return None
+
+    def state(self) -> ChamberState:
+        """Of I."""
+        values, digits = self._read()
+        nominal = 0 if self._settings.order == "nominal_actual" else 1
+        return ChamberState(
+            values[1 - nominal],
+            values[nominal],
+            _bit(digits, self._settings.start_bit),
+            humidity_on=any(_bit(digits, bit) for bit in self._settings.off_bits),
+            ramp_degC=values[nominal] if self._settings.shows_ramp else None,
+        )
+
+    def set_temperature(self, degC: float) -> None:
+        """E with every other field as it is."""
+        self._write(degC, {})
+
+    def humidity_off(self) -> None:
+        """E with the off_bits 0."""
+        self._write(None, dict.fromkeys(self._settings.off_bits, False))
+
+    def run(self, on: bool) -> None:
+        """E with the start bit; the off_bits are 0."""
+        self._write(None, {**dict.fromkeys(self._settings.off_bits, False), self._settings.start_bit: on})
+
+    def renew(self) -> None:
+        """It has no dead-man."""
+
+    def _read(self) -> tuple[list[float], str]:
+        fields = max(*self._settings.write_fields, 1)
+
+        def answer(heard: bytes) -> tuple[list[float], str] | None:
+            found = parse(heard)
+            if found is not None and len(found[0]) <= fields:
+                raise ValueError(f"{len(found[0])} fields, and write_fields names field {fields}")
+            return found
+
+        return self._client.query(self._bytes("I"), answer)
+
+    def _write(self, degC: float | None, bits: dict[int, bool]) -> None:
+        """What is not named stays as it was read just before."""
+        values, digits = self._read()
+        fields = [values[field] for field in self._settings.write_fields]
+        if degC is not None:
+            fields[0] = degC
+        written = "".join(str(int(bits.get(index, digit == "1"))) for index, digit in enumerate(digits))
+        request = self._bytes("E " + " ".join([*map(number, fields), written]))
+        try:
+            self._client.send(request, lambda heard: heard if heard.endswith((b"\r", b"\n")) else None)
+        except Unreachable:  # some units do not answer a write
+            if not self._client.connected:
+                self._read()  # over a new link; Unreachable when it is gone
+
+    def _bytes(self, command: str) -> bytes:
+        return f"${self._settings.unit:02d}{command}\r".encode("ascii")
+
+
+def _bit(digits: str, index: int) -> bool:
+    return index < len(digits) and digits[index] == "1"

@@ -1,0 +1,143 @@
+"""CTS (ITC, Cadimac): short ASCII commands, framed on RS-232, bare over TCP. Source: the maker's interface manual.
+
+A0  -> A0 024.5 025.0      actual and set temperature          a0 025.0 -> a     s1 1 -> s1     s1 0 -> s1
+S   -> S, run, error, not paused, humidity on, 4 more, code    F -> F and 32 characters of error text
+framed: STX, 80+address, text, CHK, ETX; between STX and ETX every byte has bit 7 set, CHK = XOR of address and text
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import reduce
+from operator import xor
+from typing import TypeVar
+
+from drivers.devices.chamber_language import ChamberState
+from drivers.devices.chamber_settings import CtsSettings
+from drivers.wires.line_client import LineClient
+from drivers.wires.link import SerialSettings, open_link
+from foundation.errors import Refused
+
+Found = TypeVar("Found")
+
+_STX, _ETX, _HIGH = 0x02, 0x03, 0x80
+_TEMPERATURES = re.compile(r"A0 (-?\d{2,3}\.\d) (-?\d{2,3}\.\d)")
+_STATE = re.compile(r"S([01?]{8})(.)", re.DOTALL)
+_NO_ERROR = {0x00, 0x30}  # code bytes
+
+
+def framed(unit: int, text: str) -> bytes:
+    """The frame of a text: framed(1, "O") = 02 81 CF CE 03."""
+    body = bytes([_HIGH | unit, *(byte | _HIGH for byte in text.encode("latin-1"))])
+    return bytes([_STX, *body, reduce(xor, body) | _HIGH, _ETX])
+
+
+def unframed(unit: int, heard: bytes) -> str | None:
+    """The text of the frame that has come; None until it is whole; ValueError when it is none, or another unit's."""
+    if not heard.endswith(bytes([_ETX])) or len(heard) < 4:
+        return None
+    body, check = heard[1:-2], heard[-2]
+    if heard[0] != _STX or reduce(xor, body) | _HIGH != check or not all(byte & _HIGH for byte in body):
+        raise ValueError("not a frame, or a wrong checksum")
+    if body[0] != _HIGH | unit:
+        raise ValueError(f"unit {body[0] & 0x7F} has answered, not {unit}")
+    return bytes(byte & 0x7F for byte in body[1:]).decode("latin-1")
+
+
+class Language:
+    """One CTS chamber."""
+
+    resolution_K = 0.1
+    dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
+
+    def __init__(self, name: str, settings: CtsSettings) -> None:
+        self._name = name
+        self._unit = settings.unit
+        self._is_serial = settings.address.startswith("serial:")
+        line = SerialSettings(settings.baud, 1, settings.parity)
+        self._client = LineClient(
+            name,
+            lambda: open_link(name, settings.address, line),
+            settings.timeout_s,
+            settings.gap_s,
+            is_kept=self._is_serial,
+        )
+
+    @property
+    def connected(self) -> bool:
+        """The link of the last request still stands."""
+        return self._client.connected
+
+    def close(self) -> None:
+        """Let go of the link."""
+        self._client.close()
+
+    def identity(self) -> str:
+        """It says nothing of itself."""
+        return ""
+
+    def limits_degC(self) -> tuple[float, float] | None:
+        """It does not tell them."""
+        return None
+
+    def state(self) -> ChamberState:
+        """Of A0, S, and F when there is an error."""
+        actual, nominal = self._client.query(*self._asked("A0", 14, self._temperatures))
+        flags, code = self._client.query(*self._asked("S", 10, self._flags))
+        alarms = (self._error_text(code),) if flags[1] == "1" or ord(code) & 0x7F not in _NO_ERROR else ()
+        return ChamberState(actual, nominal, flags[0] == "1", alarms, humidity_on=flags[3] == "1")
+
+    def set_temperature(self, degC: float) -> None:
+        """a0 025.0."""
+        self._client.send(*self._asked(f"a0 {_number(degC)}", 1, _expecting("a")))
+
+    def humidity_off(self) -> None:
+        """Its channel differs from unit to unit."""
+        raise Refused(self._name, "humidity is on, and can only be switched off at the panel: do so, and start again")
+
+    def run(self, on: bool) -> None:
+        """s1 1 or s1 0."""
+        self._client.send(*self._asked(f"s1 {int(on)}", 2, _expecting("s1")))
+
+    def renew(self) -> None:
+        """It has no dead-man."""
+
+    def _error_text(self, code: str) -> str:
+        text = self._client.query(*self._asked("F", 33, lambda text: text[1:].strip() if text[:1] == "F" else None))
+        return text or f"error {code!r}"
+
+    def _temperatures(self, text: str) -> tuple[float, float] | None:
+        found = _TEMPERATURES.fullmatch(text)
+        return (float(found[1]), float(found[2])) if found else None
+
+    def _flags(self, text: str) -> tuple[str, str] | None:
+        found = _STATE.fullmatch(text)
+        return (found[1], found[2]) if found else None
+
+    def _asked(
+        self, text: str, length: int, parse: Callable[[str], Found | None]
+    ) -> tuple[bytes, Callable[[bytes], Found | None]]:
+        """The request, and what makes its answer of the bytes that have come; a bare text ends at its length."""
+
+        def answer(heard: bytes) -> Found | None:
+            if self._is_serial:
+                reply = unframed(self._unit, heard)
+            else:
+                reply = heard.decode("latin-1") if len(heard) >= length else None
+            if reply is None:
+                return None
+            if (found := parse(reply)) is None:
+                raise ValueError(f"not a reply to {text!r}")
+            return found
+
+        return framed(self._unit, text) if self._is_serial else text.encode("ascii"), answer
+
+
+def _expecting(word: str) -> Callable[[str], str | None]:
+    return lambda text: word if text == word else None
+
+
+def _number(degC: float) -> str:
+    """025.0, -40.0."""
+    return f"{degC:05.1f}"

@@ -1,0 +1,231 @@
+"""A climate chamber with a controller of its own, in the place of a regulator: it heats and cools by itself.
+
+None of the makes has a watchdog of its communications that anybody documents: when this computer dies the chamber goes
+on at its last set-point. So the limits of its own controller are part of what is checked before anything is commanded.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from typing import Protocol, cast
+
+from drivers.devices.chamber_language import ChamberLanguage, ChamberState
+from drivers.devices.chamber_settings import ChamberUnitSettings
+from foundation.clock import Clock, seconds_ns
+from foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
+from foundation.lane import Lane, Result
+from foundation.readings import Reading
+
+_LOOKS = 3  # at a state that follows its command a scan of the unit later
+_RENEW_S = 60.0
+
+
+class _Module(Protocol):
+    def Language(self, name: str, settings: ChamberUnitSettings) -> ChamberLanguage: ...
+
+
+class ClimateChamber:
+    """The calls of a regulator: channels pv, sp (degC), running, fault (1 or 0), and no outputs.
+
+    allowed_degC: the set-points that the stand may ask for; a chamber whose own controller allows more is refused.
+    Identity, limits and humidity are looked at before the first command and after every loss. A set-point is sent only
+    when it differs from what the unit has. What somebody changed at the panel is told, and never overwritten unasked.
+    """
+
+    def __init__(
+        self, name: str, settings: ChamberUnitSettings, allowed_degC: tuple[float, float], clock: Clock
+    ) -> None:
+        self.name = name
+        self.identity = ""
+        self.dead_man = ""
+        self._settings = settings
+        self._allowed_degC = allowed_degC
+        self._clock = clock
+        protocol = settings.model_dump()["protocol"]
+        module = cast("_Module", importlib.import_module(f"drivers.devices.chamber_{protocol}"))
+        self._language = module.Language(name, settings)
+        self.dead_man = self._language.dead_man
+        self._lane: Lane | None = None
+        self._lock = asyncio.Lock()
+        self._is_checked = False
+        self._sp_degC: float | None = None
+        self._from_degC: float | None = None  # where a ramp to it began
+        self._is_run = False
+        self._renew_ns = 0
+
+    async def open(self) -> None:
+        """Identity and limits; nothing is commanded. DeviceFault when it is another unit, or may be set too far."""
+        if self._lane is None:
+            self._lane = Lane(self.name, self._clock)
+        async with self._exclusive():
+            await self._call(self._check)
+
+    async def close(self) -> None:
+        """Let go of the wire; the chamber goes on."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._language.close)
+            lane.close()
+
+    async def read(self) -> tuple[Reading, ...]:
+        """pv, sp, running, fault; the reason of `fault` has its alarms and what was done at the panel."""
+        async with self._exclusive():
+            state = await self._call(self._state)
+            if self._is_run and state.running and self._clock.now_ns() >= self._renew_ns:
+                await self._call(self._language.renew)
+                self._renew_ns = self._clock.now_ns() + seconds_ns(_RENEW_S)
+            return self._readings(state)
+
+    async def set_temperature(self, degC: float) -> None:
+        """Send a set-point, unless the unit has it, and read it back. Refused: outside what is allowed (nothing is
+        sent), clamped, or without effect."""
+        low_degC, high_degC = self._allowed_degC
+        if not low_degC <= degC <= high_degC:
+            raise Refused(self.name, f"{degC:g} degC is outside {low_degC:g}..{high_degC:g} degC; nothing was sent")
+        async with self._exclusive():
+            await self._call(self._set, degC)
+            self._sp_degC = degC
+
+    async def run(self) -> None:
+        """Switch humidity off, start, confirmed. DeviceFault: an alarm stands, which only an operator may reset."""
+        async with self._exclusive():
+            await self._call(self._start)
+            self._is_run, self._renew_ns = True, self._clock.now_ns() + seconds_ns(_RENEW_S)
+
+    async def stop(self) -> None:
+        """Stop, confirmed."""
+        async with self._exclusive():
+            self._is_run = False
+            await self._call(self._switch, False)
+
+    async def make_safe(self) -> None:
+        """Stopped, confirmed; DeviceFault when it is not."""
+        await self.stop()
+
+    @asynccontextmanager
+    async def _exclusive(self) -> AsyncGenerator[None]:
+        """One sequence of requests at a time; after a loss somebody else may answer."""
+        async with self._lock:
+            try:
+                yield
+            except Unreachable:
+                self._is_checked = False
+                raise
+
+    async def _call(self, function: Callable[..., Result], *args: object) -> Result:
+        if self._lane is None:
+            raise Unreachable(self.name, "not open")
+        return await self._lane.call(function, *args)
+
+    # Below: in the lane's thread.
+
+    def _check(self) -> None:
+        identity = self._language.identity()
+        if self._settings.identity not in identity:
+            raise DeviceFault(self.name, f"it says that it is {identity!r}, not {self._settings.identity!r}; not used")
+        self.identity = identity
+        self._check_limits()
+        self._is_checked = True
+
+    def _check_limits(self) -> None:
+        found, low, high = self._language.limits_degC(), *self._allowed_degC
+        limits = found or self._settings.limits_at_panel_degC
+        if limits is None:
+            text = (
+                "it does not tell the set-point limits of its controller, on which its safety rests when this computer "
+                "dies; set them at the panel, and say so by limits_at_panel_degC"
+            )
+            raise DeviceFault(self.name, text)
+        if limits[0] < low or limits[1] > high:
+            whose = "its controller allows" if found else "limits_at_panel_degC allows"
+            raise DeviceFault(
+                self.name,
+                f"{whose} set-points of {limits[0]:g}..{limits[1]:g} degC, the stand {low:g}..{high:g} degC; nothing "
+                "else limits it when this computer dies: set its limits at the panel",
+            )
+
+    def _ready(self) -> ChamberState:
+        """Its state, after it was made sure who answers."""
+        if not (self._is_checked and self._language.connected):
+            self._check()
+        return self._language.state()
+
+    def _state(self) -> ChamberState:
+        return self._ready()
+
+    def _set(self, degC: float) -> None:
+        state = self._ready()
+        near_K = self._language.resolution_K / 2
+        if abs(state.set_degC - degC) < near_K:
+            return
+        self._from_degC = state.set_degC
+        self._language.set_temperature(degC)
+        for _ in range(_LOOKS):
+            state = self._language.state()
+            if abs(state.set_degC - degC) < near_K or self._on_its_way(state, degC):
+                return
+        if abs(state.set_degC - self._from_degC) < near_K:
+            text = f"not in control: the set-point {degC:g} degC had no effect"
+            raise Refused(self.name, f"{text}; is remote control (EXTERN) on at the panel?")
+        raise Refused(self.name, f"set to {degC:g} degC, it reads {state.set_degC:g} degC: clamped by the unit")
+
+    def _on_its_way(self, state: ChamberState, degC: float) -> bool:
+        """A nominal value that moves with the ramp lies between where it began and where it goes."""
+        if state.ramp_degC is None or self._from_degC is None:
+            return False
+        low_degC, high_degC = sorted((self._from_degC, degC))
+        return low_degC <= state.ramp_degC <= high_degC
+
+    def _start(self) -> None:
+        state = self._ready()
+        if state.alarms:
+            raise DeviceFault(self.name, f"{', '.join(state.alarms)}; look at the chamber, and reset it there")
+        if state.program:
+            raise DeviceFault(self.name, "a program of its own runs; end it at the panel")
+        if state.humidity_on:
+            self._language.humidity_off()
+            if self._language.state().humidity_on:
+                raise DeviceFault(self.name, "humidity cannot be switched off; do so at the panel")
+        self._switch(True)
+
+    def _switch(self, on: bool) -> None:
+        if not self._is_checked and on:
+            self._check()
+        if not on and self._has_stopped():
+            return
+        self._language.run(on)
+        for _ in range(_LOOKS):
+            if self._language.state().running is on:
+                return
+        what = "start" if on else "stop"
+        text = f"not in control: it did not {what}; is remote control (EXTERN) on at the panel?"
+        raise DeviceFault(self.name, text)
+
+    def _has_stopped(self) -> bool:
+        """False also when that cannot be read: then it is stopped all the same."""
+        try:
+            return not self._language.state().running
+        except (GarbledReply, Refused):
+            return False
+
+    def _readings(self, state: ChamberState) -> tuple[Reading, ...]:
+        now_ns = self._clock.now_ns()
+        faults, sp_degC = list(state.alarms), state.set_degC
+        if self._sp_degC is not None:
+            if self._on_its_way(state, self._sp_degC):
+                sp_degC = self._sp_degC
+            elif abs(sp_degC - self._sp_degC) >= self._language.resolution_K / 2:
+                faults.append(f"set point changed at the unit, from {self._sp_degC:g} to {sp_degC:g} degC")
+        if state.program:
+            faults.append("a program of its own runs")
+        if state.humidity_on and self._is_run:
+            faults.append("humidity is on")
+        return (
+            Reading(f"{self.name}.pv", state.actual_degC, "degC", now_ns),
+            Reading(f"{self.name}.sp", sp_degC, "degC", now_ns),
+            Reading(f"{self.name}.running", float(state.running), "1", now_ns),
+            Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason=", ".join(faults)),
+        )

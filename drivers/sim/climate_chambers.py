@@ -1,0 +1,293 @@
+"""Commercial climate chambers, each on its wire, with the plant behind it: ESPEC P300, CTS, Weiss/Voetsch (ASCII-2).
+
+Sources: ESPEC P300/SCP-220 and CTS interface manuals, Voetsch ASCII-2 transcripts. Each answers text; how it is framed
+is said at its class. The control is proportional over 3 K. None has a watchdog of its communications.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import Protocol
+
+from drivers.sim.modbus import Timeline
+from foundation.clock import NS_PER_S, Now
+
+BAND_K = 3.0
+
+
+class Chamber(Timeline, Protocol):
+    """What a chamber sees and moves of the plant."""
+
+    heater_on_fraction: float
+    heater_enabled: bool
+    compressor_on: bool
+    chamber_degC: float
+
+
+class FakeClimateChamber:
+    """What they share. limits_degC: of the controller. Faults: silent; ignores_writes (local, or an old firmware);
+    clamps (a set-point outside the limits is taken as far as they go, and acknowledged); alarm (its code; "" none);
+    humidity_on; protected (the panel refuses remote control); stuck_degC. `press_setpoint`, `press_stop`: at the panel.
+    is_alone: no relay in series enables its heat.
+    """
+
+    def __init__(self, plant: Chamber, clock: Now) -> None:
+        self.setpoint_degC = 23.0
+        self.limits_degC = (-40.0, 150.0)
+        self.running = False
+        self.silent = False
+        self.ignores_writes = False
+        self.clamps = False
+        self.alarm = ""
+        self.humidity_on = False
+        self.protected = False
+        self.stuck_degC: float | None = None
+        self.setpoint_writes = 0
+        self.is_alone = True
+        self._plant = plant
+        self._clock = clock
+        self._stops_ns: int | None = None
+        plant.on_step.append(self._on_step)
+
+    def engine(self) -> Conversation:
+        """A new conversation with it."""
+        raise NotImplementedError
+
+    def press_setpoint(self, setpoint_degC: float) -> None:
+        """Somebody changes it at the panel."""
+        self.setpoint_degC = setpoint_degC
+
+    def press_stop(self) -> None:
+        """Somebody stops it at the panel."""
+        self.running = False
+
+    def restart(self) -> None:
+        """A power failure: it comes back stopped, with its set-point."""
+        self.running = False
+
+    @property
+    def actual_degC(self) -> float:
+        """What it shows."""
+        return self._plant.chamber_degC if self.stuck_degC is None else self.stuck_degC
+
+    @contextmanager
+    def now(self) -> Generator[None]:
+        """Its state at the clock's present time."""
+        with self._plant.lock:
+            self._plant.advance(self._clock.now_ns())
+            yield
+
+    def set(self, degC: float) -> bool:
+        """A set-point from the wire; whether it is taken."""
+        low_degC, high_degC = self.limits_degC
+        if not low_degC <= degC <= high_degC and not self.clamps:
+            return False
+        if not self.ignores_writes:
+            self.setpoint_degC = min(high_degC, max(low_degC, degC))
+            self.setpoint_writes += 1
+        return True
+
+    def switch(self, on: bool) -> None:
+        """Start or stop from the wire."""
+        if not self.ignores_writes:
+            self.running = on
+
+    def _on_step(self, time_ns: int, dt_s: float) -> None:
+        if self._stops_ns is not None and time_ns >= self._stops_ns:
+            self.running, self._stops_ns = False, None
+        share = (self.setpoint_degC - self.actual_degC) / BAND_K if self.running and not self.alarm else 0.0
+        if self.is_alone:
+            self._plant.heater_enabled = True
+        self._plant.heater_on_fraction = min(1.0, max(0.0, share))
+        self._plant.compressor_on = share < -0.1
+
+
+class Conversation:
+    """Bytes in, bytes out; `take(buffer) -> (reply, rest)` or None while a request is not whole."""
+
+    def __init__(self, chamber: FakeClimateChamber, take: Callable[[bytes], tuple[bytes, bytes] | None]) -> None:
+        self._chamber = chamber
+        self._take = take
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> bytes:
+        """Answer every request that is whole."""
+        self._buffer += data
+        replies = b""
+        with self._chamber.now():
+            while (taken := self._take(self._buffer)) is not None:
+                reply, self._buffer = taken
+                replies += reply
+        return b"" if self._chamber.silent else replies
+
+
+class FakeEspec(FakeClimateChamber):
+    """P300: commands and replies are lines, CR LF; `NA:` and a reason when refused."""
+
+    def engine(self) -> Conversation:
+        """Lines."""
+
+        def take(buffer: bytes) -> tuple[bytes, bytes] | None:
+            line, separator, rest = buffer.partition(b"\n")
+            if not separator:
+                return None
+            return self._answer(line.decode("latin-1").strip()).encode("latin-1") + b"\r\n", rest
+
+        return Conversation(self, take)
+
+    def _answer(self, command: str) -> str:
+        low_degC, high_degC = self.limits_degC
+        alarms = [self.alarm] if self.alarm else []
+        queries = {
+            "TEMP?": f"{self.actual_degC:.1f},{self.setpoint_degC:.1f},{high_degC:.1f},{low_degC:.1f}",
+            "MON?": f"{self.actual_degC:.1f},50,{'CONSTANT' if self.running else 'STANDBY'},{len(alarms)}",
+            "HUMI?": f"48,{'50' if self.humidity_on else 'OFF'},100,0",
+            "MODE?": "CONSTANT" if self.running else "STANDBY",
+            "ALARM?": ",".join([str(len(alarms)), *alarms]),
+            "TYPE?": "T,T,S2,160.0",
+        }
+        if command in queries:
+            return queries[command]
+        if self.protected:
+            return "NA:PROTECT ON"
+        return self._order(command)
+
+    def _order(self, command: str) -> str:
+        if found := re.fullmatch(r"TEMP, ?S(-?\d+\.\d)", command):
+            return f"OK:{command}" if self.set(float(found[1])) else "NA:DATA OUT OF RANGE"
+        if found := re.fullmatch(r"TIMER WRITE,NO0,(\d+):(\d\d),STANDBY", command):
+            self._timer_s = 3600 * int(found[1]) + 60 * int(found[2])
+            return f"OK:{command}"
+        match command:
+            case "MODE,CONSTANT":
+                self.switch(True)
+            case "MODE,STANDBY" | "MODE,OFF":
+                self.switch(False)
+            case "HUMI,SOFF":
+                self.humidity_on = False
+            case "TIMER,ON,0":
+                self._stops_ns = self._clock.now_ns() + self._timer_s * NS_PER_S
+            case _:
+                return "NA:CMD ERR"
+        return f"OK:{command}"
+
+    _timer_s = 0
+
+
+class FakeCts(FakeClimateChamber):
+    """CTS unit `unit`. On a serial line STX, 80+unit, text, CHK, ETX with bit 7 set between STX and ETX and CHK the XOR
+    of address and text; over TCP the bare text without an end. An unknown command is not answered."""
+
+    def __init__(self, plant: Chamber, clock: Now, unit: int = 1, *, is_serial: bool = False) -> None:
+        super().__init__(plant, clock)
+        self.unit = unit
+        self.answers_as = unit
+        self._is_serial = is_serial
+
+    def engine(self) -> Conversation:
+        """Frames, or bare texts."""
+        return Conversation(self, self._take_frame if self._is_serial else self._take_text)
+
+    def _take_text(self, buffer: bytes) -> tuple[bytes, bytes] | None:
+        found = re.match(rb"a0 -?\d+\.\d|s[123] [01]|[A-Z][0-9:;<]?", buffer)
+        if found is None:
+            return None if len(buffer) < 9 else (b"", b"")
+        return self._answer(found[0].decode()).encode("latin-1"), buffer[found.end() :]
+
+    def _take_frame(self, buffer: bytes) -> tuple[bytes, bytes] | None:
+        begin, end = buffer.find(b"\x02"), buffer.find(b"\x03")
+        if begin < 0 or end < begin:
+            return None
+        body, rest = buffer[begin + 1 : end], buffer[end + 1 :]
+        text = bytes(byte & 0x7F for byte in body[1:-1])
+        check = 0
+        for byte in body[:-1]:
+            check ^= byte
+        if body[0] != 0x80 + self.unit or body[-1] != check | 0x80:
+            return b"", rest
+        reply = self._answer(text.decode("latin-1"))
+        if not reply:
+            return b"", rest
+        high = bytes([0x80 + self.answers_as, *(ord(character) | 0x80 for character in reply)])
+        check = 0
+        for byte in high:
+            check ^= byte
+        return b"\x02" + high + bytes([check | 0x80]) + b"\x03", rest
+
+    def _answer(self, command: str) -> str:
+        match command[:2]:
+            case "A0":
+                return f"A0 {self.actual_degC:05.1f} {self.setpoint_degC:05.1f}"
+            case "a0":
+                self.set(float(command[3:]))
+                return "a"
+            case "s1":
+                self.switch(command[3] == "1")
+                return "s1"
+            case "S":
+                flags = (self.running, bool(self.alarm), True, self.humidity_on, False, False, False, False)
+                code = chr(int(self.alarm, 16)) if self.alarm else "0"
+                return "S" + "".join(str(int(flag)) for flag in flags) + code
+            case "F":
+                text = f"error {self.alarm}" if self.alarm else ""
+                return f"F{text:<32}"
+            case _:
+                return ""
+
+
+class FakeWeiss(FakeClimateChamber):
+    """ASCII-2, unit `unit`: seven pairs of nominal and actual, 32 digits; DO01 starts, DO02 is humidity. E is answered
+    by 0, or by nothing when it is `mute`; one that is ignored is answered in the same way. ramp_K_per_min: the nominal
+    value in the reply moves."""
+
+    def __init__(self, plant: Chamber, clock: Now, unit: int = 1) -> None:
+        super().__init__(plant, clock)
+        self.unit = unit
+        self.mute = False
+        self.ramp_K_per_min: float | None = None
+        self._fan_percent = 90.0
+        self._shown_degC = self.setpoint_degC
+
+    def engine(self) -> Conversation:
+        """Lines that end with CR."""
+
+        def take(buffer: bytes) -> tuple[bytes, bytes] | None:
+            line, separator, rest = buffer.partition(b"\r")
+            return (self._answer(line.decode("latin-1").strip()), rest) if separator else None
+
+        return Conversation(self, take)
+
+    def _nominal_degC(self) -> float:
+        return self.setpoint_degC if self.ramp_K_per_min is None else self._shown_degC
+
+    def _on_step(self, time_ns: int, dt_s: float) -> None:
+        super()._on_step(time_ns, dt_s)
+        if self.ramp_K_per_min is not None:
+            step_K = self.ramp_K_per_min * dt_s / 60
+            self._shown_degC += max(-step_K, min(step_K, self.setpoint_degC - self._shown_degC))
+
+    def _answer(self, line: str) -> bytes:
+        if not line.startswith(f"${self.unit:02d}"):
+            return b""
+        command, *fields = line[3:].split()
+        if command == "I":
+            return self._state().encode() + b"\r"
+        if command != "E" or len(fields) != 8:
+            return b""
+        if self.set(float(fields[0])) and not self.ignores_writes:
+            self._fan_percent = float(fields[2])
+            self.switch(fields[-1][1] == "1")
+            self.humidity_on = fields[-1][2] == "1"
+        return b"" if self.mute else b"0\r"
+
+    def _state(self) -> str:
+        pairs = [
+            (self._nominal_degC(), self.actual_degC),
+            (80.0, 66.7),
+            (self._fan_percent, self._fan_percent),
+            *((0.0, value) for value in (23.8, 22.2, 25.5, 24.4)),
+        ]
+        digits = f"0{int(self.running)}{int(self.humidity_on)}" + 29 * "0"
+        return " ".join([*(f"{value:06.1f}" for pair in pairs for value in pair), digits])
