@@ -22,7 +22,7 @@ from foundation.errors import SessionError
 from foundation.files import replace_file, sync_folder
 from foundation.lock_file import try_lock
 from recording.format.inventory import State, inventory
-from recording.reading.catalogue import Entry, contents_of
+from recording.reading.catalogue import DELETED, Entry, contents_of
 from recording.reading.journal_lines import JOURNAL_NAME
 from recording.reading.notes import NOTES_NAME, Archived, add_archived
 from recording.reading.run_word import Files, Run
@@ -107,7 +107,7 @@ def delete(entry: Entry, report: Report = lambda _: None) -> None:
     """Remove a session whose copy has just been read back. SessionError, and then nothing is removed, when the copy is
     not what it should be, or the session has changed or is in use."""
     check_copy(Path(entry.archived), entry.contents, report)
-    gone = entry.path.with_name(f".{entry.path.name}.deleted")
+    gone = entry.path.with_name(f".{entry.path.name}{DELETED}")
     try:
         with closing(_Locked(entry.path)):
             if contents_of(entry.path) != entry.contents or unfit(entry) or entry.path.is_symlink():

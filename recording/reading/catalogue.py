@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from recording.reading.glance import Glance
 
 INDEX_NAME = ".sessions.sqlite"
+DELETED = ".deleted"  # of a folder that is being deleted, behind a dot and its name
 _VERSION = 1  # of the index; the program's version counts, too, for what it says of a session
 _BUSY_S = 1.0  # how long another one that writes the index is waited for
 _SCHEMA = "CREATE TABLE sessions (name BLOB PRIMARY KEY, files TEXT NOT NULL, entry TEXT NOT NULL)"
@@ -158,7 +159,8 @@ def contents_of(path: Path) -> str:
 
 def _folders(folder: Path) -> Iterator[Path]:
     with os.scandir(folder) as entries:
-        yield from [folder / entry.name for entry in entries if entry.is_dir()]
+        names = [entry.name for entry in entries if entry.is_dir()]
+    yield from (folder / name for name in names if not (name.startswith(".") and name.endswith(DELETED)))
 
 
 def _files(path: Path) -> list[_File] | None:
