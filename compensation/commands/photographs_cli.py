@@ -8,9 +8,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from compensation.calibration.board import board_of
+from compensation.calibration.board import board_of, board_of_corners
 from compensation.calibration.errors import CalibrationError
 from compensation.calibration.exports import EXPORTS, write_exports
+from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.view_uncertainty import in_words
 from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
@@ -20,7 +21,8 @@ from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.progress import Report, progress
 from foundation.usage import one_line
-from markers.detection import Detection, DetectionError, detect
+from markers.corner_board import CornerBoard, SIGMA_px, find_corners, load_corner_board
+from markers.detection import DetectionError, Image, detect
 from markers.image_file import read_image
 from markers.target import Target
 
@@ -30,7 +32,12 @@ app = typer.Typer(add_completion=False)
 @app.command("calibrate-photographs")
 def calibrate_photographs(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Pictures of the target, of one camera.")],
-    target: Annotated[str, typer.Option("--target", help="A target file or an installed name.")],
+    target: Annotated[
+        str,
+        typer.Option(
+            "--target", help="A target file or an installed name; a board of squares is a file with its `kind`."
+        ),
+    ],
     export: Annotated[Path, typer.Option(help="A folder, new or not, for the OpenCV, ROS, Kalibr and mrcal files.")],
     distance_mm: Annotated[
         float | None, typer.Option(min=1, help="Where the uncertainty is stated; else the pictures' mean distance.")
@@ -50,20 +57,22 @@ def calibrate_photographs(
     """
     with one_line_errors(), images_up_to(max_megapixels):
         check_folder_writable(export, EXPORTS)
-        board = installed_target(target)
+        board = _described(target)
         failures: list[str] = []
         with progress("find markers", len(images)) as report:
             views = _views(images, board, failures, report)
         for failure in failures:
             typer.echo(f"not used: {one_line(failure)}", err=True)
-        known = board_of(board)
+        known = board_of(board) if isinstance(board, Target) else board_of_corners(board)
         found = calibrate_views(views, known)
         write_exports(export, found.scene.lens, "camera", found.rms_px)
         at_mm = distance_mm or float(np.mean(found.scene.translations_mm[:, 2]))
         typer.echo(summary(found, views, cross_validated_px(views, known), at_mm, board))
 
 
-def summary(found: ViewCalibration, views: Views, held_out_px: float, distance_mm: float, target: Target) -> str:
+def summary(
+    found: ViewCalibration, views: Views, held_out_px: float, distance_mm: float, target: Target | CornerBoard
+) -> str:
     """The calibration in a few lines."""
     lens = found.scene.lens
     lines = [
@@ -88,14 +97,28 @@ def summary(found: ViewCalibration, views: Views, held_out_px: float, distance_m
     return "\n".join(lines)
 
 
-def _views(images: list[Path], target: Target, failures: list[str], report: Report) -> Views:
+def _described(name: str) -> Target | CornerBoard:
+    """A board of squares when the file says so, else a target of dots."""
+    corners = load_corner_board(Path(name)) if Path(name).is_file() else None
+    return corners or installed_target(name)
+
+
+def _look(image: Image, target: Target | CornerBoard) -> tuple[Float, Float]:
+    """Points (N, 2) px and their covariances (N, 2, 2) in a picture; DetectionError when the target is not in it."""
+    if isinstance(target, Target):
+        found = detect(image, target)
+        return found.centres_px, found.covariance_px2
+    return find_corners(image, target), np.tile(SIGMA_px**2 * np.eye(2), (target.count, 1, 1))
+
+
+def _views(images: list[Path], target: Target | CornerBoard, failures: list[str], report: Report) -> Views:
     """The pictures that show enough of the target; `failures` grows by a line for each other one."""
-    found: list[Detection] = []
+    found: list[tuple[Float, Float]] = []
     size: tuple[int, int] | None = None
     for number, path in enumerate(images, 1):
         try:
             pixels = read_image(path)
-            detection = detect(pixels, target)
+            points = _look(pixels, target)
         except DetectionError as error:
             failures.append(f"{path.name}: {error}")
             continue
@@ -105,12 +128,13 @@ def _views(images: list[Path], target: Target, failures: list[str], report: Repo
         if size not in (None, shape):
             raise CalibrationError(f"{path}: the picture has {shape[0]} x {shape[1]} pixels, those before it {size}")
         size = shape
-        if detection.found < LEAST_MARKERS:
-            failures.append(f"{path.name}: {detection.found} markers, {LEAST_MARKERS} are needed")
+        count = np.count_nonzero(np.isfinite(points[0][:, 0]))
+        if count < LEAST_MARKERS:
+            failures.append(f"{path.name}: {count} markers, {LEAST_MARKERS} are needed")
             continue
-        found.append(detection)
+        found.append(points)
     if size is None:
         raise CalibrationError(failures[0] if failures else "there are no pictures")
-    centres = np.array([one.centres_px for one in found]).reshape(-1, target.count, 2)
-    covariances = np.array([one.covariance_px2 for one in found]).reshape(-1, target.count, 2, 2)
+    centres = np.array([centres for centres, _ in found]).reshape(-1, target.count, 2)
+    covariances = np.array([covariance for _, covariance in found]).reshape(-1, target.count, 2, 2)
     return Views(centres, covariances, size)
