@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from foundation.clock import NS_PER_S, Clock
+from foundation.clock import NS_PER_S, Now
 from foundation.hub import Hub
 from foundation.instants import local_text
 from foundation.items import Event, Item, StepMark
@@ -17,9 +17,7 @@ _LEAST_S = 300.0  # of a short run nobody is told a minute
 class EtaSlip:
     """A subscriber behind the one that follows the run. left_s: real seconds to the end, from an instant in ns on."""
 
-    def __init__(
-        self, hub: Hub, clock: Clock, left_s: Callable[[int], float], utc_offset_ns: Callable[[], int]
-    ) -> None:
+    def __init__(self, hub: Hub, clock: Now, left_s: Callable[[int], float], utc_offset_ns: Callable[[], int]) -> None:
         self._hub, self._clock, self._left_s, self._utc_offset_ns = hub, clock, left_s, utc_offset_ns
         now_ns = clock.now_ns()
         self._step_s = max(_SHARE * left_s(now_ns), _LEAST_S)

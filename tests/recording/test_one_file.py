@@ -5,6 +5,7 @@ from mcap.reader import make_reader
 
 from foundation.errors import SessionError
 from recording.exporting.one_file import export_mcap
+from recording.format.images import ImageEncoding
 from recording.reading.notes import add_note
 from recording.reading.session import Session
 from tests.recording.recorded import ATTACHMENTS, images, record, telemetry
@@ -14,7 +15,7 @@ def silent(done, text):
     assert 0.0 <= done <= 1.0
 
 
-async def exported(tmp_path, encoding="png", **choices):
+async def exported(tmp_path, encoding: ImageEncoding = "png", **choices):
     await record(tmp_path / "s", encoding=encoding)
     add_note(tmp_path / "s", "windy", "eva", 1)
     session = Session.open(tmp_path / "s")

@@ -155,6 +155,9 @@ def detection(centres_px: NDArray[Any]) -> Detection:
         flags=np.zeros(count, np.uint8),
         chi=np.ones(count),
         homography=np.eye(3),
+        growth=np.ones(2),
+        excess_px2=np.zeros(2),
+        band_sigma=9.0,
         state=EdgeState(np.zeros((count, 12)), np.ones(count)),
     )
 
