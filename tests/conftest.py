@@ -16,7 +16,11 @@ _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera
 _DEALT_OUT = PurePath("tests/system")
 # What compiles the marker fit goes first: the workers that need it later find it kept, instead of waiting for it.
 _FIRST = {"tests/compensation/test_markers.py"}
-_TOGETHER = {"tests/system/test_camera_wire.py", "tests/system/test_kill_recording.py"}
+_TOGETHER = {
+    "tests/system/test_camera_wire.py",
+    "tests/system/test_failure_table.py",
+    "tests/system/test_kill_recording.py",
+}
 
 
 def pytest_configure(config: pytest.Config) -> None:

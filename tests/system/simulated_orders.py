@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 
 import yaml
@@ -11,19 +10,18 @@ from foundation.documents import load_document
 from stand.config.recipe import Recipe
 from stand.config.stand_config import load_config, packaged
 from stand.running.order import Order
-
-CAMERA_ADDRESS = "127.0.0.92"
+from tests.addresses import camera_address, free_port
 
 
 def simulated_order(directory: Path, recipe: str, poll_s: float | None = None) -> Order:
     """The recipe on the installed simulated stand; every device is polled each `poll_s`, None for as configured."""
     data = yaml.safe_load(packaged("", "simulated").read_text())
-    data["bus"]["address"] = f"tcp:127.0.0.1:{_free_port()}"
+    data["bus"]["address"] = f"tcp:127.0.0.1:{free_port()}"
     for name, axis in data["axes"].items():
         axis["address"] = f"serial:{directory / name}"
-    data["flap"]["backend_address"] = f"tcp:127.0.0.1:{_free_port()}"
-    data["cameras"]["camera"]["address"] = CAMERA_ADDRESS
-    data["simulation"]["control"] = f"tcp:127.0.0.1:{_free_port()}"
+    data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
+    data["cameras"]["camera"]["address"] = camera_address()
+    data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
     if poll_s is not None:
         sections = [data[name] for name in ("regulator", "thermometer_module", "relays", "flap")]
         for section in [*sections, *data["cameras"].values(), *data["axes"].values()]:
@@ -33,8 +31,3 @@ def simulated_order(directory: Path, recipe: str, poll_s: float | None = None) -
     recipe_file.write_text(recipe)
     target = packaged("targets", "paper-9x6").read_text()
     return Order(load_config(config_file), load_document(recipe_file, Recipe), config_file.read_text(), recipe, target)
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
