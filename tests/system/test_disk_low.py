@@ -53,7 +53,7 @@ async def test_a_disk_that_fills_during_a_capture_holds_it_and_costs_no_frame(
                 with ballast.open("wb") as file:
                     os.posix_fallocate(file.fileno(), 0, round(2e9 * ROOM_GB))
         if isinstance(item, Event):
-            kinds.append(f"{item.kind} {item.text}" if item.kind in ("held", "released") else item.kind)
+            kinds.append(f"{item.kind} {item.data['reason']}" if item.kind in ("held", "released") else item.kind)
             if kinds[-1] == "held disk_low":
                 ballast.unlink()
 
