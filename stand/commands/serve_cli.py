@@ -23,7 +23,7 @@ from stand.config.stand_config import load_config, packaged
 from stand.daemon.desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
 from stand.serving.api.bridge import Bridge
-from stand.serving.api.server import Interface
+from stand.serving.api.interface import Interface
 from stand.serving.api.server import serve as serve_clients
 from stand.serving.viewing import Viewing
 

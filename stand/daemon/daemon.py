@@ -25,7 +25,6 @@ from recording.writing.recorder import FINISH_WITHIN_S
 from stand.daemon import systemd
 from stand.daemon.by_hand import ByHand
 from stand.daemon.counters import Counters
-from stand.daemon.desk import DaemonDesk
 from stand.daemon.house_record import HouseRecord
 from stand.daemon.kept import Kept, KeptFile, Latch
 from stand.daemon.orders import Orders, Stopped
@@ -38,8 +37,8 @@ from stand.running.stop import Interrupted
 from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 
-# What answers the daemon's clients while inside.
-Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[object]]
+# What answers the clients of a daemon while inside.
+Answering = Callable[[Hub, WallClock], AbstractAsyncContextManager[object]]
 
 _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
@@ -144,7 +143,7 @@ class Daemon:
             raise error
         return f"{what}: done"
 
-    async def serve(self, front: Front) -> None:
+    async def serve(self, answering: Answering) -> None:
         """Until `leave`; then the stand is safe. Raises what makes that impossible."""
         async with AsyncExitStack() as stack:
             stack.push_async_callback(cancelled, self._extending)
@@ -161,16 +160,16 @@ class Daemon:
                 self.house.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
             self.house.guard.look()
             _catch_signals(self.leave)
-            await watched(self._serve(front), self.house.tasks)
+            await watched(self._serve(answering), self.house.tasks)
 
-    async def _serve(self, front: Front) -> None:
+    async def _serve(self, answering: Answering) -> None:
         with working(self.orders.directory):
             await self.orders.ready()
             self.wake()
             worker = asyncio.create_task(self._work())
             tasks = [worker, asyncio.create_task(self._look_after()), asyncio.create_task(self._feed())]
             try:
-                async with front(DaemonDesk(self), self._hub, cast("WallClock", self._clock)):
+                async with answering(self._hub, cast("WallClock", self._clock)):
                     systemd.tell(systemd.READY, "STATUS=idle")
                     try:
                         await watched(self._left(), tasks)

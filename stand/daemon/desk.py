@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NoReturn, TypeVar
+from typing import NoReturn, TypeVar
 
 from pydantic import JsonValue
 
 from foundation.errors import StandError
 from foundation.items import Event
+from stand.daemon.daemon import Daemon
 from stand.gate import INTERLOCK
 from stand.running.run_desk import NOTE, RunDesk
 from stand.serving.desk import (
@@ -28,9 +29,6 @@ from stand.serving.desk import (
     command_event,
 )
 from stand.serving.seen import seen_state
-
-if TYPE_CHECKING:
-    from stand.daemon.daemon import Daemon
 
 Result = TypeVar("Result")
 _NOTHING_RUNS = "nothing is run now"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from pathlib import Path
 
 from foundation.clock import WallClock
@@ -16,7 +17,8 @@ from stand.assembly import assemble
 from stand.clock_watch import ClockWatch
 from stand.config.safe_ranges import accepted_text
 from stand.config.stand_config import StandConfig
-from stand.daemon.daemon import Daemon, Front
+from stand.daemon.daemon import Daemon
+from stand.daemon.desk import DaemonDesk
 from stand.daemon.house_record import HouseRecord
 from stand.daemon.kept import KeptFile, kept_in
 from stand.daemon.orders import Orders
@@ -24,6 +26,9 @@ from stand.running.claim import claimed
 from stand.running.house import opened
 from stand.running.stop import Stop
 from stand.serving.alerts import alerting
+
+# What answers the clients of the stand's desk while inside.
+Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[object]]
 
 
 async def serve(config: StandConfig, config_name: str, texts: dict[str, str], out: Path, front: Front) -> None:
@@ -52,7 +57,8 @@ async def serve(config: StandConfig, config_name: str, texts: dict[str, str], ou
                     hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
                 if accepted := config.accepted():
                     hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
-                await Daemon(house, orders, record, kept, keep).serve(front)
+                daemon = Daemon(house, orders, record, kept, keep)
+                await daemon.serve(lambda hub, clock: front(DaemonDesk(daemon), hub, clock))
             if unsafe := assembly.stand.safety.unconfirmed:
                 raise StandTripped(f"the daemon ends, but NOT SAFE: {'; '.join(unsafe)}")
         finally:

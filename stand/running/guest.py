@@ -40,7 +40,8 @@ from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.running.to_ambient import to_ambient
-from stand.serving.api.server import Interface, preload, serve
+from stand.serving.api.interface import Interface
+from stand.serving.api.server import preload, serve
 from stand.serving.eta_slip import EtaSlip
 
 # The recorder's events that hold a run, and those that let it continue.

@@ -9,8 +9,8 @@ import pytest
 
 from stand.serving.api import recorded
 from stand.serving.api.bridge import NoAnswer
+from stand.serving.api.interface import Interface
 from stand.serving.api.recorded import REPORT, REPORT_CSP, Disk
-from stand.serving.api.server import Interface
 from tests.recording.recorded import record
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import ask, free_port

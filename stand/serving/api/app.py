@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -14,14 +14,12 @@ from foundation.errors import ConfigError, DeviceError, SessionError, StandError
 from stand.serving.api.access import Access, App, Gatekeeper
 from stand.serving.api.bridge import Bridge, NoAnswer
 from stand.serving.api.commands import commands
+from stand.serving.api.interface import Interface
 from stand.serving.api.pace import Pace
 from stand.serving.api.reads import reads
 from stand.serving.api.recorded import recorded
 from stand.serving.api.stream import Stream, json_of
 from stand.serving.desk import Conflict, Missing
-
-if TYPE_CHECKING:
-    from stand.serving.api.server import Interface
 
 # What was raised -> the answer's status; the first that fits.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (

@@ -7,9 +7,8 @@ import importlib
 import os
 import socket
 import threading
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,47 +18,13 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.tasks import failure_text
 from stand.serving.api.bridge import Bridge
+from stand.serving.api.interface import Interface
 from stand.serving.desk import Desk
 from stand.serving.presence import Entry, Presence
 
 _LOOK_S = 1.0
 _CLOSE_LIMIT_S = 5.0
 _READY_LIMIT_S = 30.0
-
-
-@dataclass(frozen=True, slots=True)
-class Interface:
-    """How a stand is reached besides its Unix socket.
-
-    host, port: to listen at by TCP; no port, no TCP. tokens: by name. hosts: names of this stand besides this machine's
-    own. sessions: the folder of recorded sessions. rooms: makes what else is served (history, frames, the page) in the
-    thread, as routers, by the bridge.
-    """
-
-    sessions: Path
-    host: str = "127.0.0.1"
-    port: int | None = None
-    tokens: dict[str, str] = field(default_factory=dict[str, str], repr=False)
-    hosts: tuple[str, ...] = ()
-    rooms: Sequence[Callable[[Bridge], Any]] = ()
-
-    @property
-    def url(self) -> str:
-        """Where it is reached over the network, "" when it is not."""
-        if self.port is None:
-            return ""
-        name = socket.gethostname() if self.host in ("0.0.0.0", "::", "") else self.host
-        return f"http://[{name}]:{self.port}" if ":" in name else f"http://{name}:{self.port}"
-
-    def check(self) -> None:
-        """ConfigError when everybody on the network could operate the stand."""
-        from stand.serving.api.access import is_loopback
-
-        if self.port is not None and not self.tokens and not is_loopback(self.host):
-            raise ConfigError(
-                f"--host {self.host}: others on the network could operate this stand; make a token with "
-                "`stand token add NAME`, or listen at 127.0.0.1"
-            )
 
 
 @asynccontextmanager

@@ -1,0 +1,46 @@
+"""How a stand is reached by its clients."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from foundation.errors import ConfigError
+from stand.serving.api.access import is_loopback
+from stand.serving.api.bridge import Bridge
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """How a stand is reached besides its Unix socket.
+
+    host, port: to listen at by TCP; no port, no TCP. tokens: by name. hosts: names of this stand besides this machine's
+    own. sessions: the folder of recorded sessions. rooms: makes what else is served (history, frames, the page) in the
+    thread, as routers, by the bridge.
+    """
+
+    sessions: Path
+    host: str = "127.0.0.1"
+    port: int | None = None
+    tokens: dict[str, str] = field(default_factory=dict[str, str], repr=False)
+    hosts: tuple[str, ...] = ()
+    rooms: Sequence[Callable[[Bridge], Any]] = ()
+
+    @property
+    def url(self) -> str:
+        """Where it is reached over the network, "" when it is not."""
+        if self.port is None:
+            return ""
+        name = socket.gethostname() if self.host in ("0.0.0.0", "::", "") else self.host
+        return f"http://[{name}]:{self.port}" if ":" in name else f"http://{name}:{self.port}"
+
+    def check(self) -> None:
+        """ConfigError when everybody on the network could operate the stand."""
+        if self.port is not None and not self.tokens and not is_loopback(self.host):
+            raise ConfigError(
+                f"--host {self.host}: others on the network could operate this stand; make a token with "
+                "`stand token add NAME`, or listen at 127.0.0.1"
+            )
