@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.apply.spline import Image
+from compensation.apply.resample import Image
 from compensation.apply.warp import warp
 from compensation.drift.drift_model import DriftModel
 from compensation.history.states import Float, States

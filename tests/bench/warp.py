@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.apply.warp import source_offset, warp
+from compensation.apply.warp import warp
+from compensation.drift_runtime import source_offset
 from markers.detection import detect
 from markers.target import load_target
 from stand.config.stand_config import packaged
@@ -51,7 +52,7 @@ def figures(directory: Path) -> list[Figure]:
         )
     ]
     return [
-        at_most(100, side_by_side("warp, 5 MP frame", "ms/frame", PEER, own, other)),
+        at_most(25, side_by_side("warp, 5 MP frame", "ms/frame", PEER, own, other)),
         at_most(0.5, side_by_side("warp, error of the markers", "mpx RMS", PEER, errors[:1], errors[1:])),
     ]
 

@@ -364,6 +364,10 @@ def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_
 def test_export_says_what_it_has_written(files: dict[str, Path], tmp_path: Path):
     printed = run("export", files["thermal"], "-o", tmp_path / "a" / "b")
     assert printed.split() == [str(tmp_path / "a" / "b" / name) for name in ("drift.json", "drift_runtime.py")]
+    assert run("export", files["thermal"], "--c", tmp_path / "lens.h") == f"{tmp_path / 'lens.h'}\n"
+    assert "lens_advance(" in (tmp_path / "lens.h").read_text()
+    assert "drift_node.py" in run("export", files["thermal"], "--ros2", tmp_path / "camera_drift")
+    assert "give -o FOLDER" in run("export", files["thermal"], status=2)
 
 
 def test_an_exported_image_is_corrected_as_the_session_is_at_its_time(
