@@ -1,4 +1,4 @@
-"""Checkerboards and ChArUco boards, found by OpenCV: for calibrations where no dots are at hand.
+"""Boards of corners (checkerboards, ChArUco boards, AprilGrids), found by OpenCV: for calibrations without dots.
 
 Corners are points of the board's frame: X right along its columns, Y up, Z towards the camera, mm, origin at the top
 left of the printed pattern. OpenCV says nothing of a corner's uncertainty: `SIGMA_px` is assumed, and a calibration
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from foundation.documents import Document, load_document
+from markers.april_grid import AprilGrid, find_tag_corners
 from markers.errors import DetectionError
 from markers.noise import Image, full_scale_DN
 
@@ -74,18 +75,28 @@ class CornerBoard(Document):
         return np.stack([column + 1, -(row + 1)], axis=1) * self.square_mm
 
 
-def load_corner_board(path: Path) -> CornerBoard | None:
+BoardOfCorners = CornerBoard | AprilGrid
+"""A board whose points are corners."""
+
+
+def load_corner_board(path: Path) -> BoardOfCorners | None:
     """The board of a file that says of which `kind` it is; None for others, which are of dots."""
-    if not any(line.startswith("kind:") for line in path.read_text(encoding="utf-8").splitlines()):
+    kinds = [
+        line.split(":", 1)[1] for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("kind:")
+    ]
+    if not kinds:
         return None
-    return load_document(path, CornerBoard)
+    return load_document(path, AprilGrid if "aprilgrid" in kinds[0] else CornerBoard)
 
 
-def find_corners(image: Image, board: CornerBoard) -> Float:
+def find_corners(image: Image, board: BoardOfCorners) -> Float:
     """Corners (N, 2), px, in the order of `coordinates_mm`, NaN where not seen. Raises DetectionError when there are
     none."""
     grey = image if image.dtype == np.uint8 else cv2.convertScaleAbs(image, alpha=255 / full_scale_DN(image))
-    found = _checkerboard(grey, board) if board.kind == "checkerboard" else _charuco(grey, board)
+    if isinstance(board, AprilGrid):
+        found = find_tag_corners(grey, board)
+    else:
+        found = _checkerboard(grey, board) if board.kind == "checkerboard" else _charuco(grey, board)
     if found is None:
         raise DetectionError(f"the {board.columns} x {board.rows} {board.kind} {board.name} was not found")
     return found

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensation.calibration.least_squares import Float
-from markers.corner_board import CornerBoard
+from markers.corner_board import BoardOfCorners
 from markers.target import Target
 
 _POINT_mm = 1e-3
@@ -23,8 +23,8 @@ class Board:
     diameters_mm: Float
 
 
-def board_of_corners(board: CornerBoard) -> Board:
-    """The board of a file of squares, as dots so small that their outlines have no other centres than they have."""
+def board_of_corners(board: BoardOfCorners) -> Board:
+    """The board of a file of corners, as dots so small that their outlines have no other centres than they have."""
     sigma = np.tile([board.printing_error_mm, board.printing_error_mm, board.flatness_mm], (board.count, 1))
     points = np.column_stack([board.coordinates_mm(), np.zeros(board.count)])
     return Board(points, sigma, np.full(board.count, _POINT_mm))

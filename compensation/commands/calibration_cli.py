@@ -20,6 +20,7 @@ from compensation.reporting.calibration_report import report_page
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable, check_writable, write_whole
 from foundation.progress import progress
+from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
@@ -72,10 +73,10 @@ def calibrate_session(
             write_exports(export, file.lens, file.camera_serial or "camera", file.fit.rms_px)
         if report is not None:
             write_whole(report, report_page(file, found))
-        typer.echo(summary(file))
+        typer.echo(summary(file, used))
 
 
-def summary(file: CameraFile) -> str:
+def summary(file: CameraFile, target: Target) -> str:
     """The calibration in a few lines."""
     sigma = [file.covariance[index][index] ** 0.5 for index in range(len(file.vector))]
     lines = [f"{file.model}: {file.fit.markers} markers at {len(file.table.linear_mm)} positions"]
@@ -97,6 +98,7 @@ def summary(file: CameraFile) -> str:
     lines.append(
         f"Kalibr's model without k3 differs by {1e3 * refit.rms_px:.2f} mpx RMS, {1e3 * refit.worst_px:.1f} at most"
     )
+    lines.append(target.orientation)
     return "\n".join(lines)
 
 

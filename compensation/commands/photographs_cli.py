@@ -21,7 +21,7 @@ from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.progress import Report, progress
 from foundation.usage import one_line
-from markers.corner_board import CornerBoard, SIGMA_px, find_corners, load_corner_board
+from markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
 from markers.detection import DetectionError, Image, detect
 from markers.image_file import read_image
 from markers.target import Target
@@ -35,7 +35,7 @@ def calibrate_photographs(
     target: Annotated[
         str,
         typer.Option(
-            "--target", help="A target file or an installed name; a board of squares is a file with its `kind`."
+            "--target", help="A target file or an installed name; a board of squares or tags is a file with its `kind`."
         ),
     ],
     export: Annotated[Path, typer.Option(help="A folder, new or not, for the OpenCV, ROS, Kalibr and mrcal files.")],
@@ -71,7 +71,7 @@ def calibrate_photographs(
 
 
 def summary(
-    found: ViewCalibration, views: Views, held_out_px: float, distance_mm: float, target: Target | CornerBoard
+    found: ViewCalibration, views: Views, held_out_px: float, distance_mm: float, target: Target | BoardOfCorners
 ) -> str:
     """The calibration in a few lines."""
     lens = found.scene.lens
@@ -97,13 +97,13 @@ def summary(
     return "\n".join(lines)
 
 
-def _described(name: str) -> Target | CornerBoard:
-    """A board of squares when the file says so, else a target of dots."""
+def _described(name: str) -> Target | BoardOfCorners:
+    """A board of squares or tags when the file says so, else a target of dots."""
     corners = load_corner_board(Path(name)) if Path(name).is_file() else None
     return corners or installed_target(name)
 
 
-def _look(image: Image, target: Target | CornerBoard) -> tuple[Float, Float]:
+def _look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float]:
     """Points (N, 2) px and their covariances (N, 2, 2) in a picture; DetectionError when the target is not in it."""
     if isinstance(target, Target):
         found = detect(image, target)
@@ -111,7 +111,7 @@ def _look(image: Image, target: Target | CornerBoard) -> tuple[Float, Float]:
     return find_corners(image, target), np.tile(SIGMA_px**2 * np.eye(2), (target.count, 1, 1))
 
 
-def _views(images: list[Path], target: Target | CornerBoard, failures: list[str], report: Report) -> Views:
+def _views(images: list[Path], target: Target | BoardOfCorners, failures: list[str], report: Report) -> Views:
     """The pictures that show enough of the target; `failures` grows by a line for each other one."""
     found: list[tuple[Float, Float]] = []
     size: tuple[int, int] | None = None

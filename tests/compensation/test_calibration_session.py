@@ -155,6 +155,7 @@ def test_calibrate_writes_the_camera_its_exports_and_a_report(recorded: Recorded
     }
     assert report.read_text().count("<svg") == 7
     assert "x the detection sigma" in result.stdout
+    assert "orientation: small looks the same after half a turn" in result.stdout
     for lens in (camera.lens, camera.ray_lens):
         pose = find_pose(lens, camera.adjusted_board, recorded.true_px[2], np.tile(1e-5 * np.eye(2), (54, 1, 1)))
         rotation, translation = scene_at(REPORTED_mm, 25.0).pose()

@@ -1,4 +1,4 @@
-"""Checkerboards and ChArUco boards: corners where OpenCV's own drawing has them, and a camera from pictures of them."""
+"""Checkerboards, ChArUco boards, AprilGrids: corners where OpenCV drew them, and a camera from pictures of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from compensation.cli import app
 from foundation.errors import ConfigError
-from markers.corner_board import CornerBoard, find_corners, load_corner_board
+from markers.april_grid import AprilGrid
+from markers.corner_board import BoardOfCorners, CornerBoard, find_corners, load_corner_board
 from markers.errors import DetectionError
 
 SIZE = (1224, 1024)
@@ -26,10 +27,13 @@ CHECKERBOARD = CornerBoard(name="c", kind="checkerboard", columns=10, rows=7, sq
 CHARUCO = CornerBoard(
     name="a", kind="charuco", columns=10, rows=7, square_mm=25, marker_mm=18, dictionary="DICT_5X5_100"
 )
-BOARDS = {"checkerboard": CHECKERBOARD, "charuco": CHARUCO}
+APRILGRID = AprilGrid(name="t", kind="aprilgrid", columns=6, rows=4, tag_mm=32, gap_mm=8, first_id=3)
+BOARDS = {"checkerboard": CHECKERBOARD, "charuco": CHARUCO, "aprilgrid": APRILGRID}
 
 
-def drawn(board: CornerBoard) -> NDArray[np.uint8]:
+def drawn(board: BoardOfCorners) -> NDArray[np.uint8]:
+    if isinstance(board, AprilGrid):
+        return drawn_tags(board)
     size = (board.columns * SIDE_px, board.rows * SIDE_px)
     if board.kind == "charuco":
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
@@ -39,16 +43,34 @@ def drawn(board: CornerBoard) -> NDArray[np.uint8]:
     return (255 * ((row + column) % 2)).astype(np.uint8)
 
 
+def drawn_tags(grid: AprilGrid) -> NDArray[np.uint8]:
+    """As Kalibr prints it, with OpenCV's tags, at 4 px/mm."""
+    tag, gap = int(4 * grid.tag_mm), int(4 * grid.gap_mm)
+    pitch = tag + gap
+    image = np.full((grid.rows * pitch + gap, grid.columns * pitch + gap), 255, np.uint8)
+    for row in range(grid.rows + 1):
+        for column in range(grid.columns + 1):
+            image[row * pitch : row * pitch + gap, column * pitch : column * pitch + gap] = 0
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, grid.dictionary))
+    for number in range(grid.columns * grid.rows):
+        row, column = divmod(number, grid.columns)
+        top, left = gap + (grid.rows - 1 - row) * pitch, gap + column * pitch
+        tag_image = dictionary.generateImageMarker(grid.first_id + number, tag, borderBits=2)
+        image[top : top + tag, left : left + tag] = tag_image
+    return image
+
+
 def pictured(
-    board: CornerBoard, pose: tuple[int, int, int], seed: int
+    board: BoardOfCorners, pose: tuple[int, int, int], seed: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """A picture of the drawn board in a pose 600 mm away, and where its corners are in it."""
     places = board.coordinates_mm()
     turn = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("xyz", pose, degrees=True).as_matrix()
     shift = np.array([0, 0, 600.0]) - turn @ np.array([*places.mean(axis=0), 0])
     plane = MATRIX @ np.column_stack([turn[:, :2], shift])
-    per_px = board.square_mm / SIDE_px
-    from_drawing = np.array([[per_px, 0, per_px / 2], [0, -per_px, -per_px / 2], [0, 0, 1]])
+    per_px = 0.25
+    top = drawn(board).shape[0] * per_px if isinstance(board, AprilGrid) else 0.0
+    from_drawing = np.array([[per_px, 0, per_px / 2], [0, -per_px, top - per_px / 2], [0, 0, 1]])
     wide = cv2.copyMakeBorder(drawn(board), 100, 100, 100, 100, cv2.BORDER_CONSTANT, value=[255])
     moved = from_drawing @ np.array([[1.0, 0, -100], [0, 1, -100], [0, 0, 1]])
     image = cv2.warpPerspective(wide, plane @ moved, SIZE, borderMode=cv2.BORDER_CONSTANT, borderValue=[255])
@@ -79,9 +101,26 @@ def test_covered_corners_of_a_charuco_board_are_nan_and_the_others_keep_their_pl
     assert np.linalg.norm(found - truth, axis=1)[seen].max() < 0.3
 
 
+def test_covered_tags_are_nan_upside_down_too_and_tags_of_other_grids_are_not_taken():
+    image, truth = pictured(APRILGRID, (0, 0, 170), 1)
+    image[:, :400] = 128
+    found = find_corners(image, APRILGRID)
+    seen = np.isfinite(found[:, 0])
+    assert 16 < seen.sum() < APRILGRID.count
+    assert np.linalg.norm(found - truth, axis=1)[seen].max() < 0.3
+    shifted = APRILGRID.model_copy(update={"first_id": 8, "columns": 2, "rows": 1})
+    with pytest.raises(DetectionError):
+        find_corners(image, shifted)
+
+
+def test_a_grid_of_more_tags_than_the_family_has_is_refused():
+    with pytest.raises(ValueError, match="DICT_APRILTAG_16h5 has 30 tags, the grid 36 from 0 on"):
+        AprilGrid(name="g", kind="aprilgrid", columns=6, rows=6, tag_mm=30, gap_mm=9, dictionary="DICT_APRILTAG_16h5")
+
+
 @pytest.mark.parametrize("kind", BOARDS)
 def test_a_wall_has_no_corners(kind: str):
-    with pytest.raises(DetectionError, match=f"the 10 x 7 {kind} . was not found"):
+    with pytest.raises(DetectionError, match=rf"the \d+ x \d {kind} . was not found"):
         find_corners(np.full((600, 800), 128, np.uint8), BOARDS[kind])
 
 
@@ -98,7 +137,7 @@ def test_files_that_say_their_kind_are_boards_of_squares_and_others_are_not(tmp_
     assert load_corner_board(path) is None
 
 
-@pytest.mark.parametrize("kind", ["charuco", pytest.param("checkerboard", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("kind", ["charuco", "aprilgrid", pytest.param("checkerboard", marks=pytest.mark.nightly)])
 def test_the_command_calibrates_from_corners(kind: str, tmp_path: Path):
     board = BOARDS[kind]
     described = tmp_path / "board.yaml"
