@@ -38,6 +38,18 @@ async def cancelled(tasks: Sequence[asyncio.Task[Any]]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
+async def first_of(*waits: Coroutine[Any, Any, object]) -> int:
+    """Until the first of these is over, which has this place among them; the others are cancelled. What it raised is
+    not raised here."""
+    tasks = [asyncio.ensure_future(wait) for wait in waits]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        return next(place for place, task in enumerate(tasks) if task in done)
+    finally:
+        for task in tasks:
+            task.cancel()
+
+
 def cause_of(error: BaseException) -> BaseException:
     """What has really gone wrong: of a group of errors the first, but a lack of memory before all others."""
     if not isinstance(error, BaseExceptionGroup):

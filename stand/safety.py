@@ -14,6 +14,7 @@ from foundation.clock import Clock, seconds_ns
 from foundation.errors import GarbledReply, Unreachable
 from foundation.hub import Hub
 from foundation.items import Event
+from foundation.tasks import first_of
 
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
 _PAUSE_S = 1.0  # between tries
@@ -98,13 +99,8 @@ class _Maker:
 
     async def _paused(self) -> None:
         """Until the next try is due, or demanded."""
-        sleeping = asyncio.ensure_future(self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._pause_s)))
-        demanded = asyncio.ensure_future(self._demand.wait())
-        try:
-            await asyncio.wait((sleeping, demanded), return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            sleeping.cancel()
-            demanded.cancel()
+        due_ns = self._clock.now_ns() + seconds_ns(self._pause_s)
+        await first_of(self._clock.sleep_until(due_ns), self._demand.wait())
 
 
 class Safety:
@@ -116,6 +112,7 @@ class Safety:
 
     def __init__(self, revoke: Callable[[], None], hub: Hub, clock: Clock) -> None:
         self._makers: tuple[_Maker, ...] = ()
+        self._until_cleared: dict[Harmful, _Maker] = {}
         self._revoke = revoke
         self._hub = hub
         self._clock = clock
@@ -147,6 +144,12 @@ class Safety:
         confirm."""
         self._makers = (*self._makers, _Maker(actuator, pause_s, self._clock, self._on_change))
 
+    def take_until_cleared(self, actuator: Harmful) -> None:
+        """As `take`, until an operator clears the hold."""
+        if actuator not in self._until_cleared:
+            self.take(actuator)
+            self._until_cleared[actuator] = self._makers[-1]
+
     def give_up(self) -> bool:
         """An operator does not want to wait for the confirmation any more: whether that ends the wait, as it does from
         a minute after the demand on."""
@@ -166,6 +169,8 @@ class Safety:
         from now on."""
         for maker in self._makers:
             maker.forgive()
+        self._makers = tuple(maker for maker in self._makers if maker not in self._until_cleared.values())
+        self._until_cleared.clear()
         self._on_change()
 
     async def tried(self) -> None:

@@ -51,15 +51,7 @@ def laboratory_of(
         "chamber": _chamber_of(config, address_of),
         "relays_unit": config.relays.unit if config.relays is not None else None,
         "relay_channels": dict(config.relays.channels) if config.relays is not None else {},
-        "inputs_unit": None if config.inputs is None else config.inputs.unit,
-        "input_channels": {name: each.channel for name, each in config.inputs.contacts.items()}
-        if config.inputs
-        else {},
-        "inputs_closed": [
-            each.channel
-            for each in (config.inputs.contacts.values() if config.inputs else ())
-            if each.fault_when == "open"
-        ],
+        **_inputs_of(config),
         "thermometers_unit": config.thermometer_module.unit,
         "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.items()},
         "axes": {
@@ -72,6 +64,16 @@ def laboratory_of(
             for name, camera in config.cameras.items()
         },
         "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
+    }
+
+
+def _inputs_of(config: StandConfig) -> dict[str, object]:
+    """The fake of the digital inputs; those that are well while closed begin so."""
+    contacts = {} if config.inputs is None else config.inputs.contacts
+    return {
+        "inputs_unit": None if config.inputs is None else config.inputs.unit,
+        "input_channels": {name: each.channel for name, each in contacts.items()},
+        "inputs_closed": [each.channel for each in contacts.values() if each.fault_when == "open"],
     }
 
 

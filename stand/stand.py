@@ -68,9 +68,10 @@ class Stand:
             self.safety.take(actuator)
 
     def cut_camera(self) -> None:
-        """The camera itself is too warm: its supply goes off, too, whenever the stand is made safe from now on."""
+        """The camera itself is too warm: its supply goes off, too, whenever the stand is made safe, until an operator
+        clears the hold."""
         self.imaging.supply.is_on = False
-        self.safety.take(self.imaging.supply)
+        self.safety.take_until_cleared(self.imaging.supply)
         self.safety.demand()
 
     async def prompt(self, text: str) -> None:

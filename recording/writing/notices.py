@@ -38,6 +38,13 @@ class Notice:
     data: Mapping[str, object] = field(default_factory=dict[str, object])
 
 
+def telemetry_notice(failure: OSError | None) -> Notice:
+    """Whether the disk takes telemetry, and why not."""
+    if failure is None:
+        return Notice("info", "telemetry_saved_again", "the disk takes telemetry again")
+    return Notice("error", "telemetry_not_saved", f"telemetry is kept in memory: {failure}")
+
+
 class SpaceWatch:
     """Decides whether frames may be written, and reports each change once; `check` is called from several threads.
 

@@ -33,7 +33,7 @@ from recording.format.restarts import restarted_step
 from recording.writing.disk import Disk
 from recording.writing.forms import SessionForm
 from recording.writing.homes import Beside, Homes, Kept
-from recording.writing.notices import DroppedReadings, Losses, Notice
+from recording.writing.notices import DroppedReadings, Losses, Notice, telemetry_notice
 from recording.writing.settings import USUAL, RecordingSettings, SessionInfo
 from recording.writing.store import RemoteStore, Store
 from recording.writing.waiting import Waiting
@@ -377,7 +377,7 @@ class Recorder:
         self._tell_progress()
         if (failure is not None) != self._telemetry_failing:
             self._telemetry_failing = failure is not None
-            self._notices.append(_telemetry_notice(failure))
+            self._notices.append(telemetry_notice(failure))
         return failure
 
     def _tell_progress(self) -> None:
@@ -393,9 +393,3 @@ class Recorder:
         while self._notices:
             notice = self._notices.popleft()
             self._hub.publish(Event(self._clock.now_ns(), notice.level, notice.kind, notice.text, notice.data))
-
-
-def _telemetry_notice(failure: OSError | None) -> Notice:
-    if failure is None:
-        return Notice("info", "telemetry_saved_again", "the disk takes telemetry again")
-    return Notice("error", "telemetry_not_saved", f"telemetry is kept in memory: {failure}")

@@ -202,8 +202,7 @@ def stop(
     with one_line_errors():
         server = reached(directory, config, url, token_file, anywhere=True)
         answer = server.order("stop")
-        text = "stopping; the stand is made safe first, and the run says when it is"
-        _say(server, answer, text, as_json=as_json)
+        _say(server, answer, str(answer["text"]), as_json=as_json)
 
 
 def _say(server: Server, answer: Mapping[str, object], text: str, *, as_json: bool) -> None:

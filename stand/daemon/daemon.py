@@ -27,7 +27,7 @@ from stand.daemon.by_hand import ByHand
 from stand.daemon.counters import Counters
 from stand.daemon.house_record import HouseRecord
 from stand.daemon.kept import Kept, KeptFile, Latch
-from stand.daemon.orders import Orders, Stopped
+from stand.daemon.orders import Orders
 from stand.fault import Fault
 from stand.queueing.queue_file import Entry, working
 from stand.queueing.queue_work import Notes, drain
@@ -229,11 +229,6 @@ class Daemon:
             if self._assembly.stand.chamber.permits.granted:
                 await self._assembly.stand.chamber.stop()
             return await self.orders.run_one(entry, notes, begun, self._say)
-        except Stopped as error:
-            waiting = [each for each in self.orders.queued.entries if each.is_open]
-            if waiting:
-                raise StandTripped(f"{error}; `stand clear` lets the next of the queue begin") from error
-            raise
         except StandError as error:
             if not has_begun and not isinstance(error, Interrupted):
                 self._tell("error", RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")

@@ -28,7 +28,7 @@ from stand.queueing import queue
 from stand.queueing.queue import Asked, order_of
 from stand.queueing.queue_file import Entry, Queue, State
 from stand.queueing.queue_run import Watch, conclude, interruption_of, is_complete
-from stand.queueing.queue_work import Notes, queue_lane
+from stand.queueing.queue_work import Notes, Stopped, queue_lane
 from stand.running.guest import Job
 from stand.running.house import House
 from stand.running.order import Order, check_plan, parse_order
@@ -38,10 +38,6 @@ from stand.running.stop import Interrupted, Stop
 from stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended
-
-
-class Stopped(StandError):
-    """The operator has stopped the run; the queue continues with the next one that is asked for."""
 
 
 class Orders:
@@ -117,7 +113,8 @@ class Orders:
 
     async def run_one(self, entry: Entry, notes: Notes, begun: Callable[[], None], tell: Callable[[str], None]) -> Path:
         """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
-        without the house's. Raises as a run does, Stopped when an operator has stopped it and others follow."""
+        without the house's. Raises as a run does, Stopped when an operator has stopped it: who presses stop does not
+        want the next one to begin."""
         session = self.directory / entry.session if entry.session else None
         if session is not None and await asyncio.to_thread(is_complete, session):
             return session  # killed between its end and the note of it
@@ -143,7 +140,9 @@ class Orders:
         except Interrupted as error:
             if self.leaving:
                 raise
-            raise Stopped(f"{error}; it may be resumed") from error
+            follows = any(each.is_open for each in self.queued.entries)
+            clear = "; `stand clear` lets the next of the queue begin" if follows else ""
+            raise Stopped(f"{error}; it may be resumed{clear}", halts=follows) from error
         finally:
             self.stop = None
             hub.unsubscribe(watch)

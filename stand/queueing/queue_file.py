@@ -28,12 +28,14 @@ _WORKER_NAME = ".queue.worker"
 
 
 class State(StrEnum):
-    """Where a queued run is. Waiting and interrupted ones are still to be done, the interrupted one first."""
+    """Where a queued run is. Waiting and interrupted ones are still to be done, the interrupted one first. An operator
+    who stops a run of a daemon ends it: it is resumed only when asked for."""
 
     WAITING = "waiting"
     RUNNING = "running"
     DONE = "done"
     FAILED = "failed"
+    STOPPED = "stopped"
     INTERRUPTED = "interrupted"
 
 
@@ -48,7 +50,7 @@ class Entry(Document):
     """One run. The texts are those of the files when it was added: a later edit does not change what is queued.
 
     config: the file its text is from, for messages. Instants are ns since the epoch on the host's clock. session: the
-    name of its folder in the recording directory, "" before it has one. reason: why it failed or was interrupted.
+    name of its folder in the recording directory, "" before it has one. reason: why it did not come to its end.
     fruitless_starts: how often in a row it was begun or resumed without finishing one more step. key, request: the
     word of who asked for it, so that asking again adds nothing, and what was asked. added_by: who that was. attended:
     somebody is there to do what the plan prompts for.

@@ -39,9 +39,10 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
 
     A run that fails is marked and the next one begun, unless the stand tripped, `run_one` raises Halt, a device did not
     answer before the run had begun (the next would fail likewise), or the failure is a mistake of the program: then the
-    queue is halted and the error raised. What an operator stops, or finds the stand in use by another run, is
-    interrupted, ends the work, and is resumed by the next one. A run whose daemon was killed MOST_FRUITLESS_STARTS
-    times in a row before one more step was done is marked as failed, or it would keep all others from their turn.
+    queue is halted and the error raised. A run that raises Interrupted, or finds the stand in use by another run, ends
+    the work, and is resumed by the next one; one that raises Stopped has ended. A run whose daemon was killed
+    MOST_FRUITLESS_STARTS times in a row before one more step was done is marked as failed, or it would keep all others
+    from their turn.
     """
     lane = queue_lane()
     try:
@@ -64,6 +65,14 @@ async def drain(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[st
             await run.set_aside()
         else:
             await run.perform(run_one)
+
+
+class Stopped(StandError):
+    """An operator has stopped the run, which has ended by that. halts: whether the queue waits for an operator, too."""
+
+    def __init__(self, text: str, *, halts: bool) -> None:
+        super().__init__(text)
+        self.halts = halts
 
 
 class Halt(StandError):
@@ -96,6 +105,10 @@ class _Run:
         except (Interrupted, InUse, asyncio.CancelledError) as error:
             await self._end(State.INTERRUPTED, str(error) or "stopped by the operator")
             raise
+        except Stopped as error:
+            await self._end(State.STOPPED, str(error), halt=error.halts)
+            if error.halts:
+                raise
         except (StandTripped, Halt) as error:
             await self._end(State.FAILED, str(error), halt=True)
             raise

@@ -37,7 +37,7 @@ from foundation.clock import NS_PER_S, Clock
 from foundation.errors import ConfigError, DeviceError
 from foundation.hub import Hub
 from foundation.items import StepMark, StepState
-from foundation.tasks import cancelled
+from foundation.tasks import cancelled, first_of
 from recording.format.restarts import restarted
 from recording.reading.contents import PLAN_CHANGED
 from stand.interlock import Interlocked
@@ -224,7 +224,7 @@ class Executor:
         stand = self._stand
         match action:
             case Sleep(until_ns):
-                await self._first_of(self._clock.sleep_until(until_ns), self._changed.wait())
+                await first_of(self._clock.sleep_until(until_ns), self._changed.wait())
             case Wait():
                 await stand.gate.passed()
             case Restore(set_up):
@@ -339,7 +339,7 @@ class Executor:
                 return
             begin_ns, earned_ns = self._clock.now_ns(), duration_of(soak) - owed_ns
             slept = self._clock.sleep_until(begin_ns + min(owed_ns, _JOURNAL_NS))
-            await self._first_of(slept, self._stand.gate.closed(), self._changed.wait())
+            await first_of(slept, self._stand.gate.closed(), self._changed.wait())
             soak = self._state.step(step_id) or soak  # it may be longer now
             is_settled = False
             if isinstance(soak.step, SoakUntilSettled) and not self._is_kept() and self._state.owed_ns(soak):
@@ -366,15 +366,6 @@ class Executor:
                 task.result()
         finally:
             await cancelled([task])
-
-    async def _first_of(self, *waits: Coroutine[None, None, object]) -> None:
-        """Until the first of these is over."""
-        tasks = [asyncio.ensure_future(wait) for wait in waits]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
 
     async def _restore(self, set_up: SetUp) -> None:
         """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""

@@ -6,12 +6,11 @@ cold, and no equilibrium). And in virtual time, where no operator is there, a ho
 
 from __future__ import annotations
 
-import asyncio
-
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, StandError
 from foundation.hub import Hub
 from foundation.items import Event
+from foundation.tasks import first_of
 from stand.gate import STOPPING, Gate
 from stand.stand import Stand
 
@@ -51,14 +50,7 @@ async def _shut(stand: Stand, hub: Hub, clock: Clock) -> bool:
 
 async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
     """Whether the gate opens before so long is over."""
-    sleeping = asyncio.ensure_future(clock.sleep_until(clock.now_ns() + seconds_ns(duration_s)))
-    opening = asyncio.ensure_future(gate.passed())
-    try:
-        await asyncio.wait([sleeping, opening], return_when=asyncio.FIRST_COMPLETED)
-        return opening.done()
-    finally:
-        sleeping.cancel()
-        opening.cancel()
+    return await first_of(gate.passed(), clock.sleep_until(clock.now_ns() + seconds_ns(duration_s))) == 0
 
 
 async def end_endless_holds(gate: Gate, clock: Clock, limit_h: float) -> None:

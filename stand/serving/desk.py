@@ -150,11 +150,12 @@ class PlanStep(Value):
 
 class QueuedRun(Value):
     """A run of the queue. waiting and interrupted ones are still to be done. expected_s: how long it will take, None
-    when unknown. session: the name of its folder, "" before it has one. reason: why it failed or was interrupted."""
+    when unknown. session: the name of its folder, "" before it has one. reason: why it did not come to its
+    end."""
 
     id: int
     recipe: str
-    state: Literal["waiting", "running", "done", "failed", "interrupted"]
+    state: Literal["waiting", "running", "done", "failed", "stopped", "interrupted"]
     added_ns: int
     began_ns: int | None = None
     ended_ns: int | None = None

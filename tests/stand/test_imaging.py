@@ -126,3 +126,12 @@ async def test_a_supply_that_was_cut_goes_off_with_every_demand_and_is_confirmed
         assert OFF in here.calls
         with pytest.raises(Interlocked):
             await here.stand.imaging.supply.switch_on()
+        here.stand.cut_camera()
+        assert await here.stand.safety.confirmed(60)
+        here.stand.gate.clear(INTERLOCK)
+        here.stand.safety.forgive()
+        await here.stand.imaging.supply.switch_on()
+        here.calls.clear()
+        here.stand.safety.demand()
+        assert await here.stand.safety.confirmed(60)
+        assert OFF not in here.calls, "an operator has looked: it is on again for good"

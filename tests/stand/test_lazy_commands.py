@@ -29,7 +29,7 @@ def test_each_command_of_the_list_is_there(name: str, command: str):
 def test_the_list_says_what_each_does():
     shown = CliRunner().invoke(stand, ["--help"])
     assert "session   Recorded sessions: list, look at, verify" in shown.output
-    assert len(EACH) == 33
+    assert {("stand", "run"), ("stand", "devices"), ("compensate", "fit"), ("compensate", "datasheet")} <= set(EACH)
 
 
 def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):

@@ -4,20 +4,28 @@ import asyncio
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
+import pytest_asyncio
 
 from foundation.clock import NS_PER_S
 from stand.gate import OPERATOR
 from tests.stand.browser import DESKTOP, PHONE, a_page, browser, needs_chromium
 from tests.stand.page_desk import a_night, frame_of, free_port, target_image
 
-pytestmark = needs_chromium
+pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
 VIEWS = ("now", "plan", "queue", "camera", "sessions", "devices")
 
 
-@pytest.fixture
-async def night(tmp_path):
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def chromium():
+    """One for all: each page has a context of its own, and starting a browser takes longer than most tests."""
+    async with browser() as chromium:
+        yield chromium
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def night(tmp_path, chromium):
     port = free_port()
-    async with a_night(tmp_path / "sessions", port) as desk, browser() as chromium:
+    async with a_night(tmp_path / "sessions", port) as desk:
         desk.port, desk.chromium = port, chromium
         yield desk
 
@@ -277,22 +285,21 @@ async def test_markers_and_drift_of_the_last_frame_are_shown(night):
         assert "54 markers found; mean drift" in label
 
 
-async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path):
+async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path, chromium):
     port = free_port()
-    async with browser() as chromium:
-        async with a_night(tmp_path / "sessions", port) as first:
-            manager = a_page(chromium, port)
-            page = await manager.__aenter__()
-            await page.get_by_text("Running", exact=True).wait_for()
-            first.tell("before the restart")
-        await page.locator("#phase", has_text="No connection").wait_for()
-        await page.get_by_text("What is shown is of").wait_for()
-        async with a_night(tmp_path / "sessions", port) as second:
-            await page.locator("#phase", has_text="Running").wait_for()
-            await page.get_by_text("No connection to the stand").wait_for(state="detached")
-            second.trip()
-            await page.locator("#phase", has_text="Tripped").wait_for()
-            await manager.__aexit__(None, None, None)
+    async with a_night(tmp_path / "sessions", port) as first:
+        manager = a_page(chromium, port)
+        page = await manager.__aenter__()
+        await page.get_by_text("Running", exact=True).wait_for()
+        first.tell("before the restart")
+    await page.locator("#phase", has_text="No connection").wait_for()
+    await page.get_by_text("What is shown is of").wait_for()
+    async with a_night(tmp_path / "sessions", port) as second:
+        await page.locator("#phase", has_text="Running").wait_for()
+        await page.get_by_text("No connection to the stand").wait_for(state="detached")
+        second.trip()
+        await page.locator("#phase", has_text="Tripped").wait_for()
+        await manager.__aexit__(None, None, None)
 
 
 async def test_a_phone_is_wide_enough_for_every_view(night):

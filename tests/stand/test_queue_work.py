@@ -12,7 +12,7 @@ from foundation.clock import FollowedClock
 from foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Unreachable
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry, working
-from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, work
+from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped, work
 from stand.running.order import load_order
 from stand.running.stop import Interrupted
 
@@ -105,6 +105,19 @@ async def test_a_trip_halts_the_queue_until_an_operator_clears_it(tmp_path: Path
     queue.clear(tmp_path)
     await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["failed", "done"]
+
+
+async def test_a_run_that_an_operator_ends_is_stopped_and_not_failed(tmp_path: Path):
+    """The queue waits for an operator only where the run says so."""
+    runs = Runs(tmp_path, Stopped("stopped by the operator", halts=False), Stopped("again", halts=True), None)
+    with pytest.raises(Stopped, match="again"):
+        await runs.work()
+    assert [entry[0] for entry in runs.entries()] == ["stopped", "stopped", "waiting"]
+    assert runs.entries()[0][2] == "stopped by the operator"
+    assert queue.queued(tmp_path).halted == "run 2: again"
+    queue.clear(tmp_path)
+    await runs.work()
+    assert [entry[0] for entry in runs.entries()] == ["stopped", "stopped", "done"]
 
 
 async def test_a_stand_that_cannot_be_opened_does_not_use_up_the_queue(tmp_path: Path):

@@ -62,6 +62,7 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
         data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
         data["cameras"]["camera"] |= {"address": camera_address(), **frame}
         data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
+        data["recording"]["alert_below_percent"] = 0  # of this machine's disk
         change(data, sections)
         return yaml.safe_dump(data)
 

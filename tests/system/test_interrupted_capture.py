@@ -73,8 +73,9 @@ class Interrupter:
     def of(self, kind: str) -> list[Event]:
         return [event for event in self.events if event.kind == kind]
 
-    def times_s(self, kind: str, text: str = "") -> list[float]:
-        return [event.time_ns / NS_PER_S for event in self.events if event.kind == kind and text in event.text]
+    def times_s(self, kind: str, reason: str | None = None) -> list[float]:
+        """When events of a kind came; those of one reason, or all."""
+        return [event.time_ns / NS_PER_S for event in self.of(kind) if reason in (None, event.data.get("reason"))]
 
 
 def operator(out: Path, do: str) -> Action:

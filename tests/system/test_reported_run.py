@@ -181,6 +181,7 @@ def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_
         "Before and after compensation",
         "Model",
         "Recorded data",
+        "Measured with",
     ):
         assert f">{title}<" in report
     assert packaged("recipes", "overnight").read_text() == session.attachments["recipe.yaml"]

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from recording.reading.session import Session
+from stand.config.stand_config import packaged
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_run import digests
 
@@ -32,7 +33,12 @@ def ended(run: subprocess.Popen[str]) -> Path:
 def test_two_virtual_nights_side_by_side_of_the_installed_configuration_give_the_same_session(tmp_path: Path):
     recipe = tmp_path / "short.yaml"
     recipe.write_text(SHORT_RECIPE)
-    runs = [begun(tmp_path, name, "run", str(recipe), "--seed", "7") for name in ("first", "second")]
+    config = tmp_path / "config.yaml"  # how full this machine's disk is adds no event
+    text = packaged("", "simulated").read_text()
+    config.write_text(text.replace("{directory: sessions}", "{directory: sessions, alert_below_percent: 0}"))
+    assert "alert_below_percent: 0" in config.read_text()
+    arguments = ("run", str(recipe), "--seed", "7", "--config", str(config))
+    runs = [begun(tmp_path, name, *arguments) for name in ("first", "second")]
     first, second = (digests(ended(run)) for run in runs)
     assert first == second
     assert {name.split("/")[0] for name in first} >= {"frames", "telemetry", "journal.jsonl"}

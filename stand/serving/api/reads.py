@@ -101,6 +101,13 @@ def reads(bridge: Bridge, stream: Stream, access: Access, url: str) -> APIRouter
         text = metrics(bridge.snapshot, stream.drops, stream.viewers)
         return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
+    _add_logins(router, access, url)
+    return router
+
+
+def _add_logins(router: APIRouter, access: Access, url: str) -> None:
+    """The routes by which a browser elsewhere is let in."""
+
     @router.get(LOGIN_PATH, response_class=Response, include_in_schema=False)
     async def login(once: str = "") -> Response:
         """The page for whoever has a one-time address of `stand token login`: a cookie instead of it."""
@@ -117,8 +124,6 @@ def reads(bridge: Bridge, stream: Stream, access: Access, url: str) -> APIRouter
         """A one-time path that opens the page on another machine; for the Unix socket and holders of a token."""
         path = f"{LOGIN_PATH}?once={access.login_code(request.state.who.name)}"
         return _json(json_of({"path": path, "url": f"{url}{path}" if url else ""}))
-
-    return router
 
 
 async def _follow(socket: WebSocket, stream: Stream, after: int | None) -> None:

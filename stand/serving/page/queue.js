@@ -3,7 +3,8 @@ import { command, get, tell } from "./api.js";
 import { ask, day_clock, duration, fill, h, seconds } from "./dom.js";
 import { RecipeForm } from "./recipe_form.js";
 
-const WORD = { waiting: "waiting", running: "running", done: "done", failed: "failed", interrupted: "interrupted" };
+const ENDED = ["done", "failed", "stopped"];
+const WORD = { waiting: "waiting", running: "running", done: "done", failed: "failed", stopped: "stopped", interrupted: "interrupted" };
 const MOST_ENDED = 10;
 
 export class Queue {
@@ -87,10 +88,10 @@ export class Queue {
     if (this.list.querySelector(".ask")) return;
     this.shown = key;
     this.halted.textContent = state.queue_halted ? `The queue is halted: ${state.queue_halted}` : "";
-    const open = runs.filter((run) => run.state !== "done" && run.state !== "failed");
+    const open = runs.filter((run) => !ENDED.includes(run.state));
     const movable = open.filter((run) => run.state !== "running");
     fill(this.list, open.length ? open.map((run) => this.row(run, movable)) : h("li", {}, h("span"), h("span", { class: "quiet" }, "nothing is queued")));
-    const ended = runs.filter((run) => run.state === "done" || run.state === "failed").slice(-MOST_ENDED).reverse();
+    const ended = runs.filter((run) => ENDED.includes(run.state)).slice(-MOST_ENDED).reverse();
     fill(this.ended, ended.length ? ended.map((run) => this.row(run, [])) : h("li", {}, h("span"), h("span", { class: "quiet" }, "none yet")));
   }
 
@@ -107,7 +108,7 @@ export class Queue {
       button("Remove", "Remove", () => ask(row, `Take run ${run.id} (${run.recipe}) out of the queue?`, "Remove it", () => command(this.answer, "remove", "DELETE", `/queue/${run.id}`)));
       this.drag(row, run, at);
     }
-    if (run.state === "interrupted" && run.session) button("Resume", "Resume", () => command(this.answer, "resume", "POST", `/sessions/${encodeURIComponent(run.session)}/resume`));
+    if (["interrupted", "stopped"].includes(run.state) && run.session) button("Resume", "Resume", () => command(this.answer, "resume", "POST", `/sessions/${encodeURIComponent(run.session)}/resume`));
     return row;
   }
 

@@ -1,0 +1,80 @@
+"""`stand devices`: what is connected to this computer, and what to write into a stand's file for it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from drivers.wires.discovery import FoundCamera, SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.usage import OneLineUsage, one_line
+from stand.commands.session_args import JsonOption
+from stand.config.stand_config import load_config, packaged
+
+app = typer.Typer(cls=OneLineUsage, add_completion=False)
+
+
+@app.command()
+def devices(
+    config: Annotated[
+        str | None, typer.Option("--config", help="A stand's file: its cameras are asked at their addresses.")
+    ] = None,
+    ask: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ADDRESS", help="Ask for a camera there, too; a network's broadcast address asks all of it."
+        ),
+    ] = None,
+    wait_s: Annotated[float, typer.Option(min=0.1, max=60.0, help="How long cameras have for their answer.")] = 1.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Serial ports, USB devices and GigE cameras, with the addresses that a stand's file takes. Nothing is opened or
+    changed, and no network is asked that was not named.
+
+    Example: stand devices --ask 169.254.255.255
+    """
+    with one_line_errors():
+        addresses = list(ask or ())
+        if config is not None:
+            stand = load_config(packaged("", config))
+            addresses += [str(camera.address) for camera in stand.cameras.values() if hasattr(camera, "address")]
+        try:
+            cameras = asyncio.run(cameras_at(addresses, wait_s)) if addresses else ()
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"cameras cannot be asked at {', '.join(addresses)}: {error}") from error
+        ports, usb = serial_ports(), usb_devices()
+        if as_json:
+            found = {"serial": ports, "usb": usb, "cameras": cameras}
+            typer.echo(json.dumps({kind: [asdict(each) for each in some] for kind, some in found.items()}, indent=2))
+            return
+        for line in _lines(ports, usb, cameras, addresses):
+            typer.echo(one_line(line))
+
+
+def _lines(
+    ports: tuple[SerialPort, ...], usb: tuple[UsbDevice, ...], cameras: tuple[FoundCamera, ...], asked: list[str]
+) -> list[str]:
+    lines = ["serial ports" + ("" if ports else ": none")]
+    lines += [f"  serial:{each.address}  {each.what}{_numbered(each.serial)}" for each in ports]
+    lines.append("USB devices" + ("" if usb else ": none"))
+    lines += [f"  {each.vendor:04x}:{each.product:04x}  {each.what}{_numbered(each.serial)}" for each in usb]
+    if not asked:
+        return [*lines, "cameras: not asked for; `--ask ADDRESS` asks one, or a whole network at its broadcast address"]
+    lines.append("cameras" + ("" if cameras else f": none has answered at {', '.join(asked)}"))
+    lines += [
+        f"  {each.address}  {each.make} {each.model}, firmware {each.firmware}{_numbered(each.serial)}"
+        for each in cameras
+    ]
+    silent = [address for address in asked if address not in {each.address for each in cameras}]
+    if cameras and silent:
+        lines.append(f"  no answer at {', '.join(silent)} (a broadcast address never answers itself)")
+    return lines
+
+
+def _numbered(serial: str) -> str:
+    return f', serial number "{serial}"' if serial else ""
