@@ -45,7 +45,6 @@ def observations_of(
     """
     centres, camera = _seen(centres_px, camera_degC)
     frames, count = centres.shape[:2]
-    covariance = np.eye(2) * sigma_px**2 if covariance_px2 is None else np.array(covariance_px2, np.float64)
     instants, chamber, roles = _columns(camera, time_ns, chamber_degC, role, reference_degC)
     missing, size = np.isnan(centres).any(axis=2) | np.isnan(camera)[:, None], image_size or _size_of(centres)
     history = None if air is None else _history(air, instants, camera)
@@ -63,11 +62,16 @@ def observations_of(
         camera_degC=camera,
         air_degC=_air_at(history, instants),
         centres_px=np.where(missing[..., None], np.nan, centres),
-        covariance_px2=np.where(missing[..., None, None], np.nan, covariance),
+        covariance_px2=np.where(missing[..., None, None], np.nan, _covariance(covariance_px2, sigma_px)),
         flags=np.zeros((frames, count), np.uint8),
         reasons=tuple(map(_reason, camera.tolist(), np.all(missing, axis=1).tolist())),
         histories=() if history is None else (history,),
     )
+
+
+def _covariance(covariance_px2: ArrayLike | None, sigma_px: float) -> Float:
+    """What is given, else that of coordinates with this uncertainty each."""
+    return np.eye(2) * sigma_px**2 if covariance_px2 is None else np.array(covariance_px2, np.float64)
 
 
 def _seen(centres_px: ArrayLike, camera_degC: ArrayLike) -> tuple[Float, Float]:

@@ -4,6 +4,7 @@
     drift.advance(dt_s, ambient_degC, power_on, camera_degC)   # every few seconds, from switching on
     reference_px = drift.correct(points_px)                    # (N, 2), x to the right, y down, px
     drift.flags(points_px)                                     # (N,), 0 inside the calibrated range
+    image = cv2.remap(image, *drift.maps(), cv2.INTER_LANCZOS4)   # for programs that want pixels
 
 Integer pixel coordinates are pixel centres. A model of the form `paper` uses the camera's temperature only; one of the
 form `thermal` remembers the air, the supply and the camera, and must be fed for about three of its longest time
@@ -26,11 +27,15 @@ RATE_TAU_S = 600.0
 """The ambient's rate of change is that of its 10 min lag."""
 SETTLED_TAUS = 3.0
 """After so many time constants a state that began with a guess has forgotten it (5 % are left)."""
-_COLD_K = 3.0
+COLD_K = 3.0
 """A camera this close to the air around it has been off for long: nothing of it is warm."""
-_UNPOWERED_TAU_S = 900.0
+UNPOWERED_TAU_S = 900.0
 """An unpowered camera reports no temperature; its excess over the air is assumed to decay so until it does."""
-_SPAN_K, _MARGIN, _HULL_MARGIN_PX, _SWITCHED_ON_S, _MORE_LEVERAGE = 20.0, 0.02, 1.0, 1.0, 3.0
+SPAN_K, HULL_MARGIN_PX = 20.0, 1.0
+LATTICE_PX, ROUNDS = 16, 4
+"""Maps are worked out every 16 px; the shift changes by some 1e-4 px per px, and each round of its inverse gains four
+digits."""
+_MARGIN, _SWITCHED_ON_S, _MORE_LEVERAGE = 0.02, 1.0, 3.0
 
 
 class ThermalState:
@@ -56,14 +61,16 @@ class ThermalState:
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them
-        powered; at their end the camera has this temperature (NaN: unknown). An ambient of NaN is a gap."""
-        if math.isnan(ambient_degC) or math.isnan(power_on):
+        powered; at their end the camera has this temperature (NaN: unknown). An unknown ambient is a gap, and so is a
+        time or a share that cannot be."""
+        camera_degC = camera_degC if is_temperature(camera_degC) else math.nan
+        if not (0 <= dt_s < math.inf and is_temperature(ambient_degC) and 0 <= power_on <= 1):
             self.begun = False
             return
         if not self.begun:
             self._begin(ambient_degC, power_on, camera_degC)
         before_degC = self.camera_degC
-        excess_K = (before_degC - self.air_degC) * math.exp(-dt_s / _UNPOWERED_TAU_S)
+        excess_K = (before_degC - self.air_degC) * math.exp(-dt_s / UNPOWERED_TAU_S)
         self.air_degC = ambient_degC
         self.camera_degC = ambient_degC + excess_K if math.isnan(camera_degC) else camera_degC
         # First-order followers of a constant input, exactly: z + (s - z)(1 - exp(-dt/tau)); and Prandtl-Ishlinskii
@@ -83,7 +90,7 @@ class ThermalState:
 
     def _begin(self, ambient_degC, power_on, camera_degC):
         excess_K = 0.0 if math.isnan(camera_degC) else camera_degC - ambient_degC
-        cold = abs(excess_K) < _COLD_K and not math.isnan(camera_degC)
+        cold = abs(excess_K) < COLD_K and not math.isnan(camera_degC)
         warmed = 0.0 if cold else min(max(excess_K / self._self_heating_K, 0.0), 1.0)
         self.begun = True
         self.settled_s = math.inf if cold else 0.0
@@ -117,6 +124,16 @@ class Drift:
             return cls(json.load(file))
 
     @property
+    def camera_serial(self):
+        """Whose drift it is."""
+        return self._model["camera_serial"]
+
+    @property
+    def image_size_px(self):
+        """(width, height)."""
+        return tuple(self._model["image_size_px"])
+
+    @property
     def memory_s(self):
         """How long it must have been fed to be right, s; 0 for a form without memory."""
         longest_s = SETTLED_TAUS * max(self._model.get("taus_s", []), default=0.0)
@@ -125,7 +142,8 @@ class Drift:
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """As ThermalState.advance."""
         self._state.advance(dt_s, ambient_degC, power_on, camera_degC)
-        self._camera_degC = self._state.camera_degC if self._state.begun else camera_degC
+        told = camera_degC if is_temperature(camera_degC) else math.nan
+        self._camera_degC = self._state.camera_degC if self._state.begun else told
 
     def shift(self, points_px):
         """Displacement (N, 2), px, of points (N, 2) to where they would be at the reference; NaN before `advance`."""
@@ -141,6 +159,37 @@ class Drift:
         """Where the points (N, 2), px, would be at the reference."""
         return np.asarray(points_px, float) + self.shift(points_px)
 
+    def intrinsics(self, k):
+        """The camera matrix (3, 3) of this moment, of one that holds at the reference: what the drift makes of it at
+        its principal point, to first order. [1, 0] is a turn about the optical axis. NaN where the state is unknown."""
+        k = np.asarray(k, float)
+        centre, step_px = k[:2, 2], 50.0
+        places = centre + step_px * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+        offset = source_offset(self.shift, places)
+        grown = np.eye(3)
+        grown[:2, 0] += (offset[1] - offset[2]) / (2 * step_px)
+        grown[:2, 1] += (offset[3] - offset[4]) / (2 * step_px)
+        grown[:2, 2] = centre + offset[0] - grown[:2, :2] @ centre
+        return grown @ k
+
+    def lattice(self):
+        """Where to read in the measured image, less the place itself: offsets (M, N, 2), px, at every 16th pixel of the
+        corrected image in both directions, the last ones beyond it."""
+        width, height = self._model["image_size_px"]
+        at_x, at_y = (np.arange(0.0, size + LATTICE_PX, LATTICE_PX) for size in (width, height))
+        places = np.stack(np.meshgrid(at_x, at_y), axis=-1)
+        return source_offset(self.shift, places.reshape(-1, 2)).reshape(places.shape)
+
+    def maps(self):
+        """Two float32 (height, width) for cv2.remap: where to read in the measured image for each pixel of the
+        corrected one. NaN where the state is unknown: look at `flags`, and do not remap with it."""
+        width, height = self._model["image_size_px"]
+        lattice = self.lattice()
+        offset = _between(_between(lattice, height, 0), width, 1)
+        at_x = offset[:, :, 0] + np.arange(width)
+        at_y = offset[:, :, 1] + np.arange(height)[:, None]
+        return at_x.astype(np.float32), at_y.astype(np.float32)
+
     def flags(self, points_px):
         """(N,) int: why each correction is an extrapolation, 0 when it is not."""
         points_px = np.asarray(points_px, float)
@@ -148,7 +197,7 @@ class Drift:
         along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
         offset = points_px[:, None] - self._hull_px
         distance_px = along[:, 0] * offset[:, :, 1] - along[:, 1] * offset[:, :, 0]
-        outside = ~(distance_px >= -_HULL_MARGIN_PX).all(axis=1)
+        outside = ~(distance_px >= -HULL_MARGIN_PX).all(axis=1)
         return np.where(outside, PLACE, 0) | self._state_flags()
 
     def _polynomial(self, points_px):
@@ -165,7 +214,7 @@ class Drift:
         """The terms of the thermal state."""
         camera_degC, air_degC = self._model["reference_degC"], self._model["reference_ambient_degC"]
         taus_s, radii_K = self._model["taus_s"], self._model["plays_K"]
-        state, own = self._state, (self._state.camera_degC - camera_degC) / _SPAN_K
+        state, own = self._state, (self._state.camera_degC - camera_degC) / SPAN_K
         values = []
         for kind, parameter in self._model["terms"]:
             at = 1 + taus_s.index(parameter) if parameter in taus_s else 0
@@ -174,11 +223,11 @@ class Drift:
                     "constant": lambda: 1.0,
                     "camera": lambda: own,
                     "camera squared": lambda: own**2,
-                    "ambient lag": lambda at=at: (state.ambient_lag[at] - air_degC) / _SPAN_K,
+                    "ambient lag": lambda at=at: (state.ambient_lag[at] - air_degC) / SPAN_K,
                     "power lag": lambda at=at: state.power_lag[at] - 1,
-                    "camera lag": lambda at=at: (state.camera_lag[at] - camera_degC) / _SPAN_K,
-                    "camera lag squared": lambda at=at: ((state.camera_lag[at] - camera_degC) / _SPAN_K) ** 2,
-                    "play": lambda r=parameter: (state.plays[radii_K.index(r)] - camera_degC) / _SPAN_K,
+                    "camera lag": lambda at=at: (state.camera_lag[at] - camera_degC) / SPAN_K,
+                    "camera lag squared": lambda at=at: ((state.camera_lag[at] - camera_degC) / SPAN_K) ** 2,
+                    "play": lambda r=parameter: (state.plays[radii_K.index(r)] - camera_degC) / SPAN_K,
                 }[kind]()
             )
         return np.array(values)
@@ -197,27 +246,59 @@ class Drift:
         return np.stack([right + xx * x + xy * y + bend * x, down + yx * x + yy * y + bend * y], axis=1)
 
     def _state_flags(self):
-        found = _beyond(self._camera_degC, self._limits("camera_range_degC"), CAMERA)
+        found = _beyond(self._camera_degC, self.limits("camera_range_degC"), CAMERA)
         if self._model["form"] == "paper":
             return found
         if not self._state.begun:
             return CAMERA | AMBIENT | SWITCHED_ON | HISTORY | STATE
-        found |= _beyond(self._state.rate_K_per_h, self._limits("rate_range_K_per_h", 1.0), AMBIENT)
-        least_on_s = self._model["least_on_s"]
-        least_on_s = math.inf if least_on_s is None else least_on_s - _SWITCHED_ON_S
-        found |= _beyond(self._state.on_s, (least_on_s, math.inf), SWITCHED_ON)
-        if self._model.get("leverage") is not None:
-            away, matrix = self._away(), np.array(self._model["leverage_matrix"])
-            found |= _beyond(away @ matrix @ away, (0.0, _MORE_LEVERAGE * self._model["leverage"]), STATE)
+        found |= _beyond(self._state.rate_K_per_h, self.limits("rate_range_K_per_h"), AMBIENT)
+        found |= _beyond(self._state.on_s, (self.least_on_s, math.inf), SWITCHED_ON)
+        away, matrix = self._away(), np.array(self._model["leverage_matrix"])
+        found |= _beyond(away @ matrix @ away, (0.0, self.most_leverage), STATE)
         if self._model["taus_s"]:
-            found |= _beyond(self._state.ambient_lag[-1], self._limits("ambient_range_degC"), AMBIENT)
+            found |= _beyond(self._state.ambient_lag[-1], self.limits("ambient_range_degC"), AMBIENT)
         return found | _beyond(self._state.settled_s, (self.memory_s, math.inf), HISTORY)
 
-    def _limits(self, name, least=0.0):
-        """A calibrated range with its margin; the paper's form has none."""
+    def limits(self, name):
+        """A calibrated range (low, high) with its margin; the paper's form has none."""
         low, high = self._model[name]
+        least = 1.0 if name == "rate_range_K_per_h" else 0.0
         margin = 0.0 if self._model["form"] == "paper" else max(_MARGIN * (high - low), least)
         return low - margin, high + margin
+
+    @property
+    def least_on_s(self):
+        """How long a camera must have been on, s; inf when none was switched on in the calibration."""
+        least_s = self._model["least_on_s"]
+        return math.inf if least_s is None else least_s - _SWITCHED_ON_S
+
+    @property
+    def most_leverage(self):
+        """Of a state that is still near the calibrated ones."""
+        leverage = self._model.get("leverage")
+        return math.inf if leverage is None else _MORE_LEVERAGE * leverage
+
+
+def is_temperature(degC):
+    """Whether it can be one; NaN cannot."""
+    return -273.15 <= degC <= 1000.0
+
+
+def source_offset(shift, xy_px):
+    """Where a point that is seen at (N, 2) px at the reference is in the measured image, less those points: the shift
+    maps measured to reference, so it is inverted by fixed-point steps."""
+    offset = np.zeros_like(xy_px)
+    for _ in range(ROUNDS):
+        offset = -shift(xy_px + offset)
+    return offset
+
+
+def _between(lattice, size, axis):
+    """Linear between the lattice's values along an axis, at 0 .. size - 1."""
+    cell, rest = np.divmod(np.arange(size), LATTICE_PX)
+    share = (rest / LATTICE_PX).reshape([-1 if k == axis else 1 for k in range(3)])
+    begin, end = np.take(lattice, cell, axis), np.take(lattice, cell + 1, axis)
+    return begin + share * (end - begin)
 
 
 def _beyond(value, limits, flag):

@@ -12,9 +12,11 @@ import cv2
 
 from tests.bench import (
     abort,
+    c_header,
     calibration,
     camera,
     codec,
+    datasheet,
     drift,
     identification,
     jitter,
@@ -55,7 +57,9 @@ BENCHMARKS = {
     "markers": markers.figures,
     "photographs": photographs.figures,
     "drift": drift.figures,
+    "datasheet": datasheet.figures,
     "warp": warp.figures,
+    "c_header": c_header.figures,
     "pipeline": pipeline.figures,
     "identification": identification.figures,
     "simulator": simulator.figures,

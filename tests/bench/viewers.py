@@ -158,9 +158,4 @@ def _frames(directory: Path) -> list[Figure]:
         for viewer in viewers:
             viewer.kill()
             viewer.wait()
-    p99_ms = statistics.quantiles(late_ms, n=100, method="inclusive")[98]
-    seen = f"p99 of {len(late_ms)} frames; median {statistics.median(late_ms):.2f}, last {max(late_ms):.2f} ms late"
-    figure = at_most(
-        jitter.LIMIT_ms, Figure(what, "ms", p99_ms, f"{seen}; the daemon took {100 * share:.0f} % of a core")
-    )
-    return [figure]
+    return [jitter.schedule(what, late_ms, f"; the daemon took {100 * share:.0f} % of a core")]
