@@ -12,9 +12,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from compensation.apply.c_header import export_c
 from compensation.apply.export import export
 from compensation.apply.images import Form, corrected_image, middle_flags, write_image
 from compensation.apply.points import CAMERA, X, Y, numbers, outside_text, read_points, times, write_corrected
+from compensation.apply.ros2_package import export_ros2
 from compensation.commands.options import Incomplete, said_if
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.model_file import load_model
@@ -126,14 +128,29 @@ def _instant_ns(text: str, session: Session) -> int:
 @app.command("export")
 def export_model(
     model: ModelArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder for drift.json and drift_runtime.py.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="A folder for drift.json and drift_runtime.py, which needs numpy."),
+    ] = None,
+    c: Annotated[
+        Path | None, typer.Option("--c", metavar="FILE.h", help="A C99 header; the names in it begin with the file's.")
+    ] = None,
+    ros2: Annotated[
+        Path | None, typer.Option("--ros2", metavar="FOLDER", help="A ROS 2 package with a node, for colcon.")
+    ] = None,
 ) -> None:
-    """Write the model for other programs: a small JSON file, and a Python module that needs numpy only.
+    """Write the model for other programs: a Python module that needs numpy only, a C99 header, a ROS 2 package.
 
-    Example: compensate export model.json -o runtime
+    Example: compensate export model.json -o runtime --c drift.h
     """
     with one_line_errors():
-        for path in export(load_model(model), out):
+        if out is None and c is None and ros2 is None:
+            raise ConfigError("nothing to write: give -o FOLDER for Python, --c FILE.h for C, --ros2 FOLDER for ROS 2")
+        used = load_model(model)
+        written = [] if out is None else [*export(used, out)]
+        written += [] if c is None else [export_c(used, c)]
+        written += [] if ros2 is None else [*export_ros2(used, ros2)]
+        for path in written:
             typer.echo(path)
 
 
