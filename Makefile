@@ -3,13 +3,15 @@ PYTHON ?= python3
 VENV := .venv
 # More BLAS threads do not speed up matrices this small; they only take the other core from the simulator.
 export OPENBLAS_NUM_THREADS := 1
+# Tests start some hundred programs: each would compile the sources again where keeping bytecode is switched off.
+export PYTHONDONTWRITEBYTECODE :=
 BIN := $(VENV)/bin
 # Tests wait half of their time, for real clocks and other processes.
 WORKERS := $(shell processors=$$(nproc); workers=$$((processors * 3 / 2)); echo $$((workers < 8 ? workers : 8)))
 RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
-PEER_PACKAGES := aravis-tools-cli aravis-tools chromium
+PEER_PACKAGES := aravis-tools-cli aravis-tools chromium gcc libc6-dev
 
-.PHONY: setup demo test nightly bench clean
+.PHONY: setup demo test nightly bench benchmark clean
 
 setup: $(VENV)/installed
 	@sh .ci/system-packages $(RUNTIME_PACKAGES)
@@ -31,6 +33,10 @@ nightly: setup
 
 bench: setup
 	$(BIN)/python -m tests.bench
+
+# METHOD=my_method.py scores one more, see docs/benchmark.md.
+benchmark: setup
+	$(BIN)/python -m tests.benchmark $(METHOD)
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "thermostand needs Python 3.11 or newer; name it with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }

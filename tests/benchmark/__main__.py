@@ -1,0 +1,73 @@
+"""`make benchmark`: methods of compensation on nights of drawn cameras, against the truth. `python -m tests.benchmark
+my_method.py` scores one more; `--cameras 3` takes fewer of them; `--write FOLDER` writes the nights for other programs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from .methods import METHODS
+from .nights import CAMERAS, GROUPS, TRAININGS, Case, case
+from .scoring import Method, Score, scores, table
+
+
+def main() -> None:
+    """Score, and print one table for each group."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmark", description=__doc__)
+    parser.add_argument("method", nargs="*", type=Path, help="files with NAME and fit(training)")
+    parser.add_argument("--cameras", type=int, default=CAMERAS, help="of each group")
+    parser.add_argument("--write", type=Path, metavar="FOLDER", help="the nights as .npz files, and no scores")
+    given = parser.parse_args()
+    cases = (case(group, number, way) for way in TRAININGS for group in GROUPS for number in range(given.cameras))
+    if given.write is not None:
+        for one in cases:
+            write(one, given.write)
+        return
+    methods = {**METHODS, **dict(loaded(path) for path in given.method)}
+    begin_s = time.monotonic()
+    found: list[Score] = []
+    for one in cases:
+        for name, method in methods.items():
+            found += scores(name, method, one)
+        sys.stderr.write(
+            f"  [{time.monotonic() - begin_s:4.0f} s] {one.learned_from}, {one.group}, camera {one.camera}\n"
+        )
+    sys.stdout.write(table(found, methods))
+
+
+def loaded(path: Path) -> tuple[str, Method]:
+    """NAME and fit of a file."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        sys.exit(f"{path}: not a Python file with NAME and fit(training)")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.NAME, module.fit
+
+
+def write(one: Case, folder: Path) -> None:
+    """Two files for each camera: what may be learned from, and for each task what is asked, with the answer."""
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"{TRAININGS.index(one.learned_from)}-{GROUPS.index(one.group)}-{one.camera:02d}"
+    for part, known in (("training", one.training), *((f"task-{k}", q.night) for k, q in enumerate(one.questions, 1))):
+        history = known.histories[0]
+        columns = {key: getattr(known, key) for key in ("time_ns", "role", "chamber_degC", "camera_degC", "air_degC")}
+        telemetry = {key: getattr(history, key) for key in ("ambient_ns", "ambient_degC", "powered_ns", "powered")}
+        own = {"own_ns": history.camera_ns, "own_degC": history.camera_degC, "centres_px": known.centres_px}
+        np.savez_compressed(folder / f"{name}-{part}.npz", **columns, **telemetry, **own)
+    answers = {
+        f"task_{k}_{key}": getattr(q, key)
+        for k, q in enumerate(one.questions, 1)
+        for key in ("frames", "seen_px", "reference_px")
+    }
+    np.savez_compressed(folder / f"{name}-answers.npz", **answers)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""The methods that are compared: nothing, the paper's polynomial, the thermal form, and Gaussian processes on what that
+leaves."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from compensation.drift.choosing import fit
+from compensation.drift.displacements import displacements
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.training import frame_states
+from compensation.history.states import States
+from compensation.observations import Observations
+from experiments.steps import Role
+
+from .scoring import Correction, Corrector, Float, Method
+
+
+def nothing(training: Observations) -> Corrector:
+    """What the camera does when nobody compensates."""
+    return lambda night, frames, seen_px: Correction(seen_px)
+
+
+def of_this_project(form: Literal["paper", "thermal"] | None) -> Method:
+    """The paper's polynomial, the thermal form, or the one that the program chooses."""
+
+    def method(training: Observations) -> Corrector:
+        return corrector(fit(training, form=form))
+
+    return method
+
+
+def corrector(model: DriftModel) -> Corrector:
+    """Of a fitted model."""
+
+    def corrected(night: Observations, frames: NDArray[np.int64], seen_px: Float) -> Correction:
+        states = frame_states(night, model.memory)
+        places, sigma = np.empty_like(seen_px), np.empty_like(seen_px)
+        inside = np.empty(seen_px.shape[:2], bool)
+        for row, frame in enumerate(frames.tolist()):
+            state = states.where(np.array([frame]))
+            places[row] = model.correct(seen_px[row], state)
+            sigma[row] = np.sqrt(np.diagonal(model.covariance(seen_px[row], state), axis1=1, axis2=2))
+            inside[row] = model.inside(seen_px[row], state)
+        return Correction(places, sigma, inside)
+
+    return corrected
+
+
+def gp_on_residual(training: Observations) -> Corrector:
+    """The chosen form, and a Gaussian process for the shift of the whole image that it leaves in the frames it was
+    fitted to: over camera, air, their rate of change and the slowest lag, squared-exponential, with hyperparameters of
+    largest marginal likelihood."""
+    model = fit(training)
+    states = frame_states(training, model.memory)
+    rows = displacements(training, training.of(Role.REFERENCE, Role.FIT, Role.WARM_UP))
+    left = rows.displacement_px - model.shift(rows.measured_px, states.where(rows.frame))
+    frames, index, count = np.unique(rows.frame, return_inverse=True, return_counts=True)
+    shift = np.stack([np.bincount(index, axis) / count for axis in left.T], axis=1)
+    known = np.isfinite(shift).all(axis=1)
+    at = _inputs(states)[frames[known]]
+    middle, spread = at.mean(axis=0), np.maximum(at.std(axis=0), 1e-3)
+    gp = _Gp((at - middle) / spread, shift[known])
+    plain = corrector(model)
+
+    def corrected(night: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
+        answer = plain(night, asked, seen_px)
+        wanted = (_inputs(frame_states(night, model.memory))[asked] - middle) / spread
+        more, variance = gp.predicted(wanted)
+        assert answer.sigma_px is not None
+        sigma = np.sqrt(answer.sigma_px**2 + variance[:, None, None])
+        return Correction(answer.corrected_px + more[:, None], sigma, answer.inside)
+
+    return corrected
+
+
+def _inputs(states: States) -> Float:
+    slowest = states.ambient_lag_degC[:, -1:] if states.ambient_lag_degC.shape[1] else states.camera_degC[:, None]
+    return np.column_stack([states.camera_degC, np.nan_to_num(slowest), np.nan_to_num(states.rate_K_per_h)])
+
+
+class _Gp:
+    def __init__(self, at: Float, values: Float) -> None:
+        """at (M, D), scaled; values (M, 2) px."""
+        total = float(values.std()) + 1e-6
+        grid = product((0.5, 1.0, 2.0, 4.0), (0.3 * total, total), (0.1 * total, 0.3 * total, total))
+        self._at, self._values = at, values
+        best = max(grid, key=self._likelihood)
+        self._length, self._amplitude, noise = best
+        self._factor = cho_factor(self._kernel(at) + noise**2 * np.eye(len(at)))
+        self._weights = cho_solve(self._factor, values)
+
+    def predicted(self, at: Float) -> tuple[Float, Float]:
+        """Mean (K, 2) and variance (K,)."""
+        kernel = self._kernel(at)
+        variance = self._amplitude**2 - (kernel * cho_solve(self._factor, kernel.T).T).sum(axis=1)
+        return kernel @ self._weights, np.maximum(variance, 0.0)
+
+    def _kernel(self, at: Float) -> Float:
+        squares = ((at[:, None] - self._at[None]) ** 2).sum(axis=2)
+        return self._amplitude**2 * np.exp(-squares / (2 * self._length**2))
+
+    def _likelihood(self, parameters: tuple[float, float, float]) -> float:
+        self._length, self._amplitude, noise = parameters
+        factor = cho_factor(self._kernel(self._at) + noise**2 * np.eye(len(self._at)))
+        fits = float((self._values * cho_solve(factor, self._values)).sum())
+        return -0.5 * fits - self._values.shape[1] * float(np.log(np.diag(factor[0])).sum())
+
+
+METHODS: dict[str, Method] = {
+    "nothing": nothing,
+    "the paper's polynomial": of_this_project("paper"),
+    "the thermal form": of_this_project("thermal"),
+    "the form that is chosen": of_this_project(None),
+    "and a GP on its residual": gp_on_residual,
+}
