@@ -16,8 +16,11 @@ app = lazy_app(
         "detect": Lazy("compensation.commands.detect_cli", "Find the target's markers: a table of centres."),
         "fit": Lazy(_FIT, "Fit the drift model to the frames of sessions of one camera."),
         "report": Lazy(_FIT, "Write the report of sessions of one camera: drift, model, and what it gains."),
+        "datasheet": Lazy(
+            "compensation.commands.datasheet_cli", "Write a camera's thermal datasheet, with uncertainties."
+        ),
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
-        "export": Lazy(_APPLY, "Write the model for other programs: JSON, and a module that needs numpy only."),
+        "export": Lazy(_APPLY, "Write the model for other programs: in Python with numpy only, in C, for ROS 2."),
         "calibrate": Lazy("compensation.commands.calibration_cli", "Calibrate the camera: pinhole and ray model."),
         "calibrate-photographs": Lazy(
             "compensation.commands.photographs_cli", "Calibrate a camera from photographs of a board in any poses."

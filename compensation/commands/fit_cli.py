@@ -13,12 +13,14 @@ from compensation.commands.options import (
     AcrossGap,
     Cache,
     Cluster,
+    DetailsOption,
     Incomplete,
     TargetOption,
     Workers,
     named_target,
     said_if,
 )
+from compensation.datasheet.details import load_details
 from compensation.drift.choosing import Form, check_request
 from compensation.drift.choosing import fit as fit_model
 from compensation.drift.evaluation import evaluate, table
@@ -26,6 +28,7 @@ from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
 from compensation.finding.found import finder
 from compensation.observations import Observations, observe
+from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
 from compensation.reporting.report import NoModel, can_be_scored, check_report_writable, fitted, write_report
 from compensation.reporting.table_positions import table_positions
@@ -113,6 +116,7 @@ def report(
     validation: Annotated[
         Path | None, typer.Option(help="With the result of `compensate validate`: the JSON file beside its page.")
     ] = None,
+    details: DetailsOption = None,
     target: TargetOption = None,
     workers: Workers = 1,
     cluster: Cluster = None,
@@ -128,6 +132,7 @@ def report(
     """
     with one_line_errors():
         check_report_writable(out, model, validation)
+        stated = load_details(details)
         found_by = finder(workers, cluster, use_cache=cache)
         given = None if model is None else load_model(model)
         wanted = named_target(target)
@@ -135,6 +140,8 @@ def report(
             budgets={} if budget is None else budgets_of_sessions(sessions, budget, wanted),
             positions=table_positions([Session.open(path).steps() for path in sessions]),
             validation=None if validation is None else load_validation(validation),
+            equipment=equipment_of(Session.open(sessions[0])),
+            details=stated,
         )
         observations = observe(
             sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said_if(incomplete)

@@ -11,8 +11,8 @@ from compensation.drift.evaluation import Evaluation
 from compensation.observations import Observations
 from compensation.reporting import fit_figures as figures
 from compensation.reporting.figures import as_svg
-from compensation.reporting.numbers import ModelNumbers, Numbers, ScoreNumbers
-from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table
+from compensation.reporting.numbers import FormulaNumbers, ModelNumbers, Numbers, ScoreNumbers, compact, percent
+from compensation.reporting.page import Drawing, Facts, Heading, Listing, Paragraph, Part, Table
 from compensation.reporting.path_figures import EXAGGERATION
 
 _FORMS = {
@@ -31,6 +31,11 @@ def compensation_section(observations: Observations, evaluation: Evaluation, sco
     yield Drawing(
         as_svg(figures.compensated_paths(observations, evaluation), "compensated"),
         f"Drift of each marker, enlarged {EXAGGERATION} times, before and after compensation; {method}.",
+    )
+    yield Drawing(
+        as_svg(figures.residual_map(observations, evaluation), "residual-map"),
+        "What the model leaves at each marker, measured − model, mean over the frames of each set-point, at a scale of "
+        f"its own; arrows that agree over the image are errors of the model, not noise; {method}.",
     )
     of_evaluation: tuple[tuple[str, Callable[[Evaluation], Figure], str], ...] = (
         (
@@ -88,6 +93,7 @@ def model_section(model: ModelNumbers) -> Iterator[Part]:
             ("Fitted by", f"thermostand {model.software_version}"),
         ]
     )
+    yield from _formula(model.formula)
     yield Paragraph(
         "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is "
         "the simplest of each form within one standard error of the best, or the one asked for; the thermal form takes "
@@ -97,6 +103,18 @@ def model_section(model: ModelNumbers) -> Iterator[Part]:
     )
     yield from _candidates(model)
     yield Paragraph(_why(model))
+
+
+def _formula(formula: FormulaNumbers) -> Iterator[Part]:
+    """Written out, with every coefficient and its standard uncertainty."""
+    yield Listing("\n".join(formula.lines))
+    pairs = zip(formula.terms, formula.coefficients_px, formula.sigma_px, strict=True)
+    rows = [
+        (name, *(compact(value, u) for value, u in zip(values.tolist(), sigmas.tolist(), strict=True)))
+        for name, values, sigmas in pairs
+    ]
+    yield Table(("coefficient", *formula.heads), rows)
+    yield Paragraph("In brackets: the standard uncertainty of the last digits, by the fit.", aside=True)
 
 
 def _candidates(model: ModelNumbers) -> Iterator[Part]:
@@ -144,7 +162,7 @@ def uncertainty_section(numbers: Numbers) -> Iterator[Part]:
             ("unexplained by the form at temperatures left out", *_mpx(model.discrepancy_px)),
             ("compensated centre, as claimed", *_mpx(score.claimed_sigma_px)),
             ("compensated centre, as found (RMS)", *_mpx(score.after_px)),
-            ("part within the claimed 95 % interval", *(f"{100 * part:.1f} %" for part in score.coverage_95)),
+            ("part within the claimed 95 % interval", *(percent(100 * part) for part in score.coverage_95)),
         ],
     )
 

@@ -16,6 +16,8 @@ def data_section(numbers: Numbers) -> Iterator[Part]:
     yield Heading("Recorded data")
     for session in numbers.sessions:
         yield Facts(_session(session, numbers))
+    yield Heading("Measured with")
+    yield Facts(list(numbers.measured_with.items()))
     if numbers.unusable:
         yield from _unusable(numbers.unusable)
     made_by = ", ".join(f"{name} {version}" for name, version in numbers.versions.items())

@@ -10,7 +10,7 @@ import numpy as np
 from compensation.observations import Observations
 from compensation.reporting import drift_figures as figures
 from compensation.reporting.figures import as_svg
-from compensation.reporting.numbers import HysteresisNumbers, Numbers
+from compensation.reporting.numbers import HysteresisNumbers, Numbers, percent
 from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
 from compensation.reporting.path_figures import EXAGGERATION, Paths, trajectories
 from compensation.reporting.result_section import ours
@@ -173,7 +173,7 @@ def _hysteresis_cells(one: HysteresisNumbers, axis: int, whole_px: float) -> Ite
     largest_px = float(one.largest_px[axis])
     yield _mpx(float(one.range_px[axis]))
     yield _mpx(largest_px)
-    yield "–" if math.isnan(largest_px) or whole_px <= 0 else f"{100 * largest_px / whole_px:.1f} %"
+    yield "–" if math.isnan(largest_px) or whole_px <= 0 else percent(100 * largest_px / whole_px)
     for values in (one.rms_px, one.area_px_K, one.closure_px, one.repeatability_px):
         yield _mpx(float(values[axis]))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,12 +12,15 @@ from matplotlib.ticker import StrMethodFormatter
 from compensation.drift.evaluation import Evaluation, improvement_percent
 from compensation.observations import Float, Observations
 from compensation.reporting.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
+from compensation.reporting.numbers import percent
 from compensation.reporting.path_figures import Paths, trajectories
 from compensation.reporting.tracks import thinned
 
 _SIGMA_95 = 1.959964
 _MOST_DOTS = 20_000
 _BINS = 60
+_LONGEST_ARROW = 0.06
+"""Of the image's width: a large residual."""
 
 
 def compensated_paths(observations: Observations, evaluation: Evaluation) -> Figure:
@@ -40,15 +45,55 @@ def measured_against_model(evaluation: Evaluation) -> Figure:
     measured, said = -evaluation.before_px, evaluation.after_px - evaluation.before_px
     drawn = thinned(len(measured), _MOST_DOTS)
     with style():
-        figure, panels = new_figure(FULL_WIDTH_IN, 3.2, 1, 2)
+        figure, panels = new_figure(FULL_WIDTH_IN, 3.9, 1, 2, share=False)
         for index, (axes, (name, colour)) in enumerate(zip(panels, COORDINATES, strict=True)):
-            ends = [float(said[:, index].min()), float(said[:, index].max())]
+            both = np.concatenate([said[:, index], measured[:, index]])
+            ends = [float(both.min()), float(both.max())]
             axes.plot(ends, ends, color="black", linewidth=0.8, label="measured = model")
             _dots(axes, said[drawn, index], measured[drawn, index], colour, "marker centres")
             axes.set_xlabel(f"drift along {name}, model (px)")
+            axes.set_aspect("equal", adjustable="box")
             legend_above(axes)
         panels[0].set_ylabel("drift, measured (px)")
     return figure
+
+
+def residual_map(observations: Observations, evaluation: Evaluation) -> Figure:
+    """What is left at each marker of each scored set-point, as arrows over the image, enlarged until the larger ones
+    show; the bar says how much."""
+    rows = evaluation.rows
+    width, height = observations.image_size
+    keys = np.stack([rows.chamber_degC, rows.marker], axis=1)
+    groups, index, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    index = index.ravel()
+    mean = [np.bincount(index, column) / count for column in (*rows.measured_px.T, *(-evaluation.after_px).T)]
+    longest = float(np.quantile(np.hypot(mean[2], mean[3]), 0.95))
+    scale, bar_px = enlarged(longest, width)
+    with style():
+        figure, (axes,) = new_figure(FULL_WIDTH_IN, 5.4, 1, 1)
+        at, arrows = np.stack(mean[:2], axis=1), scale * np.stack(mean[2:], axis=1)
+        drawn = axes.quiver(
+            *at.T, *arrows.T, groups[:, 0], angles="xy", scale_units="xy", scale=1, width=0.0013, cmap="viridis"
+        )
+        drawn.set_rasterized(True)
+        axes.set(xlabel="column I (px)", ylabel="row J (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        axes.set_aspect("equal")
+        axes.grid(visible=False)
+        x, y = 0.03 * width, 0.965 * height
+        axes.plot([x, x + scale * bar_px], [y, y], color="black", linewidth=2, solid_capstyle="butt")
+        axes.text(
+            x + scale * bar_px + 0.01 * width, y, f"{1e3 * bar_px:g} mpx, {scale:,.0f} times", va="center", fontsize=8
+        )
+        figure.colorbar(drawn, ax=axes, label="chamber temperature (°C)", shrink=0.85, pad=0.02)
+    return figure
+
+
+def enlarged(long_px: float, width: int) -> tuple[float, float]:
+    """By how much an arrow of this length is drawn longer, a round number, and a round length for the bar beside it."""
+    wanted = _LONGEST_ARROW * width / max(long_px, 1e-9)
+    power = 10 ** math.floor(math.log10(wanted))
+    scale = next(step * power for step in (5, 2, 1) if step * power <= wanted)
+    return scale, 10 ** math.floor(math.log10(0.1 * width / scale))
 
 
 def residuals(evaluation: Evaluation) -> Figure:
@@ -103,7 +148,7 @@ def against_temperature(evaluation: Evaluation) -> Figure:
             gain = improvement_percent(evaluation.rms_before_px[index], evaluation.rms_after_px[index])
             axes.plot(chamber_degC, before, "o--", color=colour, mfc="white", linewidth=0.9, label=f"{name}, before")
             axes.plot(
-                chamber_degC, after, "o-", color=colour, linewidth=1.3, label=f"{name}, after ({gain:.1f} % less)"
+                chamber_degC, after, "o-", color=colour, linewidth=1.3, label=f"{name}, after ({percent(gain)} less)"
             )
             axes.set_xlabel("chamber temperature (°C)")
             legend_above(axes)

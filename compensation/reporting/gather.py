@@ -18,7 +18,9 @@ from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evalu
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.training import frame_states
 from compensation.observations import Float, Mask, Observations
+from compensation.reporting.equipment import stated
 from compensation.reporting.extras import Extras
+from compensation.reporting.formula import formula_of
 from compensation.reporting.numbers import (
     FORMAT,
     BumpNumbers,
@@ -54,6 +56,7 @@ def numbers_of(
     return Numbers(
         format=FORMAT,
         versions={name: importlib.metadata.version(name) for name in _LIBRARIES},
+        measured_with=dict([*stated(extras.details, observations.target), *extras.equipment]),
         camera=observations.sessions[0].camera_serial,
         target=observations.target.name,
         simulated=observations.simulated,
@@ -205,5 +208,6 @@ def _model(model: DriftModel) -> ModelNumbers:
         discrepancy_px=(i, j),
         session_ids=facts.session_ids,
         software_version=facts.software_version,
+        formula=formula_of(model),
         candidates=model.candidates,
     )

@@ -119,6 +119,17 @@ class BumpNumbers:
     text: str
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FormulaNumbers:
+    """lines: the formula. coefficients_px, sigma_px (H, K): a row for each of `terms`, a column for each of `heads`."""
+
+    lines: tuple[str, ...]
+    heads: tuple[str, ...]
+    terms: tuple[str, ...]
+    coefficients_px: Float
+    sigma_px: Float
+
+
 @dataclass(frozen=True, slots=True)
 class ModelNumbers:
     """candidates: every form tried, with its errors at temperatures left out."""
@@ -132,17 +143,19 @@ class ModelNumbers:
     discrepancy_px: Pair
     session_ids: tuple[str, ...]
     software_version: str
+    formula: FormulaNumbers
     candidates: tuple[Candidate, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
     """The whole of it; model, score: None without one. hysteresis: before compensation and, with a model, after.
-    budgets: the stand's, by session id. positions: of the table. validation: as `compensate validate` writes it, None
-    without one. paper: its figures, px."""
+    measured_with: as recorded and as stated. budgets: the stand's, by session id. positions: of the table. validation:
+    as `compensate validate` writes it, None without one. paper: its figures, px."""
 
     format: str
     versions: dict[str, str]
+    measured_with: dict[str, str]
     camera: str
     target: str
     simulated: bool
@@ -159,6 +172,35 @@ class Numbers:
     bumps: tuple[BumpNumbers, ...]
     validation: object
     paper: dict[str, Pair]
+
+
+def percent(value: float, digits: int = 1) -> str:
+    """A share as a text that never says all, or none, of what is not."""
+    step = 10.0**-digits
+    if 100 - step / 2 <= value < 100:
+        return f"> {100 - step:.{digits}f} %"
+    if 0 < value < step / 2:
+        return f"< {step:.{digits}f} %"
+    return f"{value:z.{digits}f} %"
+
+
+def measured(value: float, expanded: float) -> tuple[str, str]:
+    """Value and U as texts, U with two significant digits and the value with as many decimals."""
+    if not expanded > 0:
+        return f"{value:.4g}", "–"
+    digits = 1 - math.floor(math.log10(expanded))
+    if round(expanded, digits) >= 10 ** (2 - digits):  # 0.0996 becomes 0.10
+        digits -= 1
+    places = max(digits, 0)
+    return f"{round(value, digits):z.{places}f}".replace("-", "−"), f"{round(expanded, digits):.{places}f}"
+
+
+def compact(value: float, u: float) -> str:
+    """As 0.0611(81): the digits in brackets are the standard uncertainty of the last ones."""
+    if not u > 0 or not math.isfinite(value):
+        return f"{value:.4g}"
+    text, uncertain = measured(value, u)
+    return f"{text}({uncertain.lstrip('0.') or '0'})" if u < 1 else f"{text}({uncertain})"
 
 
 def as_json(numbers: Numbers) -> str:

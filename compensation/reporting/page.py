@@ -30,7 +30,8 @@ class Paragraph:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of numbers, texts already formatted; row `chosen` is bold."""
+    """A table of numbers, texts already formatted; row `chosen` is bold, one of a first cell only heads those below
+    it."""
 
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -45,6 +46,13 @@ class Facts:
 
 
 @dataclass(frozen=True, slots=True)
+class Listing:
+    """Lines that stand as they are, all letters of one width."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Drawing:
     """An SVG element with its caption."""
 
@@ -52,7 +60,7 @@ class Drawing:
     caption: str
 
 
-Part = Heading | Paragraph | Table | Facts | Drawing
+Part = Heading | Paragraph | Listing | Table | Facts | Drawing
 
 
 def page(title: str, parts: Sequence[Part]) -> str:

@@ -16,6 +16,7 @@ from compensation.observations import Observations, Progress, observe
 from compensation.reporting.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.reporting.data_section import data_section, utc
 from compensation.reporting.drift_section import drift_section
+from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
 from compensation.reporting.gather import numbers_of
 from compensation.reporting.numbers import Numbers, as_json
@@ -45,7 +46,9 @@ def analyse(
     check_writable(model_path)
     check_report_writable(report_path, model_path)
     observations = observe(session_paths, progress)
-    extras = Extras(positions=table_positions([Session.open(path).steps() for path in session_paths]))
+    sessions = [Session.open(path) for path in session_paths]
+    positions = table_positions([session.steps() for session in sessions])
+    extras = Extras(positions=positions, equipment=equipment_of(sessions[0]))
     with progress("fit and report", 3) as report:
         report(0, "choosing the form, scoring")
         model, evaluation, refusal = fitted(observations)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from compensation.drift.evaluation import improvement_percent
-from compensation.reporting.numbers import Numbers, Pair, ScoreNumbers
+from compensation.reporting.numbers import Numbers, Pair, ScoreNumbers, percent
 from compensation.reporting.page import Heading, Paragraph, Part, Table
 from compensation.reporting.validation_report import gains_table
 from compensation.validation3d.validation import Validation
@@ -67,10 +67,10 @@ def _gain(numbers: Numbers, score: ScoreNumbers) -> Iterator[Part]:
         (ours(numbers), *_gains(score.before_px, score.after_px)),
     ]
     yield Table(heads, rows, chosen=1)
-    i, j = score.coverage_95
+    i, j = (percent(100 * part, 0) for part in score.coverage_95)
     note = (
         f"{score.frames} frames; {score.method}. The deviation is the distance of a marker centre from its place at "
-        f"the reference temperature. Of the deviations after compensation, {100 * i:.0f} % (I) and {100 * j:.0f} % (J) "
+        f"the reference temperature. Of the deviations after compensation, {i} (I) and {j} (J) "
         "lie in the 95 % interval that the model claims."
     )
     if min(score.coverage_95) < _LEAST_COVERAGE:
@@ -80,10 +80,10 @@ def _gain(numbers: Numbers, score: ScoreNumbers) -> Iterator[Part]:
             "alone."
         )
     if score.outside:
-        note += f" {score.outside:.1%} of the centres are outside the model's valid range."
+        note += f" {percent(100 * score.outside)} of the centres are outside the model's valid range."
     yield Paragraph(note)
 
 
 def _gains(before: Pair, after: Pair) -> Iterator[str]:
     for b, a in zip(before, after, strict=True):
-        yield from (f"{b:.3f}", f"{a:.3f}" if a >= 0.01 else f"{a:.4f}", f"{improvement_percent(b, a):.1f} %")
+        yield from (f"{b:.3f}", f"{a:.3f}" if a >= 0.01 else f"{a:.4f}", percent(improvement_percent(b, a)))

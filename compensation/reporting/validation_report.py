@@ -12,6 +12,7 @@ from compensation.drift.evaluation import improvement_percent
 from compensation.observations import Float
 from compensation.reporting import validation_figures as figures
 from compensation.reporting.figures import as_svg
+from compensation.reporting.numbers import percent
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
 from compensation.validation3d.summary import flagged, reason_names
@@ -76,7 +77,7 @@ def _gains(before_um: Sequence[float], after_um: Sequence[float]) -> Iterator[st
         yield from (
             f"{before:.1f}",
             f"{after:.1f}" if after >= 10 else f"{after:.2f}",
-            f"{improvement_percent(before, after):.0f} %",
+            percent(improvement_percent(before, after), 0),
         )
 
 

@@ -17,9 +17,12 @@ from compensation.budget.geometry import StandState
 from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
+from compensation.history.states import States
 from compensation.observations import Observations
 from compensation.reporting.compensation_section import uncertainty_section
 from compensation.reporting.extras import Extras
+from compensation.reporting.fit_figures import enlarged, measured_against_model
+from compensation.reporting.formula import formula_of
 from compensation.reporting.gather import numbers_of
 from compensation.reporting.numbers import Numbers, as_json
 from compensation.reporting.page import page as page_of
@@ -28,6 +31,7 @@ from compensation.reporting.result_section import result_section
 from foundation.errors import SessionError
 
 from .synthetic import facts, observations, places_px, quadratic
+from .test_apply import thermal
 
 Analysed = tuple[Observations, PaperModel, Evaluation]
 BUDGET = Budget(
@@ -47,6 +51,7 @@ HEADINGS = (
     "Uncertainty",
     "The stand's budget",
     "Recorded data",
+    "Measured with",
     "Frames left out",
 )
 
@@ -108,7 +113,7 @@ def test_it_needs_no_other_file(page: str):
 
 def test_its_figures_are_sound_svg_with_ids_of_their_own(page: str):
     drawings = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
-    assert len(drawings) == 10
+    assert len(drawings) == 11
     for drawing in drawings:
         ET.fromstring(drawing)
     ids = re.findall(r'\bid="([^"]+)"', page)
@@ -199,7 +204,7 @@ def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
         own = replace(cold, sessions=(replace(cold.sessions[0], simulated=simulated),))
         write_report(tmp_path / "report.html", own, None, None)
         text = (tmp_path / "report.html").read_text()
-        assert headings(text) == ["Result", "Warm-up", "Drift over time", "Recorded data"]
+        assert headings(text) == ["Result", "Warm-up", "Drift over time", "Recorded data", "Measured with"]
         assert ("Recorded in a simulated laboratory." in text) is simulated
         assert ("<td>this report (simulated)</td>" in text) is simulated
     found = json.loads((tmp_path / "report.json").read_text())
@@ -223,7 +228,7 @@ def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving
 @pytest.mark.parametrize("role", ["calibration", "pose"])
 def test_a_session_without_any_drift_is_reported_all_the_same(role: str):
     text = report_page(warm_up_only(roles=(role,)), None, None)
-    assert headings(text) == ["Result", "Recorded data"]
+    assert headings(text) == ["Result", "Recorded data", "Measured with"]
     assert f"({12 + 8} {role})" in text
 
 
@@ -232,7 +237,7 @@ def test_frames_of_ones_own_steps_without_a_reference_are_shown_over_time(role: 
     own = warm_up_only(roles=(role,))
     text = report_page(own, None, None)
     assert not can_be_fitted(own)
-    assert headings(text) == ["Result", "Drift over time", "Recorded data"]
+    assert headings(text) == ["Result", "Drift over time", "Recorded data", "Measured with"]
     assert f"({12 + 8} {role})" in text
 
 
@@ -277,3 +282,58 @@ def test_what_the_model_leaves_of_a_warm_up_is_told(numbers: Numbers, page: str,
     moved = np.where((night.role == "warm_up")[:, None, None], night.centres_px + 400, night.centres_px)
     (elsewhere,) = numbers_of(replace(night, centres_px=moved), model, None).warm_ups
     assert np.isnan(elsewhere.left_px).all()
+
+
+def test_the_formula_in_the_report_gives_the_model_s_corrections(analysed: Analysed):
+    """The printed coefficients, put into the printed formula, are the model."""
+    night, model, _ = analysed
+    formula = numbers_of(*analysed).model.formula
+    points, degC = places_px()[:5], 41.5
+    width, height = night.image_size
+    low, high = model.facts.camera_range_degC
+    i, j = 2 * (points[:, 0] + 0.5) / width - 1, 2 * (points[:, 1] + 0.5) / height - 1
+    t = (2 * degC - (low + high)) / (high - low)
+    cosine = np.polynomial.chebyshev.Chebyshev.basis
+    said = points.copy()
+    for name, coefficients in zip(formula.terms, formula.coefficients_px, strict=True):
+        a, b, c = map(int, re.fullmatch(r"T(\d)\(i\) T(\d)\(j\) T(\d)\(t\)", name).groups())
+        said += coefficients * (cosine(a)(i) * cosine(b)(j) * cosine(c)(t))[:, None]
+    np.testing.assert_allclose(said, model.correct(points, degC), atol=1e-9)
+    assert formula.sigma_px.shape == formula.coefficients_px.shape
+    assert f"/ {width} − 1" in formula.lines[2]
+
+
+def test_the_formula_of_the_thermal_form_is_its_homography():
+    model = thermal()
+    formula = formula_of(model)
+    states = States.from_rows(model.memory, np.full((1, 4 + 3 * 2 + 2), 30.0))
+    amounts = model._features(states, 1) @ formula.coefficients_px
+    a = amounts[0]
+    place = np.array([[200.0, 100.0]])
+    width, height = model.facts.image_size
+    x, y = (place[0, 0] - (width - 1) / 2) / (width / 2), (place[0, 1] - (height - 1) / 2) / (width / 2)
+    moved = [
+        a[0] + a[2] * x + a[3] * y + (a[6] * x + a[7] * y) * x,
+        a[1] + a[4] * x + a[5] * y + (a[6] * x + a[7] * y) * y,
+    ]
+    np.testing.assert_allclose(model.shift(place, states)[0], moved, atol=1e-9)
+    assert formula.terms[:4] == ("1", "T", "T²", "air(10 min)")
+
+
+def test_figures_are_numbered_and_those_with_a_line_of_equality_have_equal_axes(analysed: Analysed, page: str):
+    numbered = re.findall(r"<b>Figure (\d+)\.</b>", page)
+    assert numbered == [str(number) for number in range(1, len(numbered) + 1)]
+    for axes in measured_against_model(analysed[2]).axes:
+        assert axes.get_aspect() == 1
+
+
+def test_it_has_layouts_for_paper_phones_and_dark_screens_and_says_what_nobody_stated(page: str):
+    for rule in ("prefers-color-scheme: dark", "max-width: 40rem", "@media print"):
+        assert rule in page
+    assert "<td>Lens</td><td>not stated</td>" in page
+
+
+def test_the_residuals_have_a_scale_of_their_own():
+    scale, bar_px = enlarged(0.005, 2448)
+    assert (scale, bar_px) == (20_000, 0.01)
+    assert 0.5 < scale * 0.005 / (0.06 * 2448) <= 1

@@ -1,0 +1,82 @@
+"""`compensate datasheet`: a camera's behaviour over temperature, with uncertainties."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.commands.options import (
+    AcrossGap,
+    Cache,
+    Cluster,
+    DetailsOption,
+    Incomplete,
+    TargetOption,
+    Workers,
+    named_target,
+    said_if,
+)
+from compensation.datasheet.datasheet import datasheet
+from compensation.datasheet.details import load_details
+from compensation.drift.choosing import fit
+from compensation.drift.model_file import load_model
+from compensation.finding.found import finder
+from compensation.observations import observe
+from compensation.reporting.datasheet_page import datasheet_json, datasheet_page
+from compensation.reporting.equipment import equipment_of
+from compensation.reporting.pdf import pdf_of
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.files import check_writable, write_whole, write_whole_bytes
+from foundation.progress import progress
+from recording.reading.session import Session
+
+app = typer.Typer(add_completion=False)
+
+_FORMATS = (".html", ".pdf", ".json")
+
+
+@app.command("datasheet")
+def write_datasheet(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions of one camera.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.html|pdf|json", help="The file to write.")],
+    model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
+    details: DetailsOption = None,
+    target: TargetOption = None,
+    workers: Workers = 1,
+    cluster: Cluster = None,
+    cache: Cache = True,
+    across_gap: AcrossGap = False,
+    incomplete: Incomplete = False,
+) -> None:
+    """Write a camera's thermal datasheet: px/K and ppm/K, settling, hysteresis, what each form of compensation leaves,
+    each with its expanded uncertainty and the budget it comes from.
+
+    Example: compensate datasheet sessions/20260101T180000Z-thermal-cycle -o camera.pdf
+    """
+    with one_line_errors():
+        if out.suffix.lower() not in _FORMATS:
+            raise ConfigError(f"{out}: give a name that ends in {', '.join(_FORMATS)}")
+        check_writable(out)
+        stated = load_details(details)
+        given = None if model is None else load_model(model)
+        observations = observe(
+            sessions,
+            progress,
+            named_target(target),
+            finder(workers, cluster, use_cache=cache),
+            across_gap=across_gap,
+            incomplete=said_if(incomplete),
+        )
+        sheet = datasheet(observations, given or fit(observations), stated)
+        equipment = equipment_of(Session.open(sessions[0]))
+        if out.suffix.lower() == ".json":
+            write_whole(out, datasheet_json(sheet, equipment))
+        elif out.suffix.lower() == ".pdf":
+            write_whole_bytes(out, pdf_of(datasheet_page(sheet, equipment)))
+        else:
+            write_whole(out, datasheet_page(sheet, equipment))
+        known = sum(one.value == one.value for one in sheet.quantities)
+        typer.echo(f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)")

@@ -1,0 +1,1 @@
+"""What a camera's datasheet says of its behaviour over temperature, each number with its uncertainty."""

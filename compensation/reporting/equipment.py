@@ -1,0 +1,88 @@
+"""With what a session was recorded, as far as it says so itself: exposure, gain, devices of the stand's file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from compensation.datasheet.details import Details
+from foundation.documents import yaml_data
+from foundation.errors import ConfigError
+from markers.target import Target
+from recording.reading.session import Session
+
+NOT_STATED = "not stated"
+Line = tuple[str, str]
+_DEVICES = (
+    ("regulator", "Temperature controller"),
+    ("chamber", "Climate chamber"),
+    ("thermometer_module", "Thermometer module"),
+    ("pt100", "Thermometers"),
+)
+
+
+def equipment_of(session: Session) -> list[Line]:
+    """Names and what belongs to them; only what is known."""
+    return [*_exposure(session), *_stand(session)]
+
+
+def _exposure(session: Session) -> Iterator[Line]:
+    metas = [meta for _, meta in session.frame_metas]
+    if not metas:
+        return
+    exposures = sorted({meta.exposure_s for meta in metas if meta.exposure_s > 0})
+    if exposures:
+        yield "Exposure", _range(1e3 * exposures[0], 1e3 * exposures[-1], "ms")
+    gains = sorted({meta.gain_dB for meta in metas if meta.gain_dB == meta.gain_dB})
+    if gains:
+        yield "Gain", _range(gains[0], gains[-1], "dB")
+
+
+def _range(low: float, high: float, unit: str) -> str:
+    return f"{low:g} {unit}" if low == high else f"{low:g} to {high:g} {unit}"
+
+
+def _stand(session: Session) -> Iterator[Line]:
+    text = session.attachment("config.yaml")
+    try:
+        data: Any = yaml_data(text or "", "config.yaml")
+    except ConfigError:
+        return
+    if not isinstance(data, dict):
+        return
+    if data.get("name"):
+        yield "Stand", str(data["name"])
+    for key, name in _DEVICES:
+        device = data.get(key)
+        if isinstance(device, dict):
+            kind = device.get("registers") or device.get("protocol") or device.get("kind") or "of the stand's file"
+            yield name, str(kind)
+    thermometers = data.get("thermometers")
+    if isinstance(thermometers, dict):
+        yield "Thermometer channels", ", ".join(str(name) for name in thermometers)
+
+
+def stated(details: Details, target: Target) -> list[Line]:
+    """What somebody has stated, and which of what a reader asks for nobody has."""
+    distance = "" if details.working_distance_mm is None else f"{details.working_distance_mm:g} mm"
+    rows = [
+        ("Lens", ", ".join(text for text in (details.lens, details.aperture, distance) if text)),
+        ("Mount", details.mount),
+        ("Target", _target(target)),
+        ("Target certificate", details.target_certificate),
+        ("Thermometer certificate", details.thermometer_certificate),
+        ("Places of the sensors", "; ".join(f"{name}: {place}" for name, place in details.sensor_positions.items())),
+    ]
+    if details.laboratory:
+        rows.append(("Laboratory", details.laboratory))
+    if details.note:
+        rows.append(("Note", details.note))
+    return [(name, text or NOT_STATED) for name, text in rows]
+
+
+def _target(target: Target) -> str:
+    discs = f"{target.columns} x {target.rows} discs of {target.diameter_mm:g} mm, {target.pitch_mm:g} mm apart"
+    text = f"{target.name}: {discs}"
+    if target.cmm_mm is None:
+        return f"{text}; nominal coordinates, printing error {1e3 * target.printing_error_mm:g} µm assumed"
+    return f"{text}; coordinates measured, standard uncertainty {1e3 * target.cmm_uncertainty_mm:g} µm"

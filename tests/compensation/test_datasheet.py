@@ -1,0 +1,230 @@
+"""A datasheet's numbers are right within what they claim, agree from night to night, and say how they came to be."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from compensation.cli import app
+from compensation.datasheet.datasheet import Datasheet, datasheet
+from compensation.datasheet.details import Details, load_details
+from compensation.datasheet.motions import motions
+from compensation.datasheet.quantity import NIGHTS, Contribution, Quantity, direct, pooled
+from compensation.drift.choosing import fit
+from compensation.drift.paper_fit import fit_paper
+from compensation.observations import Observations
+from compensation.reporting.datasheet_page import datasheet_json, datasheet_page
+from compensation.reporting.numbers import compact, measured, percent
+from compensation.reporting.pdf import pdf_of
+from foundation.errors import ConfigError
+
+from .conftest import Recorded
+from .drawn_cameras import Camera, Float, centres_px, drawn_camera, settled_degC
+from .drawn_nights import NOISE_PX, full_night, night
+from .synthetic import observations
+
+COEFFICIENTS = ("shift_I_per_K", "shift_J_per_K", "scale_per_K", "turn_per_K")
+
+
+def sheet_of(camera: Camera, seed: int, details: Details | None = None) -> Datasheet:
+    """With the paper's form alone, which is quick: it decides on no coefficient."""
+    made = night(camera, full_night(), seed)
+    return datasheet(made.observed, fit_paper(made.observed), details)
+
+
+@pytest.fixture(scope="module")
+def sheet() -> Datasheet:
+    made = night(drawn_camera(2003, "sag"), full_night(), 1)
+    return datasheet(made.observed, fit(made.observed))
+
+
+def at_rest_per_K(camera: Camera) -> Float:
+    """The true motions of a camera at rest, around its reference: least squares of the physics, not of the program."""
+    cold, warm = (centres_px(camera, settled_degC(camera, degC)[None], np.zeros((1, 2)))[0] for degC in (23.0, 25.0))
+    x, y = ((cold + warm) / 2 - (1223.5, 1023.5)).T
+    one, zero = np.ones(54), np.zeros(54)
+    terms = np.concatenate([np.stack([one, zero, x, -y], axis=1), np.stack([zero, one, y, x], axis=1)])
+    return np.linalg.lstsq(terms, ((warm - cold) / 2).T.ravel(), rcond=None)[0] * (1, 1, 1e6, 1e6)
+
+
+def test_the_coefficients_of_drawn_cameras_hold_the_truth_within_their_expanded_uncertainty():
+    inside, small = [], []
+    for seed in range(5):
+        camera = drawn_camera(2001 + seed)
+        known = sheet_of(camera, seed).by_key
+        for key, truth in zip(COEFFICIENTS, at_rest_per_K(camera), strict=True):
+            inside.append(abs(known[key].value - truth) <= known[key].expanded)
+        small.append(known["scale_per_K"].expanded / abs(known["scale_per_K"].value))
+    assert np.mean(inside) >= 0.85
+    assert np.median(small) < 0.05
+
+
+def test_two_nights_of_a_camera_agree(sheet: Datasheet):
+    made = night(drawn_camera(2003, "sag"), full_night(), 2)
+    other = datasheet(made.observed, fit(made.observed)).by_key
+    for one in sheet.quantities:
+        assert abs(one.value - other[one.key].value) <= math.hypot(one.expanded, other[one.key].expanded), one.key
+    assert "not measured" not in datasheet_page(sheet)
+    worse = sheet_of(drawn_camera(2003, "sag"), 1).by_key
+    assert math.isnan(worse["left_thermal_I"].value)
+
+
+def test_a_known_motion_is_found():
+    def drift(places: Float, above_K: float) -> Float:
+        x, y = (places - (1223.5, 1023.5)).T
+        scale, turn = 30e-6 * above_K, 5e-6 * above_K
+        return places + np.stack(
+            [0.01 * above_K + scale * x - turn * y, -0.02 * above_K + scale * y + turn * x], axis=1
+        )
+
+    seen = observations(drift)
+    found = motions(seen)
+    above = seen.chamber_degC - 24.0
+    np.testing.assert_allclose(found, above[:, None] * [0.01, -0.02, 30.0, 5.0], atol=1e-6)
+
+
+def test_a_budget_adds_up_and_its_expanded_uncertainty_is_twice_the_root(sheet: Datasheet):
+    for one in sheet.quantities:
+        assert one.contributions, one.key
+        total = math.sqrt(sum((line.sensitivity * line.u) ** 2 for line in one.contributions))
+        assert one.u == pytest.approx(total)
+        assert one.expanded == pytest.approx(2 * total)
+        assert {line.kind for line in one.contributions} <= {"A", "B"}
+        assert one.model
+
+
+def test_the_air_s_uncertainty_counts_in_what_depends_on_it():
+    known, worse = (sheet_of(drawn_camera(2003, "sag"), 1, Details(u_air_K=u_K)).by_key for u_K in (0.1, 0.5))
+    for key in (*COEFFICIENTS, "self_heating_K"):
+        assert worse[key].u > known[key].u
+    assert worse["hysteresis_I"].u == known["hysteresis_I"].u
+
+
+def test_several_nights_are_pooled_and_their_difference_is_a_contribution():
+    lines = (direct("noise", "A", 0.3, "px", ""), Contribution("air", "B", 0.1, "K", 2.0, ""))
+    one = Quantity("k", "g", "n", "px", 1.0, "m", lines)
+    both = pooled([one, replace(one, value=1.2)])
+    assert both.value == pytest.approx(1.1)
+    a, b, nights = both.contributions
+    assert a.amount == pytest.approx(0.3 / math.sqrt(2))
+    assert b.amount == pytest.approx(0.2)
+    assert (nights.source, nights.amount) == (NIGHTS, pytest.approx(0.1))
+    assert pooled([replace(one, value=math.nan), one]) == one
+
+
+def after(first: Observations, second: Observations) -> Observations:
+    """Both as one, the second two days later."""
+    later_ns = 2 * 86_400_000_000_000
+    columns = ("frame", "role", "chamber_degC", "camera_degC", "air_degC", "centres_px", "covariance_px2", "flags")
+    history = second.histories[0]
+    moved = replace(
+        history, **{name: getattr(history, name) + later_ns for name in ("ambient_ns", "powered_ns", "camera_ns")}
+    )
+    return replace(
+        first,
+        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in columns},
+        sessions=first.sessions + second.sessions,
+        session=np.concatenate([first.session, second.session + 1]),
+        time_ns=np.concatenate([first.time_ns, second.time_ns + later_ns]),
+        step_id=first.step_id + second.step_id,
+        reasons=first.reasons + second.reasons,
+        histories=(*first.histories, moved),
+    )
+
+
+def test_of_two_sessions_each_counts_and_their_difference_is_stated():
+    camera = drawn_camera(2003, "unrepeated")
+    one, other = (night(camera, full_night(), seed, session_id=f"night-{seed}").observed for seed in (1, 2))
+    both = after(one, other)
+    sheet = datasheet(both, fit_paper(both))
+    assert len(sheet.nights) == 2
+    for pooled_one, first, second in zip(sheet.quantities, *sheet.nights, strict=False):
+        assert pooled_one.value == pytest.approx((first.value + second.value) / 2)
+        assert NIGHTS in {line.source for line in pooled_one.contributions}
+    page = datasheet_page(sheet)
+    assert "From 2 sessions" in page
+    assert "One night was recorded" not in page
+    assert len(json.loads(datasheet_json(sheet))["nights"]) == 2
+
+
+def test_without_a_warm_up_the_sheet_says_that_it_was_not_measured():
+    made = night(drawn_camera(2001), full_night(with_warm_up=False))
+    one = datasheet(made.observed, fit_paper(made.observed))
+    assert math.isnan(one.by_key["settling_s"].value)
+    page = datasheet_page(one)
+    assert "not measured" in page
+    assert "no warm-up was recorded" in page
+    rows = {row["key"]: row for row in json.loads(datasheet_json(one))["quantities"]}
+    assert rows["settling_s"]["value"] is None
+    assert rows["scale_per_K"]["expanded_uncertainty"] > 0
+
+
+def test_the_page_states_what_was_stated_and_what_was_not(sheet: Datasheet, tmp_path: Path):
+    stated = tmp_path / "details.yaml"
+    stated.write_text("lens: 25 mm f/1.4\nu_air_K: 0.05\nsensor_positions: {air: beside the camera}\n")
+    page = datasheet_page(replace(sheet, details=load_details(stated)), [("Exposure", "100 ms")])
+    for text in ("25 mm f/1.4", "air: beside the camera", "100 ms", "not stated", "0.05 K (as stated)", "Figure 2."):
+        assert text in page
+    assert "assumed, since nobody stated it" in datasheet_page(sheet)
+    assert page == datasheet_page(replace(sheet, details=load_details(stated)), [("Exposure", "100 ms")])
+    stated.write_text("lense: 25 mm\n")
+    with pytest.raises(ConfigError, match="lense"):
+        load_details(stated)
+
+
+@pytest.mark.parametrize(
+    ("value", "expanded", "texts"),
+    [
+        (-0.018353, 0.000149, ("−0.01835", "0.00015")),
+        (1243.4, 16.2, ("1243", "16")),
+        (8.66, 0.0996, ("8.66", "0.10")),
+        (285.4, 134.0, ("290", "130")),
+        (0.0, 0.0, ("0", "–")),
+    ],
+)
+def test_a_value_has_the_decimals_of_its_uncertainty(value: float, expanded: float, texts: tuple[str, str]):
+    assert measured(value, expanded) == texts
+
+
+@pytest.mark.parametrize(
+    ("value", "u", "text"),
+    [(-0.06105, 0.00809, "−0.0611(81)"), (0.5, 0.02, "0.500(20)"), (12.3, 1.44, "12.3(1.4)"), (1.0, 0.0, "1")],
+)
+def test_a_coefficient_has_its_uncertainty_in_brackets(value: float, u: float, text: str):
+    assert compact(value, u) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(99.97, ">\xa099.9\xa0%"), (100, "100.0 %"), (0.01, "<\xa00.1\xa0%"), (0, "0.0 %")]
+)
+def test_a_share_is_never_rounded_to_all_or_none(value: float, text: str):
+    assert percent(value) == text
+
+
+def test_a_pdf_has_the_page_and_looks_nothing_up(sheet: Datasheet):
+    data = pdf_of(datasheet_page(sheet))
+    assert data.startswith(b"%PDF")
+    assert len(data) > 20_000
+
+
+def test_the_command_writes_what_the_name_says(recorded: Recorded, tmp_path: Path):
+    for name, begins in (("camera.html", "<!DOCTYPE html>"), ("camera.json", "{"), ("camera.pdf", "%PDF")):
+        done = CliRunner().invoke(app, ["datasheet", str(recorded.path), "-o", str(tmp_path / name)])
+        assert done.exit_code == 0, done.output
+        assert (tmp_path / name).read_bytes().startswith(begins.encode())
+    document = json.loads((tmp_path / "camera.json").read_text())
+    rows = {row["key"]: row for row in document["quantities"]}
+    assert rows["shift_J_per_K"]["value"] == pytest.approx(-0.03, abs=0.003)
+    assert document["equipment"]["Exposure"] == "100 ms"
+    refused = CliRunner().invoke(app, ["datasheet", str(recorded.path), "-o", str(tmp_path / "camera.doc")])
+    assert (refused.exit_code, "ends in .html, .pdf, .json" in refused.output) == (2, True)
+
+
+def test_the_noise_of_the_markers_is_small_beside_the_rest(sheet: Datasheet):
+    assert NOISE_PX / math.sqrt(54) < sheet.by_key["warm_up_shift_J"].u
