@@ -18,14 +18,14 @@ from drivers.wires.link import SerialSettings, open_link
 from foundation.errors import Unreachable
 
 _FIELD = re.compile(r"-?\d{3,4}\.\d")
-_DIGITS = re.compile(r"[01]{16,32}")
+_DIGITS = re.compile(r"[01]{26}|[01]{32}")
 
 
 def parse(heard: bytes) -> tuple[list[float], str] | None:
     """The analog fields and the digits of a reply to I; None until it has come whole; ValueError when it is none."""
     if not heard.endswith((b"\r", b"\n")):
         return None
-    fields = heard.decode("ascii").split()
+    fields = [field for field in heard.decode("ascii").strip("\r\n").split(" ") if field]
     if len(fields) < 3 or not _DIGITS.fullmatch(fields[-1]):
         raise ValueError("expected numbers, then digits")
     if not all(_FIELD.fullmatch(field) and len(field) == 6 for field in fields[:-1]):
@@ -46,6 +46,7 @@ class Language:
 
     def __init__(self, name: str, settings: Ascii2Settings) -> None:
         self._settings = settings
+        self._shape: tuple[int, int] | None = None  # fields and digits of the last reply
         line = SerialSettings(settings.baud, 1)
         self._client = LineClient(
             name,
@@ -100,15 +101,18 @@ class Language:
         """It has no dead-man."""
 
     def _read(self) -> tuple[list[float], str]:
-        fields = max(*self._settings.write_fields, 1)
+        return self._client.query(self._bytes("I"), self._answer)
 
-        def answer(heard: bytes) -> tuple[list[float], str] | None:
-            found = parse(heard)
-            if found is not None and len(found[0]) <= fields:
-                raise ValueError(f"{len(found[0])} fields, and write_fields names field {fields}")
-            return found
-
-        return self._client.query(self._bytes("I"), answer)
+    def _answer(self, heard: bytes) -> tuple[list[float], str] | None:
+        """As parse; a unit always sends as many fields and digits: a reply that lost some bytes gives itself away."""
+        if (found := parse(heard)) is None:
+            return None
+        if len(found[0]) <= max(*self._settings.write_fields, 1):
+            raise ValueError(f"{len(found[0])} fields, and write_fields is {list(self._settings.write_fields)}")
+        before, self._shape = self._shape, (len(found[0]), len(found[1]))
+        if before not in (None, self._shape):
+            raise ValueError(f"{self._shape[0]} fields and {self._shape[1]} digits, before {before[0]} and {before[1]}")
+        return found
 
     def _write(self, degC: float | None, bits: dict[int, bool]) -> None:
         """What is not named stays as it was read just before."""

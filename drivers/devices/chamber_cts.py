@@ -127,7 +127,7 @@ class Language:
                 reply = heard.decode("latin-1") if len(heard) >= length else None
             if reply is None:
                 return None
-            if (found := parse(reply)) is None:
+            if len(reply) != length or (found := parse(reply)) is None:
                 raise ValueError(f"not a reply to {text!r}")
             return found
 

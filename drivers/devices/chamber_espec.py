@@ -31,7 +31,7 @@ def _line(heard: bytes) -> str | None:
 
 
 def _numbers(text: str, count: int) -> list[float]:
-    fields = [field.strip() for field in text.split(",")]
+    fields = [field.strip(" ") for field in text.split(",")]
     if len(fields) != count or not all(_NUMBER.fullmatch(field) for field in fields):
         raise ValueError(f"expected {count} numbers")
     return [float(field) for field in fields]
@@ -131,7 +131,7 @@ class Language:
             if line is None:
                 return None
             self._refuse(line, "MON?")
-            fields = [field.strip() for field in line.split(",")]
+            fields = [field.strip(" ") for field in line.split(",")]
             if len(fields) < 4 or not _NUMBER.fullmatch(fields[0]) or not fields[-1].isdigit():
                 raise ValueError("expected temperature, humidity, mode, number of alarms")
             return float(fields[0]), fields[1], fields[2], int(fields[-1])

@@ -19,10 +19,17 @@ from pydantic import Field
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException
 from pymodbus.pdu import ModbusPDU
-from pymodbus.pdu.bit_message import ReadCoilsRequest, ReadDiscreteInputsRequest
+from pymodbus.pdu.bit_message import (
+    ReadCoilsRequest,
+    ReadCoilsResponse,
+    ReadDiscreteInputsRequest,
+    ReadDiscreteInputsResponse,
+)
 from pymodbus.pdu.register_message import (
     ReadHoldingRegistersRequest,
+    ReadHoldingRegistersResponse,
     ReadInputRegistersRequest,
+    ReadInputRegistersResponse,
     WriteMultipleRegistersRequest,
     WriteSingleRegisterRequest,
 )
@@ -103,6 +110,27 @@ class WriteCoilWord(ModbusPDU):
         self.registers = [value]
 
 
+def _strict(reply: type[ModbusPDU]) -> type[ModbusPDU]:
+    """`reply` with a byte count that must be that of its data: pymodbus takes bits whatever it says, and registers with
+    one byte too many."""
+
+    def decode(self: ModbusPDU, data: bytes) -> None:
+        if data[0] != len(data) - 1:
+            raise ValueError(f"byte count {data[0]} before {len(data) - 1} bytes")
+        reply.decode(self, data)
+
+    return type(reply.__name__, (reply,), {"decode": decode})
+
+
+REPLIES = (
+    WriteCoilWord,
+    *map(
+        _strict,
+        (ReadCoilsResponse, ReadDiscreteInputsResponse, ReadHoldingRegistersResponse, ReadInputRegistersResponse),
+    ),
+)
+
+
 class _SerialClient(ModbusSerialClient):
     """pymodbus over pyserial, without its polling."""
 
@@ -158,7 +186,8 @@ class ModbusClient:
         if self._client is not None:
             return
         client = self._make()
-        client.register(WriteCoilWord)
+        for reply in REPLIES:
+            client.register(reply)
         try:
             client.connect()
         except (OSError, termios.error) as error:
