@@ -12,12 +12,8 @@ from collections.abc import Callable
 from drivers.settings import Identity
 from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_connection import Connection, FrameCount, Shot
-from drivers.wires.camera_settings import (
-    EffectiveSettings,
-    GigeCameraSettings,
-    device_error,
-    lacks_control,
-)
+from drivers.wires.camera_errors import device_error, lacks_control
+from drivers.wires.camera_settings import EffectiveSettings, GigeCameraSettings
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
 from foundation.lane import Lane, Result

@@ -18,7 +18,6 @@ from drivers.wires.aravis_library import Library, library
 
 PACKET_SOCKET_DISABLED = 1  # ArvGvStreamOption: else root would get AF_PACKET and everyone else a UDP socket
 PACKET_SIZE_ADJUSTMENT_NEVER = 0  # ArvGvPacketSizeAdjustment
-ACQUISITION_MODE_CONTINUOUS = 0  # ArvAcquisitionMode
 BUFFER_SUCCESS = 0
 BUFFER_STATUS = {
     -1: "unknown",
@@ -31,6 +30,9 @@ BUFFER_STATUS = {
     6: "filling",
     7: "aborted",
 }
+
+# Kinds of nodes that carry a float; the others with a number carry an integer.
+FLOAT_KINDS = frozenset({"Float", "FloatReg", "Converter", "SwissKnife"})
 
 # The fundamental GTypes (gtype.h: number << 2) that properties are set with.
 G_TYPE_INT, G_TYPE_UINT, G_TYPE_DOUBLE = 6 << 2, 7 << 2, 15 << 2
@@ -96,27 +98,51 @@ class GigeDevice:
         """Whether we may write."""
         return bool(self._library.call("arv_gv_device_is_controller", self._device))
 
+    def kind(self, feature: str) -> str:
+        """The GenICam kind of a feature ("Float", "Command", "IntReg", ...); "" when the camera has none."""
+        node = self._library.call("arv_device_get_feature", self._device, feature.encode())
+        kind = (self._library.call("arv_dom_node_get_node_name", node) or b"").decode() if node else ""
+        return "" if kind == "Category" else kind
+
     def available(self, feature: str) -> bool:
         """Whether the camera has the feature and offers it now."""
-        return bool(self._call("arv_camera_is_feature_available", feature.encode()))
+        if not self.kind(feature):
+            return False
+        node = self._library.call("arv_device_get_feature", self._device, feature.encode())
+        return bool(self._library.call("arv_gc_feature_node_is_implemented", node)) and bool(
+            self._call("arv_camera_is_feature_available", feature.encode())
+        )
 
-    def get_float(self, feature: str) -> float:
-        """A Float feature."""
-        return float(self._call("arv_camera_get_float", feature.encode()))
+    def get_number(self, feature: str) -> float:
+        """An Integer or Float feature."""
+        if self.kind(feature) in FLOAT_KINDS:
+            return float(self._call("arv_camera_get_float", feature.encode()))
+        return float(self._call("arv_camera_get_integer", feature.encode()))
 
-    def set_float(self, feature: str, value: float) -> None:
-        """Write a Float feature."""
-        self._call("arv_camera_set_float", feature.encode(), value)
+    def set_number(self, feature: str, value: float) -> None:
+        """Write an Integer (rounded) or Float feature."""
+        if self.kind(feature) in FLOAT_KINDS:
+            self._call("arv_camera_set_float", feature.encode(), value)
+        else:
+            self._call("arv_camera_set_integer", feature.encode(), round(value))
 
-    def set_integer(self, feature: str, value: int) -> None:
-        """Write an Integer feature."""
-        self._call("arv_camera_set_integer", feature.encode(), value)
+    def bounds(self, feature: str) -> tuple[float, float]:
+        """Minimum and maximum of an Integer or Float feature."""
+        if self.kind(feature) in FLOAT_KINDS:
+            lowest, highest = ctypes.c_double(), ctypes.c_double()
+            name = "arv_camera_get_float_bounds"
+        else:
+            lowest, highest = ctypes.c_int64(), ctypes.c_int64()
+            name = "arv_camera_get_integer_bounds"
+        self._call(name, feature.encode(), ctypes.byref(lowest), ctypes.byref(highest))
+        return float(lowest.value), float(highest.value)
 
-    def integer_bounds(self, feature: str) -> tuple[int, int]:
-        """Minimum and maximum of an Integer feature."""
-        low, high = ctypes.c_int64(), ctypes.c_int64()
-        self._call("arv_camera_get_integer_bounds", feature.encode(), ctypes.byref(low), ctypes.byref(high))
-        return low.value, high.value
+    def unit(self, feature: str) -> str:
+        """The unit that the camera states for an Integer or Float feature; "" when it states none."""
+        node = self._library.call("arv_device_get_feature", self._device, feature.encode())
+        is_float = self.kind(feature) in FLOAT_KINDS
+        get = "arv_gc_float_get_unit" if is_float else "arv_gc_integer_get_unit"
+        return (self._library.call(get, node) or b"").decode(errors="replace").strip()
 
     def get_string(self, feature: str) -> str:
         """A String or Enumeration feature."""
@@ -140,58 +166,9 @@ class GigeDevice:
         """Write a Boolean feature."""
         self._call("arv_camera_set_boolean", feature.encode(), value)
 
-    def sensor_size(self) -> tuple[int, int]:
-        """Width and height of the sensor, px."""
-        width, height = ctypes.c_int(), ctypes.c_int()
-        self._call("arv_camera_get_sensor_size", ctypes.byref(width), ctypes.byref(height))
-        return width.value, height.value
-
-    def set_region(self, x: int, y: int, width: int, height: int) -> None:
-        """Write the region of interest, px."""
-        self._call("arv_camera_set_region", x, y, width, height)
-
-    def region(self) -> tuple[int, int, int, int]:
-        """x, y, width, height of the region of interest, px."""
-        values = [ctypes.c_int() for _ in range(4)]
-        self._call("arv_camera_get_region", *(ctypes.byref(value) for value in values))
-        x, y, width, height = (value.value for value in values)
-        return x, y, width, height
-
-    def set_pixel_format(self, pixel_format: str) -> None:
-        """Write the pixel format by its GenICam name."""
-        self._call("arv_camera_set_pixel_format_from_string", pixel_format.encode())
-
-    def pixel_format(self) -> str:
-        """GenICam name of the pixel format."""
-        return (self._call("arv_camera_get_pixel_format_as_string") or b"").decode(errors="replace")
-
-    def payload_bytes(self) -> int:
-        """Bytes of one frame with the present settings."""
-        return int(self._call("arv_camera_get_payload"))
-
-    def set_continuous(self) -> None:
-        """Acquire until stopped."""
-        self._call("arv_camera_set_acquisition_mode", ACQUISITION_MODE_CONTINUOUS)
-
-    def set_frame_rate(self, rate_hz: float) -> None:
-        """Write the rate; turns triggers off, and clamps silently to the camera's bounds."""
-        self._call("arv_camera_set_frame_rate", rate_hz)
-
-    def frame_rate_hz(self) -> float:
-        """The rate in force."""
-        return float(self._call("arv_camera_get_frame_rate"))
-
-    def set_trigger(self, source: str) -> None:
-        """Each trigger of `source` starts one frame."""
-        self._call("arv_camera_set_trigger", source.encode())
-
-    def clear_triggers(self) -> None:
-        """Frames follow the frame rate."""
-        self._call("arv_camera_clear_triggers")
-
-    def software_trigger(self) -> None:
-        """Start one frame now."""
-        self._call("arv_camera_software_trigger")
+    def execute(self, feature: str) -> None:
+        """Give a Command."""
+        self._call("arv_camera_execute_command", feature.encode())
 
     def set_packet_size(self, size: int) -> None:
         """Bytes of an IP packet of the stream; Aravis will not change it afterwards."""
@@ -205,14 +182,6 @@ class GigeDevice:
     def packet_size(self) -> int:
         """Bytes of an IP packet of the stream."""
         return int(self._call("arv_camera_gv_get_packet_size"))
-
-    def set_packet_delay(self, delay_ns: int) -> None:
-        """Pause between two packets."""
-        self._call("arv_camera_gv_set_packet_delay", delay_ns)
-
-    def packet_delay_ns(self) -> int:
-        """The pause in force."""
-        return int(self._call("arv_camera_gv_get_packet_delay"))
 
     def start_acquisition(self) -> None:
         """Frames flow from now on."""

@@ -11,9 +11,6 @@ import threading
 from collections import Counter
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.wires.aravis import (
     BUFFER_STATUS,
     BUFFER_SUCCESS,
@@ -25,18 +22,18 @@ from drivers.wires.aravis import (
     GigeStream,
 )
 from drivers.wires.aravis_library import AravisError
-from drivers.wires.camera_settings import (
-    BYTES_PER_PIXEL,
-    NO_CONTROL_HINT,
-    GigeCameraSettings,
-    TemperatureFeature,
+from drivers.wires.camera_apply import (
+    TICK_FREQUENCY_HIGH,
+    TICK_FREQUENCY_LOW,
     apply_settings,
-    find_temperature,
     read_identity,
-    read_temperature,
     set_exposure,
-    temperature_place,
+    software_trigger,
 )
+from drivers.wires.camera_errors import NO_CONTROL_HINT
+from drivers.wires.camera_pixels import Pixels, frame_bytes, unpacked
+from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
+from drivers.wires.camera_temperature import find_temperature, read_temperature, temperature_place
 from foundation.clock import NS_PER_S, Clock, block_until, seconds_ns
 from foundation.errors import Refused
 from foundation.readings import Cause
@@ -48,8 +45,7 @@ PACKET_REQUEST_RATIO = 1.0
 FRAME_RETENTION_PERIODS = 0.9
 SOCKET_BUFFER_FIXED = 0
 
-# Bootstrap registers (GigE Vision 1.2, section 28): tick frequency, timestamp control and latched value.
-TICK_FREQUENCY_HIGH, TICK_FREQUENCY_LOW = 0x093C, 0x0940
+# Bootstrap registers (GigE Vision 1.2, section 28): timestamp control and latched value.
 TIMESTAMP_CONTROL, TIMESTAMP_LATCH = 0x0944, 2
 TIMESTAMP_HIGH, TIMESTAMP_LOW = 0x0948, 0x094C
 LATCH_TRIES = 3
@@ -63,8 +59,6 @@ FUTURE_NS = NS_PER_S
 TRANSFER_TIMEOUT_S = 2.0  # real seconds beyond the exposure: read-out, 5 MB on the wire, resends, a busy host
 CONTROL_RETRY_S = 1.0
 FRAME_ID_WRAP = 65535  # 16-bit frame ids count 1..65535 and skip 0
-
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 class FrameCount:
@@ -210,7 +204,7 @@ class Connection:
         self.prepare(exposure_s)
         block_until(self._clock, due_ns)
         trigger_ns = self._clock.now_ns()
-        self._device.software_trigger()
+        software_trigger(self._device)
         self._counts["triggers"] += 1
         return self._take(trigger_ns, self._exposure_s + self._timeout_s)
 
@@ -264,7 +258,7 @@ class Connection:
     def _set_exposure(self, exposure_s: float) -> None:
         if exposure_s != self._exposure_asked_s:
             self._exposure_asked_s = math.nan  # unknown until the camera has taken it
-            self._exposure_s = set_exposure(self._name, self._device, exposure_s)
+            self._exposure_s = set_exposure(self._name, self._device, self._settings, exposure_s)
             self._exposure_asked_s = exposure_s
 
     def _take(self, newer_than_ns: int, timeout_s: float) -> Shot | None:
@@ -298,15 +292,15 @@ class Connection:
     def _image(self, stream: GigeStream, buffer: int, info: BufferInfo) -> Pixels | None:
         """The pixels in an array of their own, or None when the frame is not whole."""
         shape = self.effective.height_px, self.effective.width_px
-        bytes_per_pixel = BYTES_PER_PIXEL[self.effective.pixel_format]
+        pixel_format = self.effective.pixel_format
         if info.status != BUFFER_SUCCESS:
             self._counts[f"incomplete_{BUFFER_STATUS.get(info.status, 'unknown')}"] += 1
             return None
-        data = stream.copy_bytes(buffer, shape[0] * shape[1] * bytes_per_pixel)
+        data = stream.copy_bytes(buffer, frame_bytes(pixel_format, shape[0] * shape[1]))
         if data is None or (info.height, info.width) != shape:
             self._counts["wrong_size"] += 1
             return None
-        image: Pixels = data.reshape(shape) if bytes_per_pixel == 1 else data.view(np.dtype("<u2")).reshape(shape)
+        image = unpacked(pixel_format, data, shape)
         image.setflags(write=False)
         return image
 

@@ -10,7 +10,8 @@ import pytest
 from drivers.devices.camera_gige import Camera
 from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from drivers.wires.camera_connection import FrameCount
-from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature, device_error
+from drivers.wires.camera_errors import device_error
+from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
 from foundation.errors import DeviceError, Refused, Unreachable
 from foundation.readings import Quality
@@ -198,7 +199,7 @@ async def test_a_missing_temperature_is_a_bad_reading_with_its_reason():
     async with Opened() as camera:
         (reading,) = await camera.read()
     assert (reading.channel, reading.unit, reading.quality) == ("camera.temperature", "degC", Quality.BAD)
-    assert reading.reason == "the camera has no DeviceTemperature and no TemperatureAbs"
+    assert reading.reason == "the camera has no DeviceTemperature and no TemperatureAbs and no CurrentTemperature"
 
 
 @pytest.mark.usefixtures("stock_camera")

@@ -1,0 +1,78 @@
+"""Where a camera shows its own temperature, and reading it."""
+
+from __future__ import annotations
+
+import math
+
+from drivers.wires.aravis import GigeDevice
+from drivers.wires.aravis_library import AravisError
+from drivers.wires.camera_dialects import TEMPERATURE_ENTRIES, TEMPERATURES
+from drivers.wires.camera_errors import is_silence
+from drivers.wires.camera_settings import TemperatureFeature
+from foundation.readings import Cause
+
+
+def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> tuple[TemperatureFeature | None, str]:
+    """The place to read the temperature from, its selector set; or None and why there is none.
+
+    AravisError when the camera does not answer: then nothing is known about it.
+    """
+    for place in (wanted,) if wanted else _usual(device):
+        try:
+            if place.feature is not None and not device.available(place.feature):
+                continue
+            if place.selector is not None and place.entry is not None:
+                device.set_string(place.selector, place.entry)  # once: selector and value are two transactions
+        except AravisError as error:
+            if is_silence(error):
+                raise
+            return None, f"{_named(place)} cannot be read ({error}){_offered(device, place)}"
+        return place, ""
+    names = [wanted.feature or ""] if wanted else [feature for feature, _ in TEMPERATURES]
+    return None, f"the camera has no {' and no '.join(names)}"
+
+
+def _usual(device: GigeDevice) -> list[TemperatureFeature]:
+    """The makes' features, each with the entry nearest to the sensor that this camera's selector offers."""
+    places: list[TemperatureFeature] = []
+    for feature, selector in TEMPERATURES:
+        offered = device.entries(selector) if selector and device.available(selector) else ()
+        entry = next((entry for entry in TEMPERATURE_ENTRIES if entry in offered), None)
+        places.append(TemperatureFeature(feature=feature, selector=selector if entry else None, entry=entry))
+    return places
+
+
+def temperature_place(device: GigeDevice, place: TemperatureFeature) -> str:
+    """Where that is, and what the camera offers for its selector, in words."""
+    return f"{_named(place)}{_offered(device, place)}"
+
+
+def _named(place: TemperatureFeature) -> str:
+    if place.feature is None:
+        return f"register {place.register_address or 0:#x}"
+    return place.feature if place.selector is None else f"{place.feature} of {place.selector} {place.entry!r}"
+
+
+def _offered(device: GigeDevice, place: TemperatureFeature) -> str:
+    """What the camera offers for the selector, as the end of a sentence; "" when there is none, or it does not say."""
+    try:
+        entries = device.entries(place.selector) if place.selector is not None else ()
+    except AravisError:
+        return ""
+    return f"; for {place.selector} the camera offers {', '.join(entries)}" if entries else ""
+
+
+def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[float, str, Cause]:
+    """Temperature in degC and ""; or NaN, the reason and its cause. Never raises: a run continues without it."""
+    try:
+        if place.register_address is not None:
+            value_degC = (device.read_register(place.register_address) & place.mask) * place.scale + place.offset
+        else:
+            value_degC = device.get_number(place.feature or "")
+    except AravisError as error:
+        return math.nan, str(error), "wire" if is_silence(error) else "device"
+    if value_degC == 0.0:  # what a faulty firmware shows; a sensor beside its own electronics is warmer
+        return math.nan, "the camera shows exactly 0 degC", "device"
+    if not place.min_degC <= value_degC <= place.max_degC:
+        return math.nan, f"{value_degC:g} degC is outside {place.min_degC:g}..{place.max_degC:g}", "device"
+    return value_degC, "", ""
