@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from compensation.observations import Observations
 from experiments.steps import Role
 from tests.compensation.drawn_cameras import REPEATING, UNREPEATING, drawn_camera
-from tests.compensation.drawn_nights import Night, Stretch, cycle, full_night, night, reference, warm_up
+from tests.compensation.drawn_nights import Night, Stretch, followed_cycle, full_night, night, reference, warm_up
 
 Float = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def case(group: str, number: int, learned_from: str = TRAININGS[0]) -> Case:
     if group != GROUPS[0]:
         effects.append(UNREPEATING[rng.integers(2)])
     camera = drawn_camera(seed, *effects)
-    parts = full_night() if learned_from == TRAININGS[0] else [*warm_up(), *reference(), *_followed_cycle()]
+    parts = full_night() if learned_from == TRAININGS[0] else [*warm_up(), *reference(), *followed_cycle()]
     first = night(camera, parts, seed, session_id="night-1")
     begin = [*warm_up(20.0), *reference()]
     second = night(camera, [*begin, *_drive(_STEPS_DEGC, _STEP_S)], seed + 10_000, session_id="night-2")
@@ -84,16 +84,6 @@ def case(group: str, number: int, learned_from: str = TRAININGS[0]) -> Case:
             _question(TASKS[3], third, jumps, Role.VALIDATION, at_reference),
         ),
     )
-
-
-def _followed_cycle() -> list[Stretch]:
-    """The thermal cycle with a frame every two minutes on the way to each of its set-points. They are taken as those of
-    a warm-up are: of a camera that is not at rest, and at no set-point that could be left out."""
-    parts: list[Stretch] = []
-    for stretch in cycle():
-        frames = stretch.seconds // 120
-        parts += [Stretch(stretch.set_point_degC, 60, "warm_up", frames, 120.0), replace(stretch, seconds=60)]
-    return parts
 
 
 def _drive(way_degC: tuple[int, ...], dwell_s: int) -> list[Stretch]:

@@ -88,6 +88,16 @@ def cycle(
     ]
 
 
+def followed_cycle() -> list[Stretch]:
+    """The thermal cycle with a frame every two minutes on the way to each of its set-points. They are taken as those of
+    a warm-up are: of a camera that is not at rest, and at no set-point that could be left out."""
+    parts: list[Stretch] = []
+    for stretch in cycle():
+        frames = stretch.seconds // 120
+        parts += [Stretch(stretch.set_point_degC, 60, "warm_up", frames, 120.0), replace(stretch, seconds=60)]
+    return parts
+
+
 def full_night(cycles: int = 1, *, with_warm_up: bool = True) -> list[Stretch]:
     """A warm-up, or a camera that is switched on 55 min before the reference; then the cycle."""
     begin = warm_up() if with_warm_up else [Stretch(24.0, 600)]

@@ -20,7 +20,7 @@ from compensation.reporting.report import write_report
 from experiments.steps import Role
 
 from .drawn_cameras import Camera, drawn_camera
-from .drawn_nights import START_NS, Bump, Night, full_night, night
+from .drawn_nights import START_NS, Bump, Night, followed_cycle, full_night, night, reference, warm_up
 
 AT_H = 13.0
 SHIFT_PX = np.array([0.03, -0.04])
@@ -59,6 +59,16 @@ def test_a_bump_of_a_twentieth_of_a_pixel_is_found_when_and_how_far(seed: int) -
 def test_a_clean_night_has_none(seed: int) -> None:
     effects = ("creep", "coarse_sensor") if seed % 2 else ("sag", "far_air")
     assert find_bumps(night(drawn_camera(seed, *effects), full_night(), seed).observed) == ()
+
+
+@pytest.mark.parametrize("seed", [2002, 2005])
+def test_a_camera_on_its_way_is_not_taken_for_one_that_was_touched(seed: int) -> None:
+    camera = drawn_camera(seed, "creep", "coarse_sensor")
+    parts = [*warm_up(), *reference(), *followed_cycle()]
+    assert find_bumps(night(camera, parts, seed).observed) == ()
+    (found,) = find_bumps(night(camera, parts, seed, bumps=[Bump(AT_H, SHIFT_PX)]).observed)
+    assert hours(found.after_ns) - 0.3 < AT_H < hours(found.before_ns) + 0.3
+    assert np.array(found.motions_px[:2]) == pytest.approx(SHIFT_PX, abs=0.01)
 
 
 @pytest.mark.parametrize("seed", range(2))
