@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from foundation.documents import Document
+from foundation.errors import DeviceFault
 
 DeviceName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]  # the first part of its channels
 PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]
@@ -78,9 +79,37 @@ class CameraSettings(Polled):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Which camera has answered."""
+    """Which device has answered; a field that it does not tell is "". by_map: vendor and model are those of a register
+    map or profile, which the device itself does not tell."""
 
     vendor: str
     model: str
     serial_number: str
     version: str
+    by_map: bool = False
+
+    def __str__(self) -> str:
+        told = [f"serial number {self.serial_number}"] if self.serial_number else []
+        told += [f"version {self.version}"] if self.version else []
+        named = " ".join(part for part in (self.vendor, self.model) if part) or "a device that does not tell its make"
+        return ", ".join([f"{named} (by its register map)" if self.by_map else named, *told])
+
+    def is_another_than(self, before: Identity) -> bool:
+        """Whether something that both tell differs: one that tells nothing cannot be told from another of its kind."""
+        pairs = (
+            (self.vendor, before.vendor),
+            (self.model, before.model),
+            (self.serial_number, before.serial_number),
+            (self.version, before.version),
+        )
+        return any(now and then and now != then for now, then in pairs)
+
+
+def same_device(device: str, found: Identity, before: Identity | None) -> Identity:
+    """What has answered; DeviceFault, which names both, when another one answered before: it was exchanged, and nothing
+    is known of the new one."""
+    if before is not None and found.is_another_than(before):
+        raise DeviceFault(
+            device, f"was exchanged: {found} answers where {before} answered before; not used until a new start"
+        )
+    return found

@@ -39,6 +39,7 @@ class Camera:
         self.restarted = ""  # why it has, or may have, restarted between the last open and the one before; "" if not
         self._frames = FrameCount()
         self._counts: Counter[str] = Counter()
+        self._answered: Identity | None = None  # the first time
 
     @property
     def name(self) -> str:
@@ -199,7 +200,10 @@ class Camera:
 
     def _connect(self) -> None:
         self._disconnect()
-        self._connection = Connection(self._name, self.settings, self._clock, self._frames, self._counts)
+        self._connection = Connection(
+            self._name, self.settings, self._clock, self._frames, self._counts, self._answered
+        )
+        self._answered = self._connection.identity
         self._counts["opened"] += 1
 
     def _disconnect(self) -> None:

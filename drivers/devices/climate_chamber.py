@@ -14,6 +14,7 @@ from typing import Protocol, cast
 
 from drivers.devices.chamber_language import ChamberLanguage, ChamberState
 from drivers.devices.chamber_settings import ChamberUnitSettings
+from drivers.settings import Identity, same_device
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
 from foundation.lane import Lane, Result
@@ -39,7 +40,7 @@ class ClimateChamber:
         self, name: str, settings: ChamberUnitSettings, allowed_degC: tuple[float, float], clock: Clock
     ) -> None:
         self.name = name
-        self.identity = ""
+        self.identity: Identity | None = None
         self.dead_man = ""
         self._settings = settings
         self._allowed_degC = allowed_degC
@@ -123,10 +124,12 @@ class ClimateChamber:
     # Below: in the lane's thread.
 
     def _check(self) -> None:
-        identity = self._language.identity()
-        if self._settings.identity not in identity:
-            raise DeviceFault(self.name, f"it says that it is {identity!r}, not {self._settings.identity!r}; not used")
-        self.identity = identity
+        told = self._language.identity()
+        if self._settings.identity not in told:
+            raise DeviceFault(self.name, f"it says that it is {told!r}, not {self._settings.identity!r}; not used")
+        protocol = str(self._settings.model_dump()["protocol"])
+        found = Identity("", told or f"climate chamber that speaks {protocol}", "", "", by_map=not told)
+        self.identity = same_device(self.name, found, self.identity)
         self._check_limits()
         self._is_checked = True
 

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from drivers.devices.flap_travel import POLL_S, Travel
 from drivers.devices.motion import Motion, Turn
-from drivers.settings import Polled
+from drivers.settings import Identity, Polled, same_device
 from foundation.addresses import TcpAddress
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Superseded, Unreachable
@@ -23,7 +23,7 @@ from foundation.lane import Lane, Result
 from foundation.readings import Quality, Reading, bad_reading
 
 _VENDOR_POLOLU = 0x1FFB
-_PRODUCTS_JRK_G2 = {0x00B7, 0x00B9, 0x00BF, 0x00C1, 0x00C5}
+_PRODUCTS_JRK_G2 = {0x00B7: "18v27", 0x00B9: "24v21", 0x00BF: "18v19", 0x00C1: "24v13", 0x00C5: "21v3"}
 _TO_DEVICE, _TO_HOST = 0x40, 0xC0
 _SET_TARGET, _STOP_MOTOR, _GET_VARIABLES, _GET_RAM_SETTINGS = 0x84, 0x87, 0xE5, 0xEA
 _CLEAR_HALTING = 1  # value of _GET_VARIABLES: clear the errors whose cause is gone
@@ -80,6 +80,7 @@ class _UsbDevice(Protocol):
     """What of a pyusb device is used here; pyusb makes these attributes at run time."""
 
     idProduct: int
+    bcdDevice: int
     iSerialNumber: int
 
     def ctrl_transfer(
@@ -102,6 +103,7 @@ class Flap:
         self._lane: Lane | None = None
         self._device: _UsbDevice | None = None
         self._max_duty = (0, 0)
+        self.identity: Identity | None = None  # which controller has answered
         self.is_shut = False  # the last movement has confirmed it
         self._commanded = False  # a target was sent and the motor not stopped since
         self._motion = Motion(name)
@@ -209,6 +211,7 @@ class Flap:
             raise Unreachable(self.name, f"USB devices cannot be listed ({error})") from error
         self._device = self._chosen(candidates)
         try:
+            self.identity = same_device(self.name, self._identity_of(self._device), self.identity)
             self._check_settings(self._device)
         except DeviceError:
             self._release()
@@ -238,6 +241,12 @@ class Flap:
             raise self._error(denied, "serial number") from denied
         text = f"no Jrk G2 with serial number {self._settings.serial_number}"
         raise Unreachable(self.name, f"{text}, only {', '.join(sorted(present)) or 'none'}")
+
+    def _identity_of(self, device: _UsbDevice) -> Identity:
+        """Its serial number is what it was found by; the version is that of its firmware, binary coded decimal."""
+        version = f"{device.bcdDevice >> 8:x}.{device.bcdDevice & 0xFF:02x}"
+        model = f"Jrk G2 {_PRODUCTS_JRK_G2[device.idProduct]}"
+        return Identity("Pololu", model, self._settings.serial_number, version)
 
     def _check_settings(self, device: _UsbDevice) -> None:
         """Those in force, that is in RAM; they are read before every target, because a restart may change them."""

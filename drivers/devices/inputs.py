@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.settings import DeviceName, Line, OnBus
+from drivers.settings import DeviceName, Identity, Line, OnBus
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import RegisterMap
@@ -55,8 +55,14 @@ class Inputs:
             if point not in register_map.points:
                 raise ConfigError(f"{name}.{contact}: register map {register_map.model} has no {point}")
 
+    @property
+    def identity(self) -> Identity | None:
+        """Which unit has answered; None before `open`."""
+        return self._unit.identity
+
     async def open(self) -> None:
-        """See that the unit answers; raises DeviceError."""
+        """See that the unit answers, and which it is; raises DeviceError."""
+        await self._unit.probe()
         await self.read()
 
     async def close(self) -> None:

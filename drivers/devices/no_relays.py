@@ -15,6 +15,7 @@ class NoRelays:
     the guard's rules compare the chamber with it; no wire follows it. camera_power always reads on."""
 
     has_timer = False
+    identity = None
 
     def __init__(self, name: str, clock: Clock) -> None:
         self.name = name

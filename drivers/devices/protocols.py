@@ -16,6 +16,11 @@ class Device(Protocol):
         """The configured name, the first part of its channels."""
         ...
 
+    @property
+    def identity(self) -> Identity | None:
+        """Which device has answered; None while that is not known, and where there is no device to ask."""
+        ...
+
     async def open(self) -> None:
         """Connect, check identity and settings; raises DeviceError."""
         ...

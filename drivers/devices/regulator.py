@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 
+from drivers.settings import Identity
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit, is_confirmed
 from drivers.wires.registers import RegisterMap, Sample, Snapshot
@@ -51,6 +52,11 @@ class Regulator:
         self._status = [
             name for name, point in register_map.points.items() if name in confirming or AUTOTUNE in point.bits.values()
         ]
+
+    @property
+    def identity(self) -> Identity | None:
+        """Which unit has answered; None before `open`."""
+        return self._unit.identity
 
     async def open(self) -> None:
         """Probe identity and scaling, enable writing, RAM mode, each confirmed; neither runs nor stops control."""

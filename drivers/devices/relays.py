@@ -8,11 +8,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.settings import OnBus, PollPeriod_s
+from drivers.settings import Identity, OnBus, PollPeriod_s
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import Point, RegisterMap
-from foundation.errors import ConfigError, DeviceError, DeviceFault
+from foundation.errors import ConfigError, DeviceError, DeviceFault, Unreachable
 from foundation.readings import Reading
 
 COIL_ON = 0xFF00
@@ -54,20 +54,27 @@ class Relays:
         self._safe_off = tuple(channel for channel in channels if channel != CAMERA_POWER)
         self._clock = bus.clock
         self._lock = asyncio.Lock()  # a write and its read-back stay together
+        self._probe_due = True
         for channel, point in self._points.items():
             if point not in register_map.points:
                 raise ConfigError(f"{name}.{channel}: register map {register_map.model} has no {point}")
 
+    @property
+    def identity(self) -> Identity | None:
+        """Which board has answered; None before `open`."""
+        return self._unit.identity
+
     async def open(self) -> None:
-        """See that the board answers; no relay changes."""
-        await self._states()
+        """See that the board answers, and which it is; no relay changes."""
+        await self._known()
 
     async def close(self) -> None:
         """Nothing to let go of; relays stay as they are (a timed one drops by itself)."""
 
     async def read(self) -> tuple[Reading, ...]:
-        """Every named relay as the board reports it, 1 on, 0 off; raises DeviceError."""
-        states = await self._states()
+        """Every named relay as the board reports it, 1 on, 0 off; raises DeviceError, also when another board than
+        before answers."""
+        states = await self._known()
         now_ns = self._clock.now_ns()
         return tuple(Reading(f"{self.name}.{channel}", float(on), "1", now_ns) for channel, on in states.items())
 
@@ -112,10 +119,23 @@ class Relays:
             return (await self._states())[channel] == on
 
         async with self._lock:
+            if on:  # off is never withheld, whoever answers
+                await self._known()
             await self._unit.checked(send, holds, f"{channel} {'on' if on else 'off'}")
 
+    async def _known(self) -> dict[str, bool]:
+        """The states of a board that is the one of before."""
+        if self._probe_due:
+            await self._unit.probe()
+            self._probe_due = False
+        return await self._states()
+
     async def _states(self) -> dict[str, bool]:
-        snapshot = await self._unit.snapshot(self._points.values())
+        try:
+            snapshot = await self._unit.snapshot(self._points.values())
+        except Unreachable:
+            self._probe_due = True  # another board may stand there when something answers again
+            raise
         return {channel: snapshot.bits[point] for channel, point in self._points.items()}
 
     def _point(self, channel: str) -> Point:

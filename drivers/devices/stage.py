@@ -15,7 +15,8 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from drivers.devices.motion import Motion, Turn
-from drivers.settings import Polled, PollPeriod_s, Range
+from drivers.devices.stage_identity import identity_of
+from drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
 from drivers.wires.link import SerialSettings, open_link
 from drivers.wires.ximc_client import XimcClient
 from foundation.addresses import ByteAddress
@@ -150,6 +151,7 @@ class Axis:
         self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
         self._speed_steps_s = 1000.0
         self._motion = Motion(name)
+        self.identity: Identity | None = None  # which controller has answered
         self._zero_due = False  # homing has begun, and its end was not made the zero of the scale yet
 
     async def open(self) -> None:
@@ -320,6 +322,7 @@ class Axis:
                 f"controller {serial_number} answers at {self._settings.address}, "
                 f"expected {self._settings.serial_number}",
             )
+        self.identity = same_device(self.name, identity_of(self._client, serial_number), self.identity)
         mode = _ENGINE.unpack(self._client.query("geng", _ENGINE.size))[6]
         if mode != _MICROSTEP_MODE_256:
             raise Refused(self.name, f"microstep mode {mode}, expected {_MICROSTEP_MODE_256} (1/256)")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 from pydantic import Field
 
-from drivers.settings import Line, Range
+from drivers.settings import Identity, Line, Range
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import RegisterMap, Sample
@@ -64,6 +64,11 @@ class Thermometers:
         self._fault_bits = [bit for point in self._points.values() for bit in register_map.points[point].bad_if]
         self._clock = clock
         self._probe_due = True
+
+    @property
+    def identity(self) -> Identity | None:
+        """Which module has answered; None before `open`."""
+        return self._unit.identity
 
     async def open(self) -> None:
         """Check identity, data format and type codes; DeviceFault when they are not the map's."""

@@ -80,6 +80,7 @@ class FakeRelays:
         if not channels.keys() <= switches.keys() or not set(channels.values()) <= set(range(RELAYS)):
             raise ValueError(f"relay channels {dict(channels)}: expected {', '.join(switches)} -> 0..{RELAYS - 1}")
         self.unit = unit
+        self.version = VERSION
         self.silent = False
         self.lost_writes = False
         self.welded: set[str] = set()
@@ -161,7 +162,7 @@ class FakeRelays:
             self._relays[relay] = state
 
     def _read_registers(self, address: int, count: int) -> list[int]:
-        values = {ADDRESS_REGISTER: self.unit, VERSION_REGISTER: VERSION}
+        values = {ADDRESS_REGISTER: self.unit, VERSION_REGISTER: self.version}
         if address not in values or count != 1:
             raise Refusal(ILLEGAL_ADDRESS)
         return [values[address]]

@@ -29,6 +29,7 @@ FAULT_BITS = 0x80
 FORMAT_COIL = 0x10C
 TYPE_CODES = 0x100
 OFFSETS = 0x1C0
+IDENTITY = 480  # 40481 firmware, 40483 name, low word first (tM-AD5C quick start guide, p. 8)
 OVER_RANGE, UNDER_RANGE = 0x7FFF, 0x8000
 HEX_FULL_SCALE = 0x7FFF
 COIL_ON, COIL_OFF = 0xFF00, 0x0000
@@ -190,6 +191,11 @@ class FakeThermometers:
         return True
 
     def _read_registers(self, address: int, count: int) -> list[int]:
+        if IDENTITY <= address < IDENTITY + 4:
+            words = [each[at : at + 2] for each in (b"\0" + FIRMWARE, self.name) for at in (2, 0)]
+            if address + count > IDENTITY + 4:
+                raise Refusal(ILLEGAL_ADDRESS)
+            return [int.from_bytes(word, "big") for word in words][address - IDENTITY :][:count]
         table, channel = self._table(address)
         _check_span(channel, count, 0)
         return table[channel : channel + count]

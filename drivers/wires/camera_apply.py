@@ -32,7 +32,10 @@ RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
 def read_identity(device: GigeDevice) -> Identity:
     """Vendor, model, serial number and version."""
-    return Identity(*(device.read_text(*register) for register in (VENDOR, MODEL, SERIAL, VERSION)))
+    vendor, model, serial_number, version = (
+        device.read_text(*register) for register in (VENDOR, MODEL, SERIAL, VERSION)
+    )
+    return Identity(vendor, model, serial_number, version)
 
 
 def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) -> EffectiveSettings:

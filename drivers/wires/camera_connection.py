@@ -11,6 +11,7 @@ import threading
 from collections import Counter
 from dataclasses import dataclass
 
+from drivers.settings import Identity, same_device
 from drivers.wires.aravis import (
     BUFFER_STATUS,
     BUFFER_SUCCESS,
@@ -96,10 +97,17 @@ class Shot:
 
 
 class Connection:
-    """Opens the camera, takes control, writes the settings. AravisError, Refused."""
+    """Opens the camera, takes control, writes the settings. AravisError, Refused; DeviceFault when it is not the camera
+    that has `answered` before."""
 
     def __init__(
-        self, name: str, settings: GigeCameraSettings, clock: Clock, frames: FrameCount, counts: Counter[str]
+        self,
+        name: str,
+        settings: GigeCameraSettings,
+        clock: Clock,
+        frames: FrameCount,
+        counts: Counter[str],
+        answered: Identity | None = None,
     ) -> None:
         self.control_lost = threading.Event()
         self._name = name
@@ -123,6 +131,7 @@ class Connection:
             serial_number = self.identity.serial_number
             if settings.serial_number not in (None, serial_number):
                 raise Refused(name, f"serial number {settings.serial_number} is expected, {serial_number} answers")
+            same_device(name, self.identity, answered)
             self._stop_quietly()  # a client that died may have left it running, with its settings locked
             self.effective = apply_settings(name, self._device, settings)
             self._period_ns = seconds_ns(1 / self.effective.frame_rate_hz)

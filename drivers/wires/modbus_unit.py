@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Iterable
 
+from drivers.settings import Identity, same_device
 from drivers.wires.bus import Bus
-from drivers.wires.registers import Block, Command, RegisterMap, Snapshot, decode, decode_blocks, encode, plan_blocks
+from drivers.wires.registers import (
+    Block,
+    Command,
+    RegisterMap,
+    Snapshot,
+    Told,
+    decode,
+    decode_blocks,
+    encode,
+    plan_blocks,
+)
 from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 
 WRITE_TRIES = 2
@@ -13,11 +24,13 @@ CONFIRM_LOOKS = 3  # a status bit may lag its command by a scan of the unit
 
 
 class ModbusUnit:
-    """Points and commands of one unit. `name` is the device in every error."""
+    """Points and commands of one unit. `name` is the device in every error. identity: as of the last probe, None before
+    the first."""
 
     def __init__(self, name: str, bus: Bus, register_map: RegisterMap) -> None:
         self.name = name
         self.map = register_map
+        self.identity: Identity | None = None
         self._bus = bus
         self._unit = register_map.transport.unit
         self._plans: dict[tuple[str, ...], tuple[Block, ...]] = {}  # of the polls, which ask for the same every time
@@ -39,7 +52,8 @@ class ModbusUnit:
         return decode_blocks(self.map, replies)
 
     async def probe(self) -> None:
-        """Read what proves the unit's identity and settings; DeviceFault when it is not what the map says."""
+        """Read what proves the unit's identity and settings; DeviceFault when it is not what the map says, or another
+        unit than the one that was probed first."""
         snapshot = await self.snapshot(probe.point for probe in self.map.probe)
         for probe in self.map.probe:
             found = snapshot.samples[probe.point].value
@@ -47,6 +61,31 @@ class ModbusUnit:
                 raise DeviceFault(
                     self.name, f"{probe.point} is {found:g} where the register map expects {probe.expect:g}; not used"
                 )
+        self.identity = same_device(self.name, await self._told(), self.identity)
+
+    async def _told(self) -> Identity:
+        """What the unit tells of itself; vendor and model are otherwise those of the map."""
+        told = {field: await self._told_one(told) for field, told in self.map.identity.items()}
+        model = told.get("model", "")
+        return Identity(
+            self.map.vendor,
+            f"{self.map.model} {model}".rstrip(),
+            told.get("serial_number", ""),
+            told.get("version", ""),
+            by_map=not model,
+        )
+
+    async def _told_one(self, told: Told) -> str:
+        """Nothing when the unit does not have the point: it refuses it, or one that was never seen cannot be read."""
+        try:
+            sample = (await self.snapshot([told.point])).samples[told.point]
+        except DeviceError as error:
+            if isinstance(error, Refused) or self.map.points[told.point].unverified:
+                return ""
+            raise
+        if sample.reason:
+            return ""
+        return f"{sample.value:g}" if told.shown == "number" else f"{sample.raw:#x}"
 
     async def write(self, point_name: str, value: float) -> float:
         """Write a register point and read it back; the value as the unit took it, rounded to its scale.

@@ -51,10 +51,11 @@ class Split(Document):
 
 
 class Pulse(Document):
-    """Where a coil takes "on for value x step_s" (FC 05)."""
+    """Where a coil takes "on for value x step_s" (FC 05). unverified: as of a point."""
 
     address: Word
     step_s: float = Field(gt=0)
+    unverified: str = ""
 
 
 class Point(Document):
@@ -64,6 +65,7 @@ class Point(Document):
     outside are never written. bits: bit number -> name. bad_if: bits that make this point no measurement. eeprom: a
     write wears the memory unless every start-up command is confirmed; without such commands it is written only when it
     differs. refresh: it is written again at each poll, or the unit falls back to a value of its own.
+    unverified: what of it was never seen on a unit, and how to see it; `stand check` reads it back and says so.
     """
 
     address: Word
@@ -82,6 +84,7 @@ class Point(Document):
     bad_if: tuple[str, ...] = ()
     split: Split | None = None
     pulse: Pulse | None = None
+    unverified: str = ""
     eeprom: bool = False
     refresh: bool = False
 
@@ -161,9 +164,17 @@ class Probe(Document):
     expect: float
 
 
+class Told(Document):
+    """A point by which the unit tells what it is, read as a number (scaled) or as hexadecimal digits."""
+
+    point: str
+    shown: Literal["number", "hex"] = "number"
+
+
 class RegisterMap(Document):
     """All that is known about one kind of unit. `fault_bits`: bits that mean trouble, reported as they are.
-    `when_silent`: what to look at when it does not answer."""
+    `when_silent`: what to look at when it does not answer. identity: where the unit tells its serial number, model and
+    version; a unit that refuses such a point does not tell it."""
 
     schema_: Literal["regmap/1"] = Field(alias="schema")
     vendor: str
@@ -172,6 +183,7 @@ class RegisterMap(Document):
     when_silent: str = ""
     transport: Transport
     probe: tuple[Probe, ...] = ()
+    identity: dict[Literal["serial_number", "model", "version"], Told] = Field(default_factory=dict)
     points: dict[str, Point] = Field(min_length=1)
     fault_bits: tuple[str, ...] = ()
     commands: dict[str, Command] = Field(default_factory=dict)
@@ -207,7 +219,12 @@ class RegisterMap(Document):
         for name, point in self.points.items():
             yield from (f"points.{name}.bad_if: no bit {bit}" for bit in point.bad_if if bit not in bits)
         yield from (f"fault_bits: no bit {bit}" for bit in self.fault_bits if bit not in bits)
-        yield from (f"probe: no point {probe.point}" for probe in self.probe if probe.point not in self.points)
+        named = (
+            ("probe", [probe.point for probe in self.probe]),
+            ("identity", [t.point for t in self.identity.values()]),
+        )
+        for key, points in named:
+            yield from (f"{key}: no point {point}" for point in points if point not in self.points)
         for name, command in self.commands.items():
             confirm, point = command.confirm, self.points.get(command.confirm.point)
             if confirm.equals is not None and point is None:

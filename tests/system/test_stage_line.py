@@ -129,7 +129,7 @@ async def test_a_port_unplugged_and_plugged_in_again_is_read_again_its_identity_
     bench.tap.requests.clear()
     bench.plug(bench.tap)
     assert (await bench.position()).quality is Quality.GOOD
-    assert bench.tap.requests == ["gser", "geng", "gmov", "gets"]
+    assert bench.tap.requests == ["gser", "geti", "gfwv", "geng", "gmov", "gets"]
 
 
 @pytest.mark.parametrize("wire", ["tcp"])
