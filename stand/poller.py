@@ -23,7 +23,8 @@ class Poller:
     """Polls `sensor` every `period_s` (absolute deadlines) until cancelled; 1 s after a poll that failed on the wire.
 
     `first()` must succeed before `run()`: what it returns defines which channels to declare BAD when a later read
-    fails. mark: what is published of the readings of a poll at an instant (ns); it may mark some as STALE.
+    fails. mark: what is published of the readings of a poll at an instant (ns); it may mark some as STALE. A device
+    whose read takes longer than the period is an event, and one more when it is within half a period again.
     """
 
     sensor: Sensor
@@ -36,6 +37,7 @@ class Poller:
         self._known: tuple[Reading, ...] = ()
         self._failing = False
         self._lost_ns = 0
+        self._is_slow = False
         self._ask_again = False
 
     async def first(self) -> None:
@@ -53,12 +55,14 @@ class Poller:
 
     async def poll(self) -> None:
         """Read once and publish; a failed read is published as BAD readings."""
+        begin_ns = self.clock.now_ns()
         try:
             readings = await self.sensor.read()
         except DeviceError as error:
             self._lost(error)
             return
         self._ask_again = False
+        self._time(self.clock.now_ns() - begin_ns)
         if self._failing:
             self._failing = False
             now_ns, name = self.clock.now_ns(), self.sensor.name
@@ -66,6 +70,19 @@ class Poller:
             data: dict[str, object] = {"device": name, "lost_s": lost_s}
             self.hub.publish(Event(now_ns, "info", "device_back", f"{name} answers again after {lost_s:g} s", data))
         self._publish(readings)
+
+    def _time(self, took_ns: int) -> None:
+        """Of one read that succeeded."""
+        took_s, name = round(took_ns / NS_PER_S, 3), self.sensor.name
+        data: dict[str, object] = {"device": name, "took_s": took_s, "period_s": self.period_s}
+        if not self._is_slow and took_s > self.period_s:
+            self._is_slow = True
+            text = f"{name} took {took_s:g} s to answer and is read every {self.period_s:g} s: readings are missing"
+            self.hub.publish(Event(self.clock.now_ns(), "warning", "device_slow", text, data))
+        elif self._is_slow and took_s < self.period_s / 2:
+            self._is_slow = False
+            text = f"{name} answers within {took_s:g} s again"
+            self.hub.publish(Event(self.clock.now_ns(), "info", "device_fast", text, data))
 
     def _publish(self, readings: tuple[Reading, ...]) -> None:
         readings = self._known = self.mark(readings, self.clock.now_ns())

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.sim import gvcp, gvsp
 from drivers.sim.camera_registers import Registers
 from drivers.sim.camera_schedule import Schedule, Shot
-from drivers.sim.genicam import features
+from drivers.sim.genicam import TICKS_PER_S, features
 from drivers.sim.gvcp import Nack, Resend, Status
 from drivers.sim.gvcp_device import ControlChannel, Peer
 from drivers.sim.gvsp_sender import CameraFaults, StreamCounts, StreamSender
@@ -29,6 +29,7 @@ WIDTH_px, HEIGHT_px = 2448, 2048
 
 _TICK_s = 0.1  # how often the heartbeat is looked at
 _RESOLUTION_K = 0.25
+_PENDING_ms = 600  # longer than a client waits for an answer that was not announced
 _SHORT_IDS = 0xFFFF
 _TIMING = ("ExposureTime", "AcquisitionFrameRate", "AcquisitionFrameRateEnable", "TriggerMode", "TriggerSource")
 
@@ -94,6 +95,7 @@ class FakeCamera:
         self._channel = ControlChannel(self._registers, self)
         self._schedule = Schedule(self._registers, real_time)
         self._sender = StreamSender(self._stream, self.faults, pace_MBps)
+        self._backwards_ns = 0
         self._supply = (plant.camera_powered, plant.camera_power_on_ns)
         self._ticks_from_ns = self._ready_ns = clock.now_ns()
         self._wake = threading.Condition(plant.lock)
@@ -193,7 +195,13 @@ class FakeCamera:
             except TimeoutError:
                 datagram, peer = b"", ("", 0)
             reply = self._reply(datagram, peer)
-            if reply:
+            if not reply:
+                continue
+            if self.faults.pending > 0:
+                self.faults.pending -= 1
+                self._control.sendto(gvcp.pending(datagram, 2 * _PENDING_ms), peer)
+                threading.Event().wait(_PENDING_ms / 1000)
+            for _ in range(2 if self.faults.acks_twice else 1):
                 self._control.sendto(reply, peer)
 
     def _reply(self, datagram: bytes, peer: Peer) -> bytes:
@@ -211,7 +219,9 @@ class FakeCamera:
             return self._channel.feed(datagram, peer, heard_s)
 
     def before_read(self, address: int, count: int) -> None:
-        """Measure the temperature when its register is read."""
+        """Measure the temperature when its register is read; what the clock says of itself may be wrong."""
+        if self._registers.covers("GevTimestampTickFrequency", address, count):
+            self._registers.put("GevTimestampTickFrequency", 0 if self.faults.no_ticks else TICKS_PER_S)
         if not self._registers.covers("DeviceTemperature", address, count):
             return
         fault = self.faults.temperature
@@ -310,9 +320,19 @@ class FakeCamera:
             data = (pixels.astype(np.uint16) << 4).astype("<u2").tobytes()
         else:
             data = pixels.tobytes()
-        leader = gvsp.Leader(shot.start_ns - self._ticks_from_ns, value("PixelFormat"), width, height, x, y)
+        leader = gvsp.Leader(self._stamp(shot.start_ns), value("PixelFormat"), width, height, x, y)
         block_id = shot.index + 1 if self._extended_ids else shot.index % _SHORT_IDS + 1
         return gvsp.Block(block_id, leader, memoryview(data), value("GevSCPSPacketSize"), self._extended_ids)
+
+    def _stamp(self, start_ns: int) -> int:
+        """The leader's time stamp; backwards: every exposure a second before the one before it."""
+        if self.faults.stamp == "zero":
+            return 0
+        ticks = start_ns - self._ticks_from_ns
+        if self.faults.stamp == "backwards":
+            self._backwards_ns += NS_PER_S
+            return max(1, ticks - 2 * self._backwards_ns)
+        return ticks
 
 
 def _bound(address: str, port: int) -> socket.socket:

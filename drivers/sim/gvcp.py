@@ -34,6 +34,7 @@ class Command(IntEnum):
     WRITEREG = 0x0082
     READMEM = 0x0084
     WRITEMEM = 0x0086
+    PENDING = 0x0088
 
 
 class Status(IntEnum):
@@ -90,6 +91,12 @@ class Ack:
     def encode(self) -> bytes:
         """The datagram."""
         return _ACK.pack(self.status, self.command + 1, len(self.payload), self.req_id) + self.payload
+
+
+def pending(request: bytes, time_ms: int) -> bytes:
+    """PENDING_ACK to a command: its answer takes so long."""
+    req_id = _COMMAND.unpack_from(request)[-1]
+    return Ack(Command.PENDING, req_id, struct.pack(">HH", 0, time_ms)).encode()
 
 
 def decode_request(datagram: bytes) -> Request:

@@ -27,16 +27,20 @@ class CameraFaults:
     """What goes wrong on a camera; change at any time.
 
     loss: probability 0..1 that a packet is lost, with the `burst` - 1 packets after it; seeded, so that a run repeats.
-    no_resend: capability bit off and requests ignored (the bit is read by clients at connect). silent_gvcp: the camera
-    neither hears nor answers. silent_gvsp: no stream packet leaves. unpaced: packets leave as fast as they can.
-    drop_leader, drop_trailer: missing from every frame until asked for again. trigger_twice: every software trigger
-    gives two frames. no_stream_channel: it says that it has none, as one that is not ready yet. temperature:
+    truncated, doubled, reordered: probabilities that a packet arrives without its second half, twice, or after the one
+    behind it. no_resend: capability bit off and requests ignored (the bit is read by clients at connect). silent_gvcp:
+    the camera neither hears nor answers. silent_gvsp: no stream packet leaves. unpaced: packets leave as fast as they
+    can. drop_leader, drop_trailer: missing from every frame until asked for again. trigger_twice: every software
+    trigger gives two frames. no_stream_channel: it says that it has none, as one that is not ready yet. temperature:
     DeviceTemperature reads 0, is refused, or keeps its last value; temperature_offset_K: it is wrong by so much.
     """
 
     seed: int = 0
     loss: float = 0.0
     burst: int = 1
+    truncated: float = 0.0
+    doubled: float = 0.0
+    reordered: float = 0.0
     no_resend: bool = False
     silent_gvcp: bool = False
     silent_gvsp: bool = False
@@ -47,6 +51,10 @@ class CameraFaults:
     no_stream_channel: bool = False
     temperature: Literal["zero", "access", "stuck"] | None = None
     temperature_offset_K: float = 0.0
+    stamp: Literal["zero", "backwards"] | None = None
+    no_ticks: bool = False
+    acks_twice: bool = False
+    pending: int = 0
 
 
 @dataclass
@@ -118,6 +126,7 @@ class StreamSender:
         self._pace_Bps = pace_MBps * 1e6
         self._random = random.Random(faults.seed)
         self._burst_left = 0
+        self._held: tuple[bytes, bytes | memoryview] | None = None  # until the next packet has left
         self._free_at_s = 0.0
         self._gap_s = 0.0
         self._wake = threading.Condition()
@@ -214,8 +223,22 @@ class StreamSender:
                 self._transmit([header], destination)
             for job in jobs:
                 self.counts.resent += job.status == gvsp.RESENT
-                self._transmit(job.block.packet(job.packet_id, job.status), job.destination)
+                self._mangle(job.block.packet(job.packet_id, job.status), job.destination)
             self._pace(sum(job.block.packet_size for job in jobs), len(jobs))
+
+    def _mangle(self, parts: tuple[bytes, bytes | memoryview], destination: Destination) -> None:
+        """Send it as the faults have it: cut, twice, or behind the next one."""
+        if self._chance(self._faults.truncated):
+            parts = (parts[0], parts[1][: len(parts[1]) // 2])
+        if self._held is None and self._chance(self._faults.reordered):
+            self._held = parts
+            return
+        self._transmit(parts, destination)
+        if self._chance(self._faults.doubled):
+            self._transmit(parts, destination)
+        if self._held is not None:
+            held, self._held = self._held, None
+            self._transmit(held, destination)
 
     def _transmit(self, parts: list[bytes] | tuple[bytes, bytes | memoryview], destination: Destination) -> None:
         if self._faults.silent_gvsp:
@@ -234,10 +257,13 @@ class StreamSender:
         if self._burst_left > 0:
             self._burst_left -= 1
             return True
-        if self._faults.loss <= 0 or self._random.random() >= self._faults.loss:
+        if not self._chance(self._faults.loss):
             return False
         self._burst_left = self._faults.burst - 1
         return True
+
+    def _chance(self, probability: float) -> bool:
+        return probability > 0 and self._random.random() < probability
 
     def _pace(self, size_bytes: int, packets: int) -> None:
         """Wait until the wire would be free again."""

@@ -177,6 +177,10 @@ def _temperature_shown(kind: str) -> Setter:
     return _to(lambda lab: lab.camera.faults, "temperature", lambda value: kind if value else None)
 
 
+def _stamped(kind: str) -> Setter:
+    return _to(lambda lab: lab.camera.faults, "stamp", lambda value: kind if value else None)
+
+
 def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
     laboratory.camera.faults.no_stream_channel = bool(value)
     if value:
@@ -346,6 +350,20 @@ FAULTS: dict[str, Fault] = {
     "camera.trigger_twice": Fault(
         _to(lambda lab: lab.camera.faults, "trigger_twice"), True, False, "a trigger gives two frames"
     ),
+    **{
+        f"camera.{name}": Fault(
+            _to(lambda lab: lab.camera.faults, name, _number), 0.05, 0.0, f"share of packets {text}"
+        )
+        for name, text in (("truncated", "cut in half"), ("doubled", "sent twice"), ("reordered", "sent late"))
+    },
+    "camera.unpaced": Fault(_to(lambda lab: lab.camera.faults, "unpaced"), True, False, "packets leave in one burst"),
+    "camera.acks_twice": Fault(_to(lambda lab: lab.camera.faults, "acks_twice"), True, False, "each answer twice"),
+    "camera.pending": Fault(
+        _to(lambda lab: lab.camera.faults, "pending", lambda value: int(_number(value))), 3, 0, "answers are late"
+    ),
+    "camera.stamp_zero": Fault(_stamped("zero"), True, False, "its time stamps are 0"),
+    "camera.stamp_backwards": Fault(_stamped("backwards"), True, False, "its time stamps run backwards"),
+    "camera.no_ticks": Fault(_to(lambda lab: lab.camera.faults, "no_ticks"), True, False, "its clock does not tick"),
     "camera.silent": Fault(_silent_camera, True, False, "neither answers nor sends"),
     "camera.stalled": Fault(_stall_stream, True, False, "answers, but sends no frame"),
     "camera.deaf": Fault(_to(lambda lab: lab.camera.faults, "silent_gvcp"), True, False, "sends, but does not answer"),

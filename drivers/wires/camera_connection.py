@@ -123,6 +123,7 @@ class Connection:
         self._timeout_s = max(TRANSFER_TIMEOUT_S, 2 * settings.period_s)
         self._offset_ns: int | None = None  # stand clock minus camera clock; None: no useful time stamps
         self._latched_at_ns = 0
+        self._stamped_ns = 0  # the last time stamp, on the camera's clock
         self._phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
         self._device = _open_controlled(name, settings)
         try:
@@ -336,12 +337,16 @@ class Connection:
         self._stream_counts = now
 
     def _stand_ns(self, timestamp_ns: int) -> int | None:
-        """The camera's time stamp on the stand's clock, None when it is not to be believed."""
+        """The camera's time stamp on the stand's clock, None when it is not to be believed: 0, not after the one
+        before, or in the future. The clocks are compared again before the next frame then."""
         if self._offset_ns is None:
             return None
+        earlier_ns, self._stamped_ns = self._stamped_ns, timestamp_ns
         time_ns = timestamp_ns + self._offset_ns
-        if time_ns > self._clock.now_ns() + seconds_ns(self._exposure_s) + FUTURE_NS:
+        is_ahead = time_ns > self._clock.now_ns() + seconds_ns(self._exposure_s) + FUTURE_NS
+        if timestamp_ns <= earlier_ns or is_ahead:
             self._counts["bad_time_stamps"] += 1
+            self._latched_at_ns = 0
             return None
         return time_ns
 
@@ -359,9 +364,12 @@ class Connection:
                 if not ticks or not frequency_Hz:
                     self._offset_ns = None
                     return
+                camera_ns = ticks * NS_PER_S // frequency_Hz
+                if camera_ns < self._stamped_ns:  # its clock was set back
+                    self._stamped_ns = 0
                 if best_ns is None or round_trip_ns < best_ns:
                     best_ns = round_trip_ns
-                    self._offset_ns = before_ns + round_trip_ns // 2 - ticks * NS_PER_S // frequency_Hz
+                    self._offset_ns = before_ns + round_trip_ns // 2 - camera_ns
                 if round_trip_ns < LATCH_GOOD_NS:
                     return
         except AravisError:

@@ -19,6 +19,7 @@ from foundation.clock import WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub
 from recording.reading.session import Session
+from stand.assembly import assemble
 from stand.config.stand_config import load_config, packaged
 from stand.daemon.desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
@@ -189,6 +190,15 @@ async def heater_goes_off(config_file: Path) -> None:
             await asyncio.sleep(0.2)
 
 
+async def leave_flap_open(config_file: Path) -> None:
+    """As a daemon that died in a capture does: the driver leaves the flap where it is."""
+    assembly = assemble(load_config(config_file), Hub(), WallClock())
+    flap = assembly.devices.flap
+    await flap.open()
+    await flap.move_open()
+    await flap.close()
+
+
 def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
     serve: Callable[[], Served], laboratory: Path
 ):
@@ -199,8 +209,10 @@ def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
     served.process.send_signal(signal.SIGKILL)
     served.process.wait()
     asyncio.run(heater_goes_off(laboratory))  # nobody is there to switch it
+    asyncio.run(leave_flap_open(laboratory))
     again = serve()
     offered = again.until(is_idle)
+    assert offered.flap == "closed"
     assert states_of(offered) == ["interrupted"]
     assert "resume it" in offered.queue_halted
     assert not offered.heater_permitted

@@ -1,0 +1,116 @@
+"""Packets, answers and time stamps that a camera should not send, through Aravis: never a wrong pixel, never a frame
+lost without need, never a wrong instant."""
+
+from collections.abc import AsyncGenerator
+
+import pytest
+
+from drivers.devices.camera_gige import Camera
+from drivers.sim.camera import FakeCamera
+from foundation.clock import NS_PER_S, VirtualClock
+from foundation.errors import Unreachable
+from foundation.readings import Frame
+from tests.system.test_camera_wire import WarmPlant, noise, opened, virtual
+
+FRAMES = 5
+
+
+@pytest.fixture
+def plant() -> WarmPlant:
+    return WarmPlant(1_700_000_000 * NS_PER_S)
+
+
+@pytest.fixture
+async def wired(plant: WarmPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
+    async with virtual(plant) as both:
+        yield both
+
+
+def is_right(frame: Frame) -> bool:
+    return bool((frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)).all())
+
+
+async def grabbed(camera: Camera, clock: VirtualClock, count: int = FRAMES) -> list[Frame]:
+    frames = list[Frame]()
+    for _ in range(count):
+        frames.append(await camera.grab())
+        await clock.sleep_until(clock.now_ns() + NS_PER_S)
+    return frames
+
+
+@pytest.mark.parametrize("fault", ["doubled", "reordered"])
+async def test_packets_that_come_twice_or_late_make_the_same_frame(wired: tuple[VirtualClock, FakeCamera], fault: str):
+    clock, fake = wired
+    async with opened(clock, packet_size=1500) as camera:
+        setattr(fake.faults, fault, 0.2)
+        assert all(map(is_right, await grabbed(camera, clock)))
+        assert camera.counters().get("lost", 0) == 0
+
+
+async def test_a_frame_with_a_packet_cut_short_is_never_used(wired: tuple[VirtualClock, FakeCamera]):
+    clock, fake = wired
+    async with opened(clock, packet_size=1500) as camera:
+        await grabbed(camera, clock, 1)
+        fake.faults.truncated = 0.01  # one or two of a frame's 220 packets
+        frames = list[Frame]()
+        for _ in range(FRAMES):
+            try:
+                frames.append(await camera.grab())
+            except Unreachable:
+                await camera.open()
+            await clock.sleep_until(clock.now_ns() + NS_PER_S)
+        assert all(map(is_right, frames))
+        assert camera.counters()["lost"] + sum(frame.dropped for frame in frames) > 0
+        fake.faults.truncated = 0.0
+        assert all(map(is_right, await grabbed(camera, clock, 1)))
+
+
+@pytest.mark.parametrize(("fault", "value"), [("acks_twice", True), ("pending", 1)])
+async def test_answers_that_come_twice_or_are_announced_as_late_are_taken_once(
+    wired: tuple[VirtualClock, FakeCamera], fault: str, value: int
+):
+    clock, fake = wired
+    async with opened(clock, heartbeat_s=3.0) as camera:
+        await grabbed(camera, clock, 1)
+        setattr(fake.faults, fault, value)
+        (frame,) = await grabbed(camera, clock, 1)
+        assert is_right(frame)
+        assert frame.dropped == 0
+        assert (fake.faults.pending, fake.counts.blocks) == (0, 2)  # the trigger was not executed again
+        (reading,) = await camera.read()
+        assert reading.value == pytest.approx(41.5)
+        assert camera.counters().get("lost", 0) == 0
+
+
+@pytest.mark.parametrize("stamp", ["zero", "backwards"])
+async def test_a_time_stamp_that_cannot_be_is_counted_and_the_frame_has_the_triggers_instant(
+    wired: tuple[VirtualClock, FakeCamera], stamp: str
+):
+    clock, fake = wired
+    async with opened(clock) as camera:
+        await grabbed(camera, clock, 2)
+        fake.faults.stamp = stamp  # pyright: ignore[reportAttributeAccessIssue] - one of the two
+        assert all(map(is_right, await grabbed(camera, clock, 3)))
+        assert camera.counters()["bad_time_stamps"] == 3
+        fake.faults.stamp = None
+        assert all(map(is_right, await grabbed(camera, clock, 2)))
+        assert camera.counters()["bad_time_stamps"] == 3
+        assert camera.counters().get("lost", 0) == 0
+
+
+async def test_a_camera_whose_clock_does_not_tick_is_used_by_the_stands_clock(
+    wired: tuple[VirtualClock, FakeCamera],
+):
+    clock, fake = wired
+    fake.faults.no_ticks = True
+    async with opened(clock) as camera:
+        assert all(map(is_right, await grabbed(camera, clock, 2)))
+        assert camera.restarted == ""
+
+
+async def test_an_unpaced_burst_at_the_kernels_usual_buffer_comes_whole(wired: tuple[VirtualClock, FakeCamera]):
+    clock, fake = wired
+    fake.faults.unpaced = True
+    async with opened(clock, packet_size=1500) as camera:
+        assert all(map(is_right, await grabbed(camera, clock)))
+        assert camera.effective.receive_buffer_bytes > 0
