@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -68,22 +69,29 @@ def watch(
     url: UrlOption = "",
     token_file: TokenOption = None,
 ) -> None:
-    """What happens, as it happens: events, one a line, from now on. Ctrl-C ends watching, not the run.
+    """What happens, as it happens, above a panel with step, temperatures, frames, disk and end; without a terminal a
+    line a minute. With --json the events, one a line. Ctrl-C ends watching, not the run.
 
     Example: stand watch
     """
     with one_line_errors():
+        from stand.watching.live import view
+        from stand.watching.there import There, event_line
+
         server = reached(directory, config, url, token_file, anywhere=True)
-        seq = server.state().seq
-        try:
-            while True:
-                found = cast("Answer", server.request("GET", f"{API}/events?from={seq}"))
-                seq = cast("int", found["seq"])
-                for event in cast("list[Answer]", found["events"]):
-                    typer.echo(json.dumps(event) if as_json else _event_line(event))
-                threading.Event().wait(_WATCH_S)
-        except KeyboardInterrupt:
-            return
+        there = There(server)
+        with suppress(KeyboardInterrupt):
+            if as_json:
+                while True:
+                    for event in there.events():
+                        typer.echo(json.dumps(event))
+                    threading.Event().wait(_WATCH_S)
+            with view() as shown:
+                while True:
+                    for event in there.events():
+                        shown.tell(event_line(event))
+                    shown.show(there.moment(server.state()))
+                    threading.Event().wait(_WATCH_S)
 
 
 @app.command()
@@ -250,12 +258,6 @@ def _step_id(server: Server, step: str) -> str:
 def _number(planned: Answer) -> int:
     """Of a step of the plan, as `stand status` counts: 1 is the first."""
     return cast("int", planned["index"]) + 1
-
-
-def _event_line(event: Mapping[str, object]) -> str:
-    time_ns, offset_ns = cast("int", event["time_ns"]), cast("int", event["utc_offset_ns"])
-    level = "" if event["level"] == "info" else f"{event['level']}: "
-    return one_line(f"{local_text(time_ns + offset_ns)}  {level}{event['text']}")
 
 
 def idle_lines(name: str, state: StandState) -> Iterator[str]:

@@ -9,14 +9,14 @@ from typing import Annotated
 
 import typer
 
-from experiments.steps import kind_of, parameters_of
+from experiments.steps import Step, kind_of, parameters_of
 from foundation.clock import NS_PER_S, WallClock
 from foundation.ending import Ending
 from foundation.exit_codes import one_line_errors
 from stand.config.stand_config import load_config, packaged
-from stand.estimating.estimate import PricedStep, price
-from stand.estimating.follow import parameters_text
+from stand.estimating.estimate import PricedStep
 from stand.estimating.learned import load_learned
+from stand.estimating.night import price_night
 from stand.running.order import load_order
 from stand.simulator import Simulator, laboratory_of, list_faults
 
@@ -40,12 +40,13 @@ def plan(
     with one_line_errors():
         order = load_order(recipe, config)
         learned = load_learned(order.config.recording.directory)
-        steps = price(order.recipe.plan(), order.config, learned)
-        total_s = sum(step.duration_s for step in steps)
+        night = price_night(tuple(order.recipe.plan()), order.config, order.config.recording.directory)
+        steps, total_s = night.steps, night.duration_s
         now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
         end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
         totals = {
             "duration_s": total_s,
+            "after_s": night.after_s,
             "frames": sum(step.frames for step in steps),
             "bytes": round(sum(step.size_bytes for step in steps)),
             "end": end,
@@ -55,6 +56,8 @@ def plan(
             return
         for step in steps:
             typer.echo(_line(step))
+        if night.after_s:
+            typer.echo(f"then back to the laboratory's temperature, {_hours(night.after_s)}")
         typer.echo(
             f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
             f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
@@ -93,11 +96,15 @@ def _line(step: PricedStep) -> str:
     planned = step.planned
     return (
         f"{planned.index + 1:4d}  {planned.step_id}  {kind_of(planned.step):<16s}"
-        f"{parameters_text(parameters_of(planned.step)):<72s}{_hours(step.duration_s):>12s}"
+        f"{_parameters(planned.step):<72s}{_hours(step.duration_s):>12s}"
         + (f"{step.frames:6d} frames {step.size_bytes / 1e6:8.1f} MB" if step.frames else "")
         + (f"   in band after {_hours(step.in_band_after_s)}" if step.in_band_after_s else "")
         + (f"   {step.warning}" if step.warning else "")
     )
+
+
+def _parameters(step: Step) -> str:
+    return " ".join(f"{name}={value}" for name, value in parameters_of(step).items())
 
 
 def _hours(duration_s: float) -> str:

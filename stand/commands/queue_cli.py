@@ -124,7 +124,7 @@ def start(
             queue.clear(directory)
 
         async def run_one(entry: Entry, notes: Notes) -> Path:
-            session = await run_entry(directory, entry, notes, _say, virtual_time=virtual_time)
+            session = await run_entry(directory, entry, notes, virtual_time=virtual_time)
             await asyncio.to_thread(conclude, entry, session, _say, report=report)
             return session
 

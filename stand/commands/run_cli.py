@@ -6,34 +6,30 @@ import asyncio
 import itertools
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Generator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated
 
 import typer
 
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import INTERRUPTED, NOT_REPORTED, one_line_errors
-from foundation.hub import Hub
-from foundation.progress import progress
 from foundation.usage import one_line, tell
 from recording.repair.salvage import salvage_line
-from stand.aside import aside
 from stand.commands.submitted import daemon_of, follow, submit
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.estimating.estimate import PricedStep, price
-from stand.estimating.follow import Follow
-from stand.estimating.learned import learn, load_learned
+from stand.estimating.learned import learn
+from stand.estimating.night import price_night
 from stand.estimating.room import existing, small_disk
 from stand.running.order import Order, load_order
-from stand.running.resume import interruption
+from stand.running.resume import interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.stop import Interrupted
 from stand.serving.client import Server
 from stand.session_report import NotReported, check_reportable, report_session
+from stand.watching.live import followed
 
 app = typer.Typer(add_completion=False)
 
@@ -60,7 +56,8 @@ def demo(
         order = load_order("demo", "simulated")
         directory = _unused(out)
         _check_writable(directory)
-        with _run_progress(price(order.recipe.plan(), order.config)) as watch:
+        night = price_night(tuple(order.recipe.plan()), order.config, directory)
+        with followed(order, night, directory, is_virtual=True) as watch:
             session = asyncio.run(run_virtual(order, directory, None, watch))
         typer.echo(f"session  {session}")
         _report(session, directory)
@@ -105,10 +102,10 @@ def run(
             raise ConfigError("--detach: no `stand serve` has this stand, and a run by itself ends with its command")
         directory = out or order.config.recording.directory
         _check_writable(directory)
-        steps = price(order.recipe.plan(), order.config, load_learned(directory))
-        if lack := small_disk(shutil.disk_usage(existing(directory)).free, steps, order.config):
+        night = price_night(tuple(order.recipe.plan()), order.config, directory)
+        if lack := small_disk(shutil.disk_usage(existing(directory)).free, night.steps, order.config):
             typer.echo(one_line(f"warning: {directory}: {lack}"), err=True)
-        with _run_progress(steps) as watch:
+        with followed(order, night, directory, is_virtual=virtual_time) as watch:
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
             session = asyncio.run(work)
         _finished(session, order.config, report=report)
@@ -139,11 +136,12 @@ def resume_run(
                 check_reportable(order.recipe.plan())
             for segment in before.salvaged:
                 typer.echo(salvage_line(segment), err=True)
-            steps = price(before.state.plan, order.config, load_learned(before.directory.parent))
+            night = price_night(before.state.plan, order.config, before.directory.parent)
         except BaseException:
             before.release()
             raise
-        with _run_progress(steps, before.kept.done, before.kept.earned_s) as watch:
+        is_virtual = is_of_virtual_time(before)
+        with followed(order, night, directory, is_virtual=is_virtual, before=before) as watch:
             session = asyncio.run(resume(before, watch))
         _finished(session, order.config, report=report)
 
@@ -195,17 +193,6 @@ def _check_writable(directory: Path) -> None:
         Path(tempfile.mkdtemp(prefix=".writable-", dir=existing(directory))).rmdir()
     except OSError as error:
         raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error
-
-
-@contextmanager
-def _run_progress(
-    steps: tuple[PricedStep, ...], done: Collection[str] = (), earned_s: Mapping[str, float] = MappingProxyType({})
-) -> Generator[Callable[[Hub], None]]:
-    """Progress in expected seconds of the plan, the time left as the run goes; warnings and errors as they come. The
-    run never waits for the terminal."""
-    with progress("run", sum(step.duration_s for step in steps)) as report, aside() as later:
-        follow = Follow(steps, later(report), later(lambda line: typer.echo(line, err=True)), done, earned_s)
-        yield lambda hub: hub.subscribe(follow)
 
 
 @contextmanager

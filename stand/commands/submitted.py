@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
-import typer
 from pydantic import ValidationError
 
-from foundation.clock import NS_PER_S
 from foundation.errors import ConfigError, SessionError, StandError
-from foundation.progress import Report, progress
-from foundation.usage import one_line
 from stand.config.stand_config import StandConfig
 from stand.running.claim import daemon_pid
 from stand.running.order import Order
 from stand.running.stop import Interrupted
-from stand.serving.client import Server
+from stand.serving.client import API, Server
 from stand.serving.desk import QueuedRun, StandState
 from stand.serving.presence import living
+from stand.watching.live import View, view
+from stand.watching.moment import Moment
+from stand.watching.there import There, event_line
 
 _LOOK_S = 0.5
 _LOST_LIMIT_S = 60.0  # a daemon that does not answer for so long is not followed any more
-_EVENTS = 500
 _LEVELS = ("warning", "error")
 
 
@@ -42,7 +39,7 @@ def submit(server: Server, order: Order, out: Path | None) -> QueuedRun:
         raise ConfigError(f"--out {out}: `stand serve` has this stand, and records to {server.name}")
     body = {"recipe_text": order.recipe_text, "attended": order.attended, "key": uuid.uuid4().hex}
     try:
-        return QueuedRun.model_validate(server.request("POST", "/api/v1/queue", body, 30.0))
+        return QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, 30.0))
     except ValidationError as error:
         raise SessionError(f"{server.name}: its daemon sent an unknown reply; is its version different?") from error
 
@@ -51,12 +48,12 @@ def follow(server: Server, run: QueuedRun) -> Path:
     """Show it until it has ended; its session's folder. Interrupted when it was stopped by Ctrl-C, which it then ends;
     StandError when it failed."""
     follower = _Follower(server, run)
-    with progress("run", max(run.expected_s or 0.0, 1e-9)) as report:
+    with view() as shown:
         try:
-            ended = follower.until_ended(report)
+            ended = follower.until_ended(shown)
         except KeyboardInterrupt:
             follower.stop()
-            ended = follower.until_ended(report)
+            ended = follower.until_ended(shown)
             raise Interrupted(ended.reason or "stopped by the operator") from None
     if ended.state != "done":
         raise StandError(f"run {ended.id} {ended.state}: {ended.reason}")
@@ -67,15 +64,18 @@ class _Follower:
     def __init__(self, server: Server, run: QueuedRun) -> None:
         self._server = server
         self._run = run
-        self._seq = server.state().seq
+        self._there = There(server)
 
-    def until_ended(self, report: Report) -> QueuedRun:
+    def until_ended(self, shown: View) -> QueuedRun:
         """A daemon that is busy, or restarts, may not answer for a while."""
         silent_s = 0.0
         while True:
             try:
                 state = self._server.state()
-                self._tell_events()
+                for event in self._there.events():
+                    if event.get("level") in _LEVELS:
+                        shown.tell(event_line(event))
+                moment = self._there.moment(state)
             except SessionError:
                 silent_s += _LOOK_S
                 if silent_s > _LOST_LIMIT_S:
@@ -87,7 +87,7 @@ class _Follower:
                     raise SessionError(f"run {self._run.id} was taken out of the queue")
                 if run.state not in ("waiting", "running"):
                     return run
-                self._tell(state, run, report)
+                shown.show(self._waiting(state, moment) if run.state == "waiting" else moment)
             threading.Event().wait(_LOOK_S)
 
     def stop(self) -> None:
@@ -95,24 +95,11 @@ class _Follower:
         state = self._server.state()
         waits = any(run.id == self._run.id and run.state == "waiting" for run in state.queue)
         if waits:
-            self._server.request("DELETE", f"/api/v1/queue/{self._run.id}")
+            self._server.request("DELETE", f"{API}/queue/{self._run.id}")
             raise Interrupted(f"run {self._run.id} was taken out of the queue; nothing was started")
         self._server.order("stop")
 
-    def _tell(self, state: StandState, run: QueuedRun, report: Report) -> None:
-        status = state.run
-        if run.state == "waiting" or status is None or status.end_ns is None:
-            ahead = sum(each.state in ("waiting", "running", "interrupted") for each in state.queue) - 1
-            report(0.0, f"run {run.id} waits; {state.queue_halted or f'{ahead} others are before it'}")
-            return
-        left_s, whole_s = (status.end_ns - status.now_ns) / NS_PER_S, run.expected_s or 0.0
-        held = f" (held: {', '.join(status.reasons)})" if status.reasons else ""
-        report(max(0.0, whole_s - left_s), f"{status.step}/{status.steps} {status.doing}{held}")
-
-    def _tell_events(self) -> None:
-        found = self._server.request("GET", f"/api/v1/events?from={self._seq}&limit={_EVENTS}")
-        answer = cast("Mapping[str, object]", found)
-        self._seq = max(self._seq, cast("int", answer.get("seq", 0)))
-        for event in cast("list[Mapping[str, object]]", answer.get("events", [])):
-            if event.get("level") in _LEVELS:
-                typer.echo(one_line(f"{event.get('level')}: {event.get('text')}"), err=True)
+    def _waiting(self, state: StandState, moment: Moment) -> Moment:
+        ahead = sum(each.state in ("waiting", "running", "interrupted") for each in state.queue) - 1
+        why = state.queue_halted or f"{ahead} others are before it"
+        return replace(moment, doing=f"{moment.doing}; run {self._run.id} waits: {why}")

@@ -129,6 +129,24 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
     return tuple(priced)
 
 
+def way_back_s(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned) -> float:
+    """How long the chamber, and a camera that is cold, take back to the laboratory's temperature when the plan is done,
+    s; 0 on a stand that does not bring it back, or of a plan that ends there."""
+    ending, last_degC = config.ending, config.ending.ambient_degC
+    for planned in plan:
+        if isinstance(planned.step, StartChamber | SetTemperature):
+            last_degC = planned.step.chamber_degC
+    gap_K = ending.ambient_degC - last_degC
+    if not ending.to_ambient or abs(gap_K) <= ending.band_K:
+        return 0.0
+    chamber = learned.chamber
+    if gap_K < 0.0:
+        return min(ending.max_s, chamber.cooling.arrival_s(gap_K, ending.band_K))
+    dew_K = ending.band_K if config.dew is None else ending.ambient_degC - config.dew.lowest_degC(math.nan)
+    follows_s = chamber.camera_time_constant_s * max(0.0, math.log(gap_K / max(ending.band_K, dew_K)))
+    return min(ending.max_s, chamber.heating.arrival_s(gap_K, ending.band_K) + follows_s)
+
+
 def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:
     """Of a soak: s until the chamber is in its band; None when it is, and of other steps."""
     after_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s

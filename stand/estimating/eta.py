@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -16,6 +17,8 @@ from recording.reading.contents import PLAN_CHANGED
 from stand.estimating.estimate import PricedStep
 
 _REMEMBERED = 9  # the last measurements of a kind of work count
+_LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
+_LEAST_WITHIN_S = 60.0
 
 
 class Eta:
@@ -26,7 +29,8 @@ class Eta:
     waited for.
 
     Of a run that is resumed after an interruption, `done` are the ids of steps that are done, `earned_s` what others
-    have earned of what is stated, by their ids.
+    have earned of what is stated, by their ids. `after_s`: what follows the last step, the way back to the laboratory's
+    temperature.
     """
 
     def __init__(
@@ -34,6 +38,7 @@ class Eta:
         steps: Sequence[PricedStep],
         done: Collection[str] = (),
         earned_s: Mapping[str, float] = MappingProxyType({}),
+        after_s: float = 0.0,
     ) -> None:
         self._steps = [_owed(step, earned_s.get(step.planned.step_id, 0.0)) for step in steps]
         self._waiting = {step.planned.index: step for step in self._steps if step.planned.step_id not in done}
@@ -47,6 +52,8 @@ class Eta:
         self._reasons: set[object] = set()
         self._held_since_ns: int | None = None
         self._held_ns = 0  # of the running step
+        self._off_s: dict[str, list[float]] = {}  # by kind of work, how far each step was from what was expected of it
+        self._after_s, self._after_since_ns = after_s, -1
 
     def mark(self, mark: StepMark) -> None:
         """A step began or ended."""
@@ -60,8 +67,9 @@ class Eta:
             return
         self._running = None
         if mark.state is StepState.DONE:
-            seen_s = self._seen_s[running.work]
-            seen_s.append(self._progress_s(mark.time_ns) - running.stated_s)
+            seen_s, beyond_s = self._seen_s[running.work], self._progress_s(mark.time_ns) - running.stated_s
+            self._off_s.setdefault(running.work, []).append(beyond_s - self._overhead_s[running.work])
+            seen_s.append(beyond_s)
             self._overhead_s[running.work] = median_low(seen_s)
 
     @property
@@ -69,9 +77,25 @@ class Eta:
         """How many steps the plan has now."""
         return len(self._steps)
 
+    @property
+    def frames(self) -> int:
+        """How many frames the plan is expected to give now."""
+        return sum(step.frames for step in self._steps)
+
+    def within_s(self) -> float | None:
+        """By how much the plan may end earlier or later, s: twice the deviation of the steps so far from what was
+        expected of each, for as many of their kind of work as are to come; no less than a minute. None before three
+        are done, and when none is left."""
+        left = self._count + Counter(() if self._running is None else (self._running.work,))
+        if sum(map(len, self._off_s.values())) < _LEAST_SEEN or not left.total():
+            return None
+        variance_s2 = sum(left[work] * sum(off * off for off in seen) / len(seen) for work, seen in self._off_s.items())
+        return max(_LEAST_WITHIN_S, 2.0 * math.sqrt(variance_s2))
+
     def event(self, event: Event) -> None:
         """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further.
-        `plan_changed`: an operator has changed what is still to be done."""
+        `plan_changed`: an operator has changed what is still to be done. `to_ambient`, `at_ambient`, `not_at_ambient`:
+        the way back begins or ends."""
         if event.kind == "held":
             self._held_since_ns = event.time_ns if self._held_since_ns is None else self._held_since_ns
             self._reasons.add(event.data.get("reason"))
@@ -82,14 +106,19 @@ class Eta:
                 self._held_since_ns = None
         elif event.kind == PLAN_CHANGED:
             self._change(event.data)
+        elif event.kind == "to_ambient":
+            self._after_since_ns = event.time_ns
+        elif event.kind in ("at_ambient", "not_at_ambient"):
+            self._after_s = 0.0
 
     def left_s(self, now_ns: int) -> float:
-        """From `now_ns` until the plan is done, s; a pause that is under way is taken to end now."""
+        """From `now_ns` until the plan and what follows it are done, s; a pause under way is taken to end now."""
         left_s = self._stated_s + sum(count * self._overhead_s[work] for work, count in self._count.items())
         if self._running is not None:
             expected_s = self._running.stated_s + self._overhead_s[self._running.work]
             left_s += max(0.0, expected_s - self._progress_s(now_ns))
-        return max(0.0, left_s)
+        gone_s = 0.0 if self._after_since_ns < 0 else (now_ns - self._after_since_ns) / NS_PER_S
+        return max(0.0, left_s) + max(0.0, self._after_s - gone_s)
 
     def _change(self, data: Mapping[str, object]) -> None:
         """What replaces steps is priced by what it states."""

@@ -3,36 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Generator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from foundation.errors import ConfigError, SessionError, StandError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
-from foundation.progress import progress
-from stand.aside import aside
 from stand.config.stand_config import StandConfig
-from stand.estimating.estimate import price
-from stand.estimating.follow import Follow
-from stand.estimating.learned import learn, load_learned
+from stand.estimating.learned import learn
+from stand.estimating.night import price_night
 from stand.queueing.queue import order_of
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Halt, Notes
 from stand.running.entries import Ended
 from stand.running.journal import Journal
-from stand.running.order import Order
-from stand.running.resume import Interruption, interruption
+from stand.running.resume import Interruption, interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.stop import Interrupted
 from stand.session_report import NotReported, check_reportable, report_session
+from stand.watching.live import followed
 
 
-async def run_entry(
-    directory: Path, entry: Entry, notes: Notes, tell: Callable[[str], None], *, virtual_time: bool
-) -> Path:
-    """Run `entry` into a session below `directory`, or resume the one it has; progress is shown, `tell` gets
-    warnings.
+async def run_entry(directory: Path, entry: Entry, notes: Notes, *, virtual_time: bool) -> Path:
+    """Run `entry` into a session below `directory`, or resume the one it has; it is shown while it runs.
 
     Returns the session's folder. Halt when an interrupted run cannot be resumed, or one that failed has left the stand
     not confirmed safe; else raises as a run does.
@@ -42,12 +35,14 @@ async def run_entry(
         return session  # killed between its end and the note of it
     order = order_of(entry)
     before = None if session is None else await asyncio.to_thread(interruption_of, session, order.config)
+    night = price_night(tuple(order.recipe.plan()) if before is None else before.state.plan, order.config, directory)
     watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
     try:
-        with _followed(directory, order, before, tell) as follow:
+        is_virtual = virtual_time or is_of_virtual_time(before)
+        with followed(order, night, directory, is_virtual=is_virtual, before=before) as show:
 
             def subscribe(hub: Hub) -> None:
-                hub.subscribe(follow)
+                show(hub)
                 hub.subscribe(watch)
 
             if before is not None:
@@ -98,19 +93,6 @@ def conclude(entry: Entry, session: Path, tell: Callable[[str], None], *, report
         tell(f"{session.name}: {error}")
     except Exception as error:  # noqa: BLE001 - a fit that fails must not end the queue
         tell(f"{session.name}: is recorded, but not reported: {type(error).__name__}: {error}")
-
-
-@contextmanager
-def _followed(
-    directory: Path, order: Order, before: Interruption | None, tell: Callable[[str], None]
-) -> Generator[Follow]:
-    plan = order.recipe.plan() if before is None else before.state.plan
-    steps = price(plan, order.config, load_learned(directory))
-    with progress("run", sum(step.duration_s for step in steps)) as report, aside() as later:
-        if before is None:
-            yield Follow(steps, later(report), later(tell))
-        else:
-            yield Follow(steps, later(report), later(tell), before.kept.done, before.kept.earned_s)
 
 
 def interruption_of(session: Path, own: StandConfig, *, clear: bool = False) -> Interruption:

@@ -22,8 +22,7 @@ from recording.reading.contents import RUN_END
 from recording.reading.run_word import Run
 from recording.writing.recorder import Recorder
 from stand.assembly import Assembly
-from stand.estimating.estimate import price
-from stand.estimating.learned import load_learned
+from stand.estimating.night import price_night
 from stand.fault import Fault
 from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.running.camera_gap import OffsetGap, OffsetWatch, doubt
@@ -186,11 +185,10 @@ class Guest:
         assembly, recorder, state, before = self._assembly, self.recorder, self.log.state, self.job.before
         kept = state if before is None else before.kept
         with assembly.clock.hold():  # nothing moves yet: the disk may take its time
-            learned = await asyncio.to_thread(load_learned, recorder.directory.parent)
-        steps = price(state.plan, self.job.order.config, learned)
+            night = await asyncio.to_thread(price_night, state.plan, self.job.order.config, recorder.directory.parent)
         gate, clock, house = assembly.stand.gate, assembly.clock, self._house
         name = self.job.order.recipe.name
-        board = StatusBoard(name, steps, kept, gate, self.stop, lambda: house.latched, recorder, clock)
+        board = StatusBoard(name, night, kept, gate, self.stop, lambda: house.latched, recorder, clock)
         assembly.hub.subscribe(board)
         leaving.callback(assembly.hub.unsubscribe, board)
         if not isinstance(clock, VirtualClock):  # there nobody waits for the end

@@ -219,3 +219,8 @@ def _order(session: Session, first: Begun) -> Order:
             f"{session.path}: this version of thermostand makes another plan of its recipe; begin a new run"
         )
     return order
+
+
+def is_of_virtual_time(before: Interruption | None) -> bool:
+    """Whether an interrupted run was one in virtual time, in which it is then resumed."""
+    return before is not None and before.info.clock_source == "virtual"

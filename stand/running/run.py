@@ -28,7 +28,7 @@ from stand.running.guest import Guest, Job
 from stand.running.house import House, Time, opened
 from stand.running.order import Order
 from stand.running.rehearsal import rehearsed
-from stand.running.resume import Interruption
+from stand.running.resume import Interruption, is_of_virtual_time
 from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory
 from stand.running.stop import Interrupted, Stop
 from stand.serving.alerts import alerting
@@ -80,7 +80,7 @@ async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s:
     """
     try:
         job = Job(before.order, before.directory.parent, before.seed, watch, _nobody, before)
-        if before.info.clock_source == "virtual":
+        if is_of_virtual_time(before):
             return await _run_virtual(job, before.last_ns + seconds_ns(downtime_s))
         async with Stop() as stop:
             return await _run(job, WallClock(before.last_ns + 1), None, stop)

@@ -9,11 +9,11 @@ from pathlib import Path
 from pydantic import JsonValue
 
 from experiments.steps import PlannedStep, estimate_s, frames_of, kind_of, parameters_of, step_of
+from experiments.words import in_words
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError, SessionError
 from foundation.items import Event, Item, StepMark, StepState
 from stand.assembly import Assembly
-from stand.estimating.follow import parameters_text
 from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR, Phase
 from stand.running.executor import Executor
@@ -240,7 +240,7 @@ class RunDesk:
             index=planned.index,
             kind=kind_of(step),
             parameters=parameters_of(step),
-            text=f"{kind_of(step)} {parameters_text(parameters_of(step))}".rstrip(),
+            text=in_words(step),
             standing=standing,
             duration_s=duration_s,
             earned_s=earned_s,

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
+from experiments.words import mark_in_words
 from foundation.clock import Clock, seconds_ns, utc_offset_ns
 from foundation.items import Batch, Event, Item, StepMark
 from foundation.readings import Quality
 from recording.writing.recorder import Recorder
-from stand.estimating.estimate import PricedStep
 from stand.estimating.eta import Eta
-from stand.estimating.follow import parameters_text
+from stand.estimating.night import Night
 from stand.fault import Fault
 from stand.gate import Gate, Phase
 from stand.running.state import RunState
@@ -38,7 +38,7 @@ class StatusBoard:
     def __init__(
         self,
         recipe: str,
-        steps: Sequence[PricedStep],
+        night: Night,
         state: RunState,
         gate: Gate,
         stop: Stop,
@@ -46,9 +46,9 @@ class StatusBoard:
         recorder: Recorder,
         clock: Clock,
     ) -> None:
-        self.priced_s = {step.planned.step_id: step.duration_s for step in steps}
+        self.priced_s = {step.planned.step_id: step.duration_s for step in night.steps}
         self._recipe = recipe
-        self._eta = Eta(steps, state.done, state.earned_s)
+        self._eta = Eta(night.steps, state.done, state.earned_s, night.after_s)
         self._gate = gate
         self._stop = stop
         self._held = held
@@ -69,7 +69,7 @@ class StatusBoard:
             case StepMark():
                 self._eta.mark(item)
                 self._step = item.index + 1
-                self._doing = f"{item.kind} {parameters_text(item.parameters)}".rstrip()
+                self._doing = mark_in_words(item.kind, item.parameters)
             case Event():
                 self._eta.event(item)
                 if item.level != "info":
@@ -97,6 +97,8 @@ class StatusBoard:
             now_ns=now_ns,
             since_ns=self._since_ns,
             end_ns=None if self._state == "stopping" else now_ns + seconds_ns(self._eta.left_s(now_ns)),
+            end_within_s=self._eta.within_s(),
+            frames_planned=self._eta.frames,
             temperatures_degC=self._temperatures_degC,
             frames_saved=saved.frames,
             frames_lost=saved.frames_lost,

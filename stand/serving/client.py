@@ -44,7 +44,8 @@ class Server:
     def request(
         self, method: str, path: str, body: Mapping[str, object] | None = None, timeout_s: float = LIMIT_S
     ) -> object:
-        """The JSON it answers. SessionError when it does not answer, or refuses: then with its sentence."""
+        """The JSON it answers, None when that is empty. SessionError when it does not answer, or refuses: then with its
+        sentence."""
         connection = self._connection(timeout_s)
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         try:
@@ -95,6 +96,8 @@ class Server:
         return kind(parts.hostname or "", parts.port, timeout=timeout_s)
 
     def _understood(self, status: int, text: bytes) -> object:
+        if status == http.HTTPStatus.NO_CONTENT:
+            return None
         try:
             answer: object = json.loads(text)
         except (ValueError, RecursionError):

@@ -67,10 +67,13 @@ class RunStatus(Value):
     utc_offset_ns makes now and later UTC as the host has it, since_utc_offset_ns and warning_utc_offset_ns the others.
 
     session: its folder as it was when the run began. run_id: the session's name, which no other run of the stand has.
-    step: number of the step under way, 1 is the first. since_ns: when the present state began. end_ns: when the run is
-    expected to end, None when unknown. temperatures_degC: by channel, None for a BAD reading. warning: the text of the
-    last warning or error, published at warning_ns. fault_rule, fault: the rule that has tripped and holds or ends the
-    run, and what was found, "" when all is well.
+    step: number of the step under way, 1 is the first; doing: that step in words. since_ns: when the present state
+    began. end_ns: when the run is expected to end, the way back to the laboratory's temperature included, None when
+    unknown; end_within_s: by how much it may be earlier or later, from how far this run's steps were from what was
+    expected of them, None before three are done. frames_planned: how many the plan is expected to give.
+    temperatures_degC: by channel, None for a BAD reading. warning: the text of the last warning or error, published at
+    warning_ns. fault_rule, fault: the rule that has tripped and holds or ends the run, and what was found, "" when all
+    is well.
     """
 
     recipe: str
@@ -89,6 +92,8 @@ class RunStatus(Value):
     warning: str = ""
     warning_level: Literal["", "warning", "error"] = ""
     warning_ns: int | None = None
+    end_within_s: float | None = None
+    frames_planned: int | None = None
     utc_offset_ns: int = 0
     since_utc_offset_ns: int = 0
     warning_utc_offset_ns: int = 0

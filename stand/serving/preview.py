@@ -14,34 +14,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.steps import Role
 from markers.detection import Detection, detect, grey_image
 from markers.edge_model import SIGMA
 from markers.errors import DetectionError
 from markers.plane import project, roll_deg
 from markers.target import Target
+from stand.serving.shot import DRIFT_ROLES, Image, Shot
 
-# Also "", a frame that no capture of a run asked for.
-DRIFT_ROLES = frozenset({"", Role.REFERENCE, Role.FIT, Role.VALIDATION, Role.WARM_UP, Role.SETTLING})
 _JPEG_QUALITY = 80
 _BINS = 64
 _EDGE_10_90 = 2.5631  # from 10 to 90 % of a Gaussian edge, in its standard deviations
 _CORNER = np.array([(0, 0), (1, 0), (0, 1)])  # mm
 _NEARLY_SQUARE = 0.9995  # foreshortening that noise and pixels that are not quite square can make, too
 
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """A frame as it is sent here. role: of its capture, "" without one. as_reference: drift counts from it on."""
-
-    camera: str
-    time_ns: int
-    image: Image
-    role: str = ""
-    as_reference: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +114,10 @@ class Previewer:
             reference[0] if mean is not None and reference is not None else None,
             jpeg=jpeg,
         )
+
+    def mean_px(self, shot: Shot) -> float | None:
+        """The length of the mean drift, for those who show no more."""
+        return self.look(shot).mean_px
 
     def _drift(self, shot: Shot, found: Detection) -> Float:
         """Of each marker, px; NaN where there is none to be told."""

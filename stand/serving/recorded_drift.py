@@ -13,7 +13,8 @@ from experiments.steps import Role
 from foundation.documents import parse_document
 from markers.target import Target
 from recording.reading.session import Session
-from stand.serving.preview import DRIFT_ROLES, Previewer, Shot
+from stand.serving.preview import Previewer
+from stand.serving.shot import DRIFT_ROLES, Shot
 
 MOST_FRAMES = 120
 

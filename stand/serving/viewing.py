@@ -21,6 +21,7 @@ from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame
 from stand.serving.history import History
 from stand.serving.preview_process import MODULE, previewer, recorded_week
+from stand.serving.shot import Shot, is_reference
 
 if TYPE_CHECKING:
     from stand.serving.preview import Preview
@@ -128,9 +129,7 @@ class Viewing:
             await asyncio.sleep(max(0.05, began_s + _SOONEST_S - loop.time()) if self._newest else 0.1)
 
     async def _look(self, camera: str, frame: Frame, role: str) -> None:
-        from stand.serving.preview import DRIFT_ROLES, Shot
-
-        as_reference = role in DRIFT_ROLES and (camera in self._fresh or role == "reference" != self._role_of(camera))
+        as_reference = is_reference(role, self._role_of(camera), is_first=camera in self._fresh)
         try:
             line = await self._previewer()
             shot = Shot(camera, frame.time_ns, frame.image, role, as_reference)

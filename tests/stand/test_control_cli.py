@@ -14,6 +14,7 @@ from foundation.clock import NS_PER_S
 from foundation.items import Event
 from stand.commands.control_cli import app, status_lines
 from stand.config.stand_config import packaged
+from stand.estimating.night import Night
 from stand.gate import Gate
 from stand.running.state import RunState
 from stand.running.status import StatusBoard
@@ -91,7 +92,7 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
     host, gate = Host(), Gate()
     clock = host.clock()
     recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
-    board = StatusBoard("night", (), RunState(()), gate, Stop(), lambda: None, recorder, clock)
+    board = StatusBoard("night", Night(()), RunState(()), gate, Stop(), lambda: None, recorder, clock)
     host.step(3600)
     board(Event(clock.now_ns(), "warning", "odd", "it is so"))
     host.step(-60)

@@ -22,19 +22,19 @@ from experiments.steps import (
     SoakUntilSettled,
     StartChamber,
     Step,
+    StopChamber,
     kind_of,
     number_steps,
     parameters_of,
 )
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError
-from foundation.items import Batch, Event, StepMark, StepState
+from foundation.items import Event, StepMark, StepState
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.durations import Pace, Situation, expect
-from stand.estimating.estimate import PricedStep, price
+from stand.estimating.estimate import PricedStep, price, way_back_s
 from stand.estimating.eta import Eta
-from stand.estimating.follow import Follow
 from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
 from stand.estimating.thermal_model import ChamberModel, Response
 from stand.running.entries import Change, Edited, Extended, Skipped, data_of
@@ -320,35 +320,6 @@ def test_steps_before_the_running_one_are_not_waited_for(config: StandConfig):
     assert eta.left_s(BEGIN_NS) == 360.0
 
 
-def test_following_a_run_reports_the_share_done_the_time_left_and_what_is_wrong(config: StandConfig):
-    plan = planned(Soak(600.0), Soak(300.0))
-    reports: list[tuple[float, str]] = []
-    lines: list[str] = []
-    follow = Follow(price(plan, config), lambda done, text: reports.append((done, text)), lines.append)
-    follow(Event(BEGIN_NS, "info", "run.start", "recipe x"))
-    follow(Batch("regulator", BEGIN_NS, ()))  # nothing has begun
-    assert reports == []
-    for mark in marks(plan, [600.0, 300.0]):
-        follow(mark)
-    assert [done for done, _ in reports] == pytest.approx([0.0, 600.0, 600.0, 900.0])
-    assert reports[2][1] == "until 2026-01-01 18:15 (0:05:00 of stand time); 2/2 Soak duration_s=300.0"
-    for second in range(3):
-        follow(Batch("regulator", BEGIN_NS + (900 + second) * NS_PER_S, ()))
-    assert len(reports) == 6
-    follow(Event(BEGIN_NS, "warning", "camera_lost", "no answer"))
-    assert lines == ["warning: 18:00:00 UTC no answer"]
-
-
-def test_a_terminal_that_is_gone_does_not_end_what_it_follows(config: StandConfig):
-    def gone(done: float, text: str) -> None:
-        raise BrokenPipeError
-
-    plan = planned(Soak(60.0))
-    follow = Follow(price(plan, config), gone, lambda line: gone(0.0, line))
-    follow(Event(BEGIN_NS, "error", "guard.rule", "it is so"))
-    follow(marks(plan, [60.0])[0])
-
-
 async def test_runs_teach_what_work_takes_and_the_median_counts(tmp_path: Path, config: StandConfig):
     plan = planned(MoveTo("linear", 0.0), CloseFlap(), OpenFlap(), Soak(5.0), CAPTURE, CloseFlap())
     for night, travel_s in enumerate((1.0, 1.2, 40.0)):
@@ -405,3 +376,35 @@ def test_a_situation_is_what_the_steps_before_have_left(config: StandConfig):
     found = Situation().after(MoveTo("linear", 3.0)).after(OpenFlap())
     assert found == Situation(flap_open=True, positions={"linear": 3.0})
     assert expect(OpenFlap(), found, config).work == "flap at rest"
+
+
+def test_how_sure_the_end_is_follows_from_the_steps_of_the_kinds_that_are_still_to_come(config: StandConfig):
+    plan = planned(*[CloseFlap()] * 2, *[Soak(600.0)] * 6)
+    steps = price(plan, config)
+    eta = Eta(steps)
+    lasted_s = [steps[0].duration_s + 3000.0, steps[1].duration_s, 600.0, 630.0, 570.0]
+    for mark in marks(plan[:3], lasted_s[:3]):
+        eta.mark(mark)
+    assert eta.within_s() == 60.0  # no flap is to come, and the soak was as expected
+    for mark in marks(plan[:5], lasted_s)[6:]:
+        eta.mark(mark)
+    deviation_s = math.sqrt((0.0 + 30.0**2 + 30.0**2) / 3)
+    assert eta.within_s() == pytest.approx(2 * deviation_s * math.sqrt(3), rel=0.3)
+    assert Eta(steps).within_s() is None
+
+
+def test_the_way_back_to_the_laboratory_is_part_of_the_night(config: StandConfig):
+    plan = planned(StartChamber(10.0), Soak(600.0), StopChamber())
+    back = config.model_copy(update={"ending": config.ending.model_copy(update={"to_ambient": True})})
+    after_s = way_back_s(plan, back, Learned())
+    assert way_back_s(plan, config, Learned()) == 0.0
+    assert way_back_s(planned(StartChamber(back.ending.ambient_degC)), back, Learned()) == 0.0
+    assert ChamberModel().heating.arrival_s(13.0, back.ending.band_K) < after_s < back.ending.max_s
+    eta = Eta(price(plan, back), after_s=after_s)
+    assert eta.left_s(BEGIN_NS) == pytest.approx(Eta(price(plan, back)).left_s(BEGIN_NS) + after_s)
+    for mark in marks(plan, [0.0, 600.0, 0.0]):
+        eta.mark(mark)
+    eta.event(Event(BEGIN_NS, "info", "to_ambient", ""))
+    assert eta.left_s(BEGIN_NS + 60 * NS_PER_S) == pytest.approx(after_s - 60.0)
+    eta.event(Event(BEGIN_NS, "info", "at_ambient", ""))
+    assert eta.left_s(BEGIN_NS) == 0.0

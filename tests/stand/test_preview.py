@@ -9,7 +9,8 @@ import pytest
 
 from markers.detection import detect
 from markers.target import load_target
-from stand.serving.preview import Previewer, Shot, half_jpeg, keystone_percent, setup_of, tilt_deg
+from stand.serving.preview import Previewer, half_jpeg, keystone_percent, setup_of, tilt_deg
+from stand.serving.shot import Shot
 from tests.compensation.rendered import Scene, photograph, render, true_centres_px
 
 PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")

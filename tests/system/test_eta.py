@@ -14,11 +14,13 @@ from foundation.items import Batch, Event, Item, StepMark, StepState
 from recording.reading.session import Session
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
-from stand.estimating.follow import Follow
 from stand.estimating.learned import learn, load_learned
+from stand.estimating.night import Night
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
+from stand.watching.follow import Follow
+from stand.watching.moment import Moment
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
@@ -52,7 +54,7 @@ def following(follow: Follow) -> tuple[Callable[[Hub], None], list[tuple[int, fl
 async def followed(order: Order, out: Path, seed: int | None = None) -> tuple[Path, list[tuple[int, float]]]:
     """The session, and the time left as `following` has it, by what earlier runs in that folder have taught."""
     steps = price(order.recipe.plan(), order.config, load_learned(out))
-    watch, left = following(Follow(steps, lambda done, text: None, lambda line: None))
+    watch, left = following(Follow("a night", Night(steps), lambda moment: None, lambda line: None))
     return await run_virtual(order, out, seed, watch), left
 
 
@@ -101,7 +103,7 @@ async def test_the_time_left_of_a_run_that_goes_on_is_true(tmp_path: Path, order
     before = interruption(directory)
     steps = price(ordered.recipe.plan(), ordered.config)
     done, earned_s = before.kept.done, before.kept.earned_s
-    watch, left = following(Follow(steps, lambda done, text: None, lambda line: None, done, earned_s))
+    watch, left = following(Follow("a night", Night(steps), lambda moment: None, lambda line: None, done, earned_s))
     await resume(before, watch)
     assert len(left) > 100
     assert is_true(left, directory, 5.0)
@@ -131,23 +133,21 @@ async def test_the_time_left_is_true_over_the_whole_demo_night(tmp_path: Path, o
 
 
 def test_the_console_shows_no_time_gained_in_a_pause(order: Callable[..., Order]):
-    ordered, texts, shares = order(), list[str](), list[float]()
-
-    def report(done: float, text: str) -> None:
-        texts.append(text)
-        shares.append(done)
-
+    ordered, shown = order(), list[Moment]()
     steps = price(ordered.recipe.plan(), ordered.config)
-    follow = Follow(steps, report, lambda line: None)
+    follow = Follow("a night", Night(steps), shown.append, lambda line: None)
     soak = next(step.planned for step in steps if isinstance(step.planned.step, Soak))
     follow(StepMark(0, soak.step_id, soak.index, "Soak", StepState.STARTED))
-    follow(Event(100 * NS_PER_S, "warning", "held", "operator"))
+    follow(Event(100 * NS_PER_S, "warning", "held", "", {"reason": "operator"}))
     follow(Batch("regulator", 100 * NS_PER_S, ()))
     left_s = follow.eta.left_s(100 * NS_PER_S)
     follow(Batch("regulator", 4000 * NS_PER_S, ()))
     assert follow.eta.left_s(4000 * NS_PER_S) == left_s
-    assert texts[-1].split("(")[1] == texts[-2].split("(")[1]  # as much stand time as at its beginning
-    follow(Event(4000 * NS_PER_S, "info", "released", "operator"))
+    now, before = shown[-1], shown[-2]
+    assert (now.end_ns or 0) - now.now_ns == (before.end_ns or 0) - before.now_ns  # as long as at its beginning
+    assert "an operator's pause" in now.held
+    follow(Event(4000 * NS_PER_S, "info", "released", "", {"reason": "operator"}))
     follow(Batch("regulator", 4050 * NS_PER_S, ()))
     assert follow.eta.left_s(4050 * NS_PER_S) == left_s - 50
-    assert shares[-1] > shares[-2]
+    assert (shown[-1].share or 0.0) > (shown[-2].share or 0.0)
+    assert shown[-1].held == ""

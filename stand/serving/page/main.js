@@ -49,8 +49,7 @@ function show(state) {
   say(at("phase"), PHASE[phase]);
   const { run } = state;
   say(at("doing"), run ? `${run.recipe}: step ${run.step} of ${run.steps}, ${run.doing}` : state.setpoint_degC === null ? "no run" : `no run; chamber at ${state.setpoint_degC} °C`);
-  const steps = app.view instanceof Plan ? app.view.steps : [];
-  say(at("eta"), run?.end_ns ? `ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(steps)}` : clock(app.now_s()));
+  say(at("eta"), run?.end_ns ? `ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(run)}` : clock(app.now_s()));
   document.title = `${PHASE[phase]} · ${state.stand}`;
   notices.update(state);
   app.view.update(state);

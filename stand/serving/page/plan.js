@@ -122,7 +122,7 @@ export class Plan {
     this.edit_button.disabled = !is_run || !this.steps.length;
     if (!is_run) return say(this.summary, "No run is under way.");
     const run = state.run;
-    const end = run.end_ns === null ? "" : `; ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(this.steps)}`;
+    const end = run.end_ns === null ? "" : `; ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(run)}`;
     say(this.summary, `${run.recipe}, session ${run.run_id || "–"}: step ${run.step} of ${run.steps}${is_held ? `, held: ${state.reasons.map(this.app.reason).join(", ")}` : ""}${end}`);
   }
 
@@ -173,12 +173,5 @@ function progress_text(step) {
   return step.earned_s > 0 ? ` – ${duration(step.earned_s)} of ${duration(step.duration_s)} earned` : "";
 }
 
-// How far the end may be off: by how much steps that are done differed from what was expected of them, for as many as
-// are to come, twice the deviation. "" before there is anything to go by.
-export function uncertainty(steps) {
-  const off = steps.filter((step) => step.standing === "done" && step.began_ns && step.ended_ns).map((step) => (step.ended_ns - step.began_ns) / 1e9 - step.duration_s);
-  const left = steps.filter((step) => step.standing === "waiting" || step.standing === "under_way").length;
-  if (off.length < 3 || !left) return "";
-  const rms_s = Math.sqrt(off.reduce((sum, each) => sum + each * each, 0) / off.length);
-  return ` ± ${duration(Math.max(60, 2 * rms_s * Math.sqrt(left)))}`;
-}
+// How far the end may be off, as the stand tells it; "" before there is anything to go by.
+export const uncertainty = (run) => (run.end_within_s ? ` ± ${duration(run.end_within_s)}` : "");

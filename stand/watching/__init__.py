@@ -1,0 +1,1 @@
+"""A run as whoever sits at the terminal sees it."""

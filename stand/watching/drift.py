@@ -1,0 +1,85 @@
+"""The drift in the frames of a run that no daemon looks at, by the process that looks at frames for the page."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from threading import Event as Flag
+from threading import Thread
+
+from foundation.errors import StandError
+from foundation.helper import Helper, Line
+from foundation.hub import Hub
+from foundation.items import Item, StepMark, StepState
+from foundation.readings import Frame
+from stand.serving.preview_process import MODULE, previewer
+from stand.serving.shot import DRIFT_ROLES, Shot, is_reference
+
+_LOOK_S = 1.0
+_LOOK = "look"
+_ENDED = "the process that looks at frames has ended"
+
+
+class DriftWatch:
+    """A subscriber that keeps the newest frame; a thread asks for its drift at the lowest priority. `mean_px`: of the
+    last frame that was looked at, None before there is one, or when it shows no drift."""
+
+    def __init__(self, target_text: str) -> None:
+        self.mean_px: float | None = None
+        self._target_text = target_text
+        self._role = self._channel = ""  # drift is told of the first camera that gives a frame
+        self._newest: tuple[Frame, str] | None = None
+        self._ending = Flag()
+        self._thread = Thread(target=self._work, name="drift", daemon=True)
+        self._helper: Helper | None = None
+
+    def subscribe(self, hub: Hub) -> None:
+        """To the hub of the run."""
+        hub.subscribe(self._follow)
+
+    def _follow(self, item: Item) -> None:
+        if isinstance(item, StepMark) and item.state is StepState.STARTED:
+            self._role = str(item.parameters.get("role", ""))
+        elif isinstance(item, Frame) and item.channel == (self._channel or item.channel):
+            self._channel = item.channel
+            self._newest = item, self._role
+            if not self._thread.ident:
+                self._thread.start()
+
+    def close(self) -> None:
+        """Look at no more."""
+        self._ending.set()
+        if self._helper is not None:
+            self._helper.close()
+
+    def _work(self) -> None:
+        """A process that ends, or cannot be started, takes the drift with it, and nothing else."""
+        with suppress(OSError, StandError):
+            self._helper = helper = Helper(MODULE, (_LOOK,), _ENDED)
+            try:
+                self._look_on(helper.line(_LOOK))
+            finally:
+                helper.close()
+        self.mean_px = None
+
+    def _look_on(self, line: Line) -> None:
+        line.make("previewer", previewer, self._target_text)
+        before: str | None = None
+        while not self._ending.wait(_LOOK_S):
+            newest, self._newest = self._newest, None
+            if newest is None or newest[1] not in DRIFT_ROLES:
+                continue
+            frame, role = newest
+            as_reference = is_reference(role, before or "", is_first=before is None)
+            shot = Shot(frame.channel, frame.time_ns, frame.image, role, as_reference)
+            self.mean_px, before = line.call("previewer", "mean_px", shot), role
+
+
+@contextmanager
+def drift_watched(target_text: str) -> Generator[DriftWatch]:
+    """While inside."""
+    watch = DriftWatch(target_text)
+    try:
+        yield watch
+    finally:
+        watch.close()

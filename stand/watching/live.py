@@ -1,0 +1,146 @@
+"""Where a run is shown: a panel that stays at the foot of a terminal, with messages above it; elsewhere, lines."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.panel import Panel
+from rich.text import Text
+
+from foundation.clock import NS_PER_S, Now, WallClock
+from foundation.hub import Hub
+from foundation.usage import one_line
+from stand.aside import aside
+from stand.estimating.night import Night
+from stand.running.order import Order
+from stand.running.resume import Interruption
+from stand.watching.drift import drift_watched
+from stand.watching.follow import Follow
+from stand.watching.moment import Moment, free_bytes
+from stand.watching.panel import panel_lines, plain_line
+
+_BETWEEN_PANELS_NS = NS_PER_S // 4
+_BETWEEN_LINES_NS = 60 * NS_PER_S
+_TENTH = 0.1  # of a run in virtual time, whose minutes are none
+
+
+class View(Protocol):
+    """Shows moments as often as it likes, and each message at once."""
+
+    def show(self, moment: Moment) -> None:
+        """How it stands."""
+        ...
+
+    def tell(self, line: str) -> None:
+        """What has happened."""
+        ...
+
+
+@contextmanager
+def view(*, is_virtual: bool = False) -> Generator[View]:
+    """On standard error, while inside. Of a run in virtual time a line comes at each tenth instead of each minute."""
+    if not sys.stderr.isatty():
+        yield Lines(WallClock(), is_virtual=is_virtual)
+        return
+    with _foot(WallClock()) as foot:
+        yield foot
+
+
+@contextmanager
+def followed(
+    order: Order, night: Night, directory: Path, *, is_virtual: bool, before: Interruption | None = None
+) -> Generator[Callable[[Hub], None]]:
+    """What shows a run that records below `directory`, `before` having been done of it already: to be given its hub. It
+    is shown by a thread of its own, for which the run never waits. In virtual time no frame is looked at for its drift:
+    that would take longer than the run."""
+    title = f"{order.recipe.name} on {order.config.name}"
+    with view(is_virtual=is_virtual) as shown, drift_watched(order.target_text) as drift, aside() as later:
+
+        def show(moment: Moment) -> None:
+            shown.show(replace(moment, disk_free_bytes=free_bytes(directory), drift_px=drift.mean_px))
+
+        done, earned_s = ((), {}) if before is None else (before.kept.done, before.kept.earned_s)
+        follow = Follow(title, night, later(show), later(shown.tell), done, earned_s)
+
+        def watch(hub: Hub) -> None:
+            hub.subscribe(follow)
+            if not is_virtual:
+                drift.subscribe(hub)
+
+        yield watch
+
+
+class Lines:
+    """For a file or a pipe: a line when the run begins, and then each minute, or at each tenth in virtual time."""
+
+    def __init__(self, clock: Now, *, is_virtual: bool) -> None:
+        self._clock = clock
+        self._is_virtual = is_virtual
+        self._next_ns = 0
+        self._next_share = _TENTH
+
+    def show(self, moment: Moment) -> None:
+        """When it is time for one."""
+        if self._is_virtual:
+            share = moment.share or 0.0
+            if share + 1e-9 < self._next_share:
+                return
+            while self._next_share <= share + 1e-9:
+                self._next_share += _TENTH
+        else:
+            now_ns = self._clock.now_ns()
+            if now_ns < self._next_ns:
+                return
+            self._next_ns = now_ns + _BETWEEN_LINES_NS
+        typer.echo(plain_line(moment), err=True)
+
+    def tell(self, line: str) -> None:
+        """At once."""
+        typer.echo(one_line(line), err=True)
+
+
+class Foot:
+    """The panel at the foot of a terminal; its last moment stays there when it ends."""
+
+    def __init__(self, live: Live, clock: Now) -> None:
+        self._live = live
+        self._clock = clock
+        self._next_ns = 0
+        self._last: Moment | None = None
+
+    def show(self, moment: Moment) -> None:
+        """Four times a second at the most."""
+        self._last = moment
+        if (now_ns := self._clock.now_ns()) >= self._next_ns:
+            self._next_ns = now_ns + _BETWEEN_PANELS_NS
+            self.draw()
+
+    def draw(self) -> None:
+        """Now."""
+        if self._last is None:
+            return
+        text = Text("\n".join(panel_lines(self._last)), no_wrap=True, overflow="ellipsis")
+        title, style = Text(one_line(self._last.title)), "yellow" if self._last.held else "none"
+        self._live.update(Panel(text, title=title, title_align="left", border_style=style), refresh=True)
+
+    def tell(self, line: str) -> None:
+        """Above the panel."""
+        style = "red" if line.startswith("error") else "yellow" if line.startswith("warning") else ""
+        self._live.console.print(Text(one_line(line), style=style), soft_wrap=True)
+
+
+@contextmanager
+def _foot(clock: Now) -> Generator[Foot]:
+    console = Console(stderr=True, highlight=False)
+    with Live(console=console, auto_refresh=False, redirect_stdout=False) as live:
+        foot = Foot(live, clock)
+        yield foot
+        foot.draw()

@@ -1,0 +1,107 @@
+"""What whoever watches a run is shown at one instant, be it from the run's own hub or from a daemon's state."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from stand.estimating.room import existing
+from stand.gate import IN_WORDS
+from stand.serving.desk import StandState
+
+SET_POINT, AIR, CAMERA = "regulator.sp", "thermometers.air", "camera.temperature"
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """now_ns, end_ns: UTC, ns since the epoch. share: how much of the run is done, 0..1, None without one. step: number
+    of the step under way, 0 before the first; doing: that step in words. held: what holds the run, in words. A
+    temperature that is BAD or unknown is None, as all else that nobody has told. end_within_s: by how much the end may
+    be earlier or later. drift_px: mean drift of the markers in the last frame that was looked at.
+    """
+
+    now_ns: int
+    title: str
+    share: float | None = None
+    step: int = 0
+    steps: int = 0
+    doing: str = ""
+    held: str = ""
+    setpoint_degC: float | None = None
+    air_degC: float | None = None
+    camera_degC: float | None = None
+    frames: int = 0
+    frames_planned: int | None = None
+    frames_lost: int = 0
+    drift_px: float | None = None
+    disk_free_bytes: int | None = None
+    end_ns: int | None = None
+    end_within_s: float | None = None
+
+
+def moment_of(state: StandState, drift_px: float | None = None) -> Moment:
+    """Of a stand as its daemon tells it."""
+    offset_ns, run = state.utc_offset_ns, state.run
+    held = held_by(state.reasons)
+    setpoint_degC, air_degC, camera_degC = state.setpoint_degC, _value(state, AIR), _value(state, CAMERA)
+    if run is None:
+        waiting = sum(each.state == "waiting" for each in state.queue)
+        doing = f"no run; {waiting} queued" if waiting else "no run"
+        return Moment(
+            state.now_ns + offset_ns,
+            state.stand,
+            doing=doing,
+            held=held or state.queue_halted,
+            disk_free_bytes=state.disk_free_bytes,
+            setpoint_degC=setpoint_degC,
+            air_degC=air_degC,
+            camera_degC=camera_degC,
+        )
+    return Moment(
+        run.now_ns + run.utc_offset_ns,
+        f"{run.recipe} on {state.stand}",
+        share_done(state),
+        run.step,
+        run.steps,
+        run.doing,
+        "is being ended" if run.state == "stopping" else held,
+        setpoint_degC,
+        air_degC,
+        camera_degC,
+        frames=run.frames_saved,
+        frames_planned=run.frames_planned,
+        frames_lost=run.frames_lost,
+        drift_px=drift_px,
+        disk_free_bytes=run.disk_free_bytes,
+        end_ns=None if run.end_ns is None else run.end_ns + run.utc_offset_ns,
+        end_within_s=run.end_within_s,
+    )
+
+
+def _value(state: StandState, channel: str) -> float | None:
+    return state.readings[channel].value if channel in state.readings else None
+
+
+def share_done(state: StandState) -> float | None:
+    """Of the run under way, by the time it has taken and will take; None when its end, or its begin, is not known."""
+    run = state.run
+    began_ns = next((each.began_ns for each in state.queue if each.state == "running"), None)
+    if run is None or run.end_ns is None or began_ns is None or run.end_ns <= began_ns:
+        return None
+    return min(1.0, max(0.0, (run.now_ns - began_ns) / (run.end_ns - began_ns)))
+
+
+def held_by(reasons: Iterable[str]) -> str:
+    """`held by an operator's pause`; "" when nothing holds the run."""
+    causes = ", ".join(IN_WORDS.get(reason, reason) for reason in reasons)
+    return f"held by {causes}" if causes else ""
+
+
+def free_bytes(directory: Path) -> int | None:
+    """On the disk of a folder that need not exist yet; None when it cannot be asked."""
+    try:
+        return shutil.disk_usage(existing(directory)).free
+    except (OSError, StopIteration):
+        return None

@@ -1,0 +1,52 @@
+"""What to type after a message: whoever reads it at the terminal need not look it up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
+
+_ROOM = "it continues when there is room: `stand session archive` copies what is finished elsewhere"
+_OF_REASON = {
+    OPERATOR: "`stand continue` ends the pause",
+    INTERLOCK: "`stand clear` once the cause is removed",
+    CAMERA_LOST: "it continues when the camera answers: `stand devices` shows what is connected",
+    DISK_LOW: _ROOM,
+    NOT_RECORDED: _ROOM,
+}
+_OF_KIND = {
+    "prompt": "`stand continue` when it is done",
+    "hold_stays": _OF_REASON[INTERLOCK],
+    "camera_lost": _OF_REASON[CAMERA_LOST],
+    "camera_supply_off": "`stand devices` shows what is connected",
+    "device_lost": "`stand devices` shows what is connected",
+    "frames_stopped": _ROOM,
+    "telemetry_not_saved": _ROOM,
+    "disk_nearly_full": _ROOM,
+    "not_confirmed_safe": "switch the stand off by hand; `stand status` says when it is safe",
+    "alert_failed": "`stand alert test` tries them",
+    "notify_failed": "`stand alert test` tries alerts",
+    "salvaged": "`stand session verify` reads what was recovered",
+    "plan_changed": "`stand status --plan` shows the plan",
+    "run_failed": "`stand queue list` shows the queue",
+}
+_ELSE = "`stand status` shows how it stands"
+
+
+def next_command(kind: str, data: Mapping[str, object]) -> str:
+    """What helps, or shows more, after a warning or an error of that kind."""
+    if kind == "held":
+        return _OF_REASON.get(str(data.get("reason")), _ELSE)
+    if kind.startswith("guard."):
+        action = data.get("action")
+        if action == "hold":
+            return _OF_REASON[INTERLOCK]
+        return "`stand resume DIR --clear` once the cause is removed" if action == "abort" else _ELSE
+    if kind == "run.end":
+        return "`stand resume DIR` continues it" if data.get("status") != "complete" else _ELSE
+    return _OF_KIND.get(kind, _ELSE)
+
+
+def for_reason(reason: str) -> str:
+    """What ends a hold; "" when nothing has to be typed."""
+    return _OF_REASON[reason] if reason in (OPERATOR, INTERLOCK) else ""
