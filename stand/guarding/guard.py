@@ -149,14 +149,14 @@ class Guard:
         self._endings_ns = [time_ns for time_ns in self._endings_ns if now_ns - time_ns < seconds_ns(3600)]
         data: dict[str, object] = {"rule": fault.rule, "endings_in_last_h": len(self._endings_ns)}
         if self.release is None or len(self._endings_ns) >= _ENDINGS_PER_H:
-            text = f"{fault.rule} has held the run more than {_ENDINGS_PER_H} times in an hour; `stand clear` continues"
+            text = f"this has held the stand more than {_ENDINGS_PER_H} times in an hour; `stand clear` continues"
             self.held = Fault(fault.rule, f"{fault.text}; {text}", fault.action)
             self.hub.publish(Event(now_ns, "error", "hold_stays", text, data))
             self._notify(text)
             return
         self._endings_ns.append(now_ns)
         self.held = None
-        text = f"{fault.rule} is over; the run continues"
+        text = f"what held the stand is over, and it goes on; it was: {fault.text}"
         self.hub.publish(Event(now_ns, "warning", "hold_ended", text, data))
         self.release()
 
