@@ -106,6 +106,15 @@ class Observations:
         """(F,): usable frames taken for one of these purposes."""
         return self.usable & np.isin(self.role, [str(role) for role in roles])
 
+    def switched_on_ns(self, session: int, before_ns: int) -> int | None:
+        """When the camera's supply last came on before an instant of a session; None when that is not recorded."""
+        if not self.histories:
+            return None
+        history = self.histories[session]
+        rises = history.powered_ns[1:][np.diff(history.powered) > 0]
+        earlier = rises[rises <= before_ns]
+        return int(earlier[-1]) if len(earlier) else None
+
 
 def session_target(session: Session) -> Target:
     """The target attached to the session; SessionError when none is, ConfigError when it is wrong."""

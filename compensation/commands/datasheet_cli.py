@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from compensation.commands.observed import observed
 from compensation.commands.options import (
     AcrossGap,
     Cache,
@@ -15,22 +16,17 @@ from compensation.commands.options import (
     Incomplete,
     TargetOption,
     Workers,
-    named_target,
-    said_if,
 )
 from compensation.datasheet.datasheet import datasheet
 from compensation.datasheet.details import load_details
 from compensation.drift.choosing import fit
 from compensation.drift.model_file import load_model
-from compensation.finding.found import finder
-from compensation.observations import observe
 from compensation.reporting.datasheet_page import datasheet_json, datasheet_page
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.pdf import pdf_of
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, write_whole, write_whole_bytes
-from foundation.progress import progress
 from recording.reading.session import Session
 
 app = typer.Typer(add_completion=False)
@@ -62,13 +58,8 @@ def write_datasheet(
         check_writable(out)
         stated = load_details(details)
         given = None if model is None else load_model(model)
-        observations = observe(
-            sessions,
-            progress,
-            named_target(target),
-            finder(workers, cluster, use_cache=cache),
-            across_gap=across_gap,
-            incomplete=said_if(incomplete),
+        observations = observed(
+            sessions, target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
         )
         sheet = datasheet(observations, given or fit(observations), stated)
         equipment = equipment_of(Session.open(sessions[0]))

@@ -9,6 +9,7 @@ import typer
 
 from compensation.centres_table import observations_of_table
 from compensation.commands.budget_cli import budgets_of_sessions
+from compensation.commands.observed import observed
 from compensation.commands.options import (
     AcrossGap,
     Cache,
@@ -18,7 +19,6 @@ from compensation.commands.options import (
     TargetOption,
     Workers,
     named_target,
-    said_if,
 )
 from compensation.datasheet.details import load_details
 from compensation.drift.choosing import Form, check_request
@@ -26,8 +26,7 @@ from compensation.drift.choosing import fit as fit_model
 from compensation.drift.evaluation import evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
-from compensation.finding.found import finder
-from compensation.observations import Observations, observe
+from compensation.observations import Observations
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
 from compensation.reporting.report import NoModel, can_be_scored, check_report_writable, fitted, write_report
@@ -36,7 +35,6 @@ from compensation.validation3d.reading import load_validation
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
-from foundation.progress import progress
 from recording.reading.session import Session
 
 app = typer.Typer(add_completion=False)
@@ -80,13 +78,8 @@ def fit(
         if any(path.suffix.lower() == ".csv" for path in sessions):
             observations = _of_table(sessions)
         else:
-            observations = observe(
-                sessions,
-                progress,
-                named_target(target),
-                finder(workers, cluster, use_cache=cache),
-                across_gap=across_gap,
-                incomplete=said_if(incomplete),
+            observations = observed(
+                sessions, target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
             )
         model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
@@ -133,18 +126,16 @@ def report(
     with one_line_errors():
         check_report_writable(out, model, validation)
         stated = load_details(details)
-        found_by = finder(workers, cluster, use_cache=cache)
         given = None if model is None else load_model(model)
-        wanted = named_target(target)
         extras = Extras(
-            budgets={} if budget is None else budgets_of_sessions(sessions, budget, wanted),
+            budgets={} if budget is None else budgets_of_sessions(sessions, budget, named_target(target)),
             positions=table_positions([Session.open(path).steps() for path in sessions]),
             validation=None if validation is None else load_validation(validation),
             equipment=equipment_of(Session.open(sessions[0])),
             details=stated,
         )
-        observations = observe(
-            sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said_if(incomplete)
+        observations = observed(
+            sessions, target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
         )
         if given is None:
             used, evaluation, refusal = fitted(observations)

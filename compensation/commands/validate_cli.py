@@ -9,6 +9,7 @@ import typer
 
 from compensation.budget.geometry import load_geometry
 from compensation.calibration.camera_file import CameraFile
+from compensation.commands.observed import observed
 from compensation.commands.options import (
     AcrossGap,
     Cache,
@@ -16,12 +17,9 @@ from compensation.commands.options import (
     Incomplete,
     TargetOption,
     Workers,
-    named_target,
-    said_if,
 )
 from compensation.drift.model_file import load_model
-from compensation.finding.found import finder
-from compensation.observations import Float, observe
+from compensation.observations import Float
 from compensation.reporting.validation_report import validation_page
 from compensation.validation3d.document import as_json
 from compensation.validation3d.positions import validation_frames
@@ -31,7 +29,6 @@ from compensation.validation3d.validation import LensModel, camera_of, check_sam
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, write_whole
-from foundation.progress import progress
 from recording.reading.session import Session
 
 app = typer.Typer(add_completion=False)
@@ -65,13 +62,8 @@ def validate_session(
         beside = _numbers_beside(out)
         file, drift = CameraFile.load(camera), load_model(model)
         geometry = None if budget is None else load_geometry(budget)
-        observations = observe(
-            [session],
-            progress,
-            named_target(target),
-            finder(workers, cluster, use_cache=cache),
-            across_gap=across_gap,
-            incomplete=said_if(incomplete),
+        observations = observed(
+            [session], target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
         )
         check_same(observations, file, drift)
         opened = Session.open(session)

@@ -87,7 +87,7 @@ def warming_of(observations: Observations, moved: Float, session: int) -> Warmin
     if len(frames) < 5 or np.abs(moved[frames, :2]).max() > 10:
         return None
     times_ns = observations.time_ns[frames]
-    on_ns = _switched_on_ns(observations, session, int(times_ns[0]))
+    on_ns = observations.switched_on_ns(session, int(times_ns[0]))
     since_s = (times_ns - (int(times_ns[0]) if on_ns is None else on_ns)) / 1e9
     return Warming(
         since_s,
@@ -96,12 +96,3 @@ def warming_of(observations: Observations, moved: Float, session: int) -> Warmin
         observations.camera_degC[frames],
         moved[frames] - moved[frames[0]],
     )
-
-
-def _switched_on_ns(observations: Observations, session: int, first_ns: int) -> int | None:
-    if not observations.histories:
-        return None
-    history = observations.histories[session]
-    rises = history.powered_ns[1:][np.diff(history.powered) > 0]
-    before = rises[rises <= first_ns]
-    return int(before[-1]) if len(before) else None

@@ -120,21 +120,11 @@ def _warm_up(observations: Observations, frames: Rows) -> WarmUp:
     session = int(observations.session[frames[0]])
     start, moved = _from_own_first(observations.centres_px[frames])
     times_ns = observations.time_ns[frames]
-    on_ns = _switched_on_ns(observations, session, int(times_ns[0]))
+    on_ns = observations.switched_on_ns(session, int(times_ns[0]))
     since_ns = times_ns - (int(times_ns[0]) if on_ns is None else on_ns)
     at_reference = _is_near(start - reference_centres(observations)[0][session])
     track = Track(session, frames, start, moved, _roll_deg(observations, start), at_reference)
     return WarmUp(track, since_ns / _NS_PER_S, on_ns is not None)
-
-
-def _switched_on_ns(observations: Observations, session: int, first_ns: int) -> int | None:
-    """When the camera's supply came on before its first frame; None when that is not recorded."""
-    if not observations.histories:
-        return None
-    history = observations.histories[session]
-    rises = history.powered_ns[1:][np.diff(history.powered) > 0]
-    before = rises[rises <= first_ns]
-    return int(before[-1]) if len(before) else None
 
 
 def _roll_deg(observations: Observations, start_px: Float) -> float:

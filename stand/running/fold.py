@@ -8,8 +8,9 @@ Pure: no clock, no disk, no device.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import reduce
 from types import MappingProxyType
 
 from experiments.steps import (
@@ -51,25 +52,7 @@ from stand.running.state import RunState, SetUp
 def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
     """The state of a run of that plan after these entries. ConfigError when the plan was edited to steps that are not
     known here."""
-    state = RunState(tuple(plan), done=_Growing(), begun=_Growing())
-    for entry in entries:
-        state = after(state, entry)
-    return replace(state, done=frozenset(state.done), begun=frozenset(state.begun))
-
-
-class _Growing(set[str]):
-    """Ids within a fold, where the states between are not kept: a plan has up to 100,000 steps."""
-
-
-def _plus(ids: Set[str], step_id: str) -> Set[str]:
-    if isinstance(ids, _Growing):
-        ids.add(step_id)
-        return ids
-    return ids | {step_id}
-
-
-def _minus(ids: Set[str], gone: Set[str]) -> Set[str]:
-    return _Growing(ids - gone) if isinstance(ids, _Growing) else ids - gone
+    return reduce(after, entries, RunState(tuple(plan)))
 
 
 def after(state: RunState, entry: Entry) -> RunState:
@@ -161,7 +144,7 @@ def _changed(state: RunState, change: Change) -> RunState:
     state = replace(state, changes=(*state.changes, change))
     match change:
         case Skipped(_, step_id):
-            state = replace(state, skipped=state.skipped | {step_id}, done=_plus(state.done, step_id))
+            state = replace(state, skipped=state.skipped.plus(step_id), done=state.done.plus(step_id))
             if state.under_way == step_id:
                 state = replace(state, under_way="", due_ns=None, is_lost=False)
             return _placed(state)
@@ -200,7 +183,7 @@ def _begun(state: RunState, entry: Step) -> RunState:
     is_anew = state.under_way != entry.step_id
     state = replace(
         state,
-        begun=_plus(state.begun, entry.step_id),
+        begun=state.begun.plus(entry.step_id),
         under_way=entry.step_id,
         due_ns=None if is_anew else state.due_ns,
         is_lost=state.is_lost and not is_anew,
@@ -216,7 +199,7 @@ def _done(state: RunState, entry: Step) -> RunState:
     return _placed(
         replace(
             state,
-            done=_plus(state.done, entry.step_id),
+            done=state.done.plus(entry.step_id),
             under_way="" if is_under_way else state.under_way,
             earned_ns=_without(state.earned_ns, entry.step_id),
             frames=_without(state.frames, entry.step_id),
@@ -279,9 +262,9 @@ def _again(state: RunState, entry: Again) -> RunState:
         state,
         index=0,
         set_up=SetUp(),
-        done=_minus(state.done, ids),
-        begun=_minus(state.begun, ids),
-        skipped=state.skipped - ids,
+        done=state.done.minus(ids),
+        begun=state.begun.minus(ids),
+        skipped=state.skipped.minus(ids),
         frames=frames,
     )
     if ids != frozenset((state.under_way,)):

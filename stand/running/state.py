@@ -5,7 +5,7 @@ It is folded from the run's entries (stand/running/fold.py); what to do next is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -25,10 +25,8 @@ from experiments.steps import (
     longest_s,
 )
 from foundation.clock import NS_PER_S, seconds_ns
-from stand.running.entries import (
-    Change,
-    Ended,
-)
+from stand.running.entries import Change, Ended
+from stand.running.ids import Ids
 
 Plan = tuple[PlannedStep, ...]
 
@@ -104,9 +102,9 @@ class RunState:
     plan: Plan
     index: int = 0
     set_up: SetUp = field(default_factory=SetUp)
-    done: Set[str] = frozenset()
-    begun: Set[str] = frozenset()
-    skipped: Set[str] = frozenset()
+    done: Ids = field(default_factory=Ids)
+    begun: Ids = field(default_factory=Ids)
+    skipped: Ids = field(default_factory=Ids)
     under_way: str = ""
     earned_ns: Mapping[str, int] = field(default_factory=_nothing)
     frames: Mapping[str, int] = field(default_factory=_nothing)
