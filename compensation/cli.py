@@ -27,6 +27,7 @@ app = lazy_app(
         ),
         "validate": Lazy("compensation.commands.validate_cli", "How far the target seems to move in space."),
         "budget": Lazy("compensation.commands.budget_cli", "The stand's error budget, in um and px."),
+        "schema": Lazy("compensation.commands.schema_cli", "JSON Schemas of geometries and details, for editors."),
     },
 )
 

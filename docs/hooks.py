@@ -10,7 +10,14 @@ from mkdocs.structure.files import File, Files
 
 from stand.config.reference import reference
 
-_PAGES = {"stand": "A stand's file", "recipe": "A recipe", "registers": "A register map", "target": "A target"}
+_PAGES = {
+    "stand": "A stand's file",
+    "recipe": "A recipe",
+    "registers": "A register map",
+    "target": "A target",
+    "geometry": "A stand's geometry",
+    "details": "Details of a measurement",
+}
 
 
 def on_files(files: Files, config: Any) -> Files:

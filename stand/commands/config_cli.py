@@ -11,9 +11,10 @@ from foundation.documents import read_document
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import write_whole
+from foundation.schemas import write_schemas
 from foundation.usage import OneLineUsage
 from stand.config.migration import migrated
-from stand.config.schemas import write_schemas
+from stand.config.schemas import DOCUMENTS
 from stand.config.stand_config import packaged
 
 app = typer.Typer(
@@ -66,5 +67,5 @@ def schema(
     Example: stand config schema --out schema
     """
     with one_line_errors():
-        for path in write_schemas(out or packaged("", "simulated").parent / "schema"):
+        for path in write_schemas(out or packaged("", "simulated").parent / "schema", DOCUMENTS):
             typer.echo(path)

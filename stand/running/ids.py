@@ -1,4 +1,4 @@
-"""Ids of steps, as an immutable set to which one is added quickly: a plan may have 100,000 steps, each begun and done."""
+"""Ids of steps, as an immutable set to which one is added quickly: a plan may have 100,000 steps."""
 
 from __future__ import annotations
 

@@ -11,16 +11,20 @@ import yaml
 from jsonschema import Draft202012Validator
 from typer.testing import CliRunner
 
-from stand.commands.commands import app
-from stand.config.schemas import DOCUMENTS, schema_text
+from compensation.cli import app as compensate
+from compensation.commands.schema_cli import DOCUMENTS as OFFLINE
+from foundation.schemas import schema_text
+from stand.commands.commands import app as stand
+from stand.config.schemas import DOCUMENTS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-FILES = [path for path in sorted(CONFIGS.rglob("*.yaml")) if path.parent.name != "geometry"]
-KINDS = {"configs": "stand", "recipes": "recipe", "registers": "registers", "targets": "target"}
+FILES = sorted(CONFIGS.rglob("*.yaml"))
+ALL = {**DOCUMENTS, **OFFLINE}
+KINDS = {"configs": "stand", "recipes": "recipe", "registers": "registers", "targets": "target", "geometry": "geometry"}
 
 
 def validator(kind: str) -> Draft202012Validator:
-    return Draft202012Validator(json.loads(schema_text(kind)))
+    return Draft202012Validator(json.loads(schema_text(ALL[kind])))
 
 
 def as_json(value: object) -> Any:
@@ -32,10 +36,10 @@ def as_json(value: object) -> Any:
     return value.isoformat() if isinstance(value, datetime) else value
 
 
-@pytest.mark.parametrize("kind", DOCUMENTS)
+@pytest.mark.parametrize("kind", ALL)
 def test_the_schemas_are_current(kind: str):
-    """When not: stand config schema."""
-    assert (CONFIGS / "schema" / f"{kind}.json").read_text() == schema_text(kind)
+    """When not: stand config schema, compensate schema."""
+    assert (CONFIGS / "schema" / f"{kind}.json").read_text() == schema_text(ALL[kind])
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -63,13 +67,14 @@ def test_a_recipe_that_waits_until_settled_fits():
         assert [fault.message for fault in validator("recipe").iter_errors(recipe)] == []
 
 
-def test_the_command_writes_them_where_it_is_told(tmp_path: Path):
-    result = CliRunner().invoke(app, ["config", "schema", "--out", str(tmp_path / "new" / "folder")])
-    assert result.exit_code == 0, result.output
-    assert {path.stem for path in (tmp_path / "new" / "folder").iterdir()} == set(DOCUMENTS)
+def test_the_commands_write_them_where_they_are_told(tmp_path: Path):
+    for app, words in ((stand, ["config", "schema"]), (compensate, ["schema"])):
+        result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "new" / "folder")])
+        assert result.exit_code == 0, result.output
+    assert {path.stem for path in (tmp_path / "new" / "folder").iterdir()} == set(ALL)
 
 
 def test_a_place_that_refuses_is_told(tmp_path: Path):
     (tmp_path / "file").write_text("")
-    result = CliRunner().invoke(app, ["config", "schema", "--out", str(tmp_path / "file")])
+    result = CliRunner().invoke(stand, ["config", "schema", "--out", str(tmp_path / "file")])
     assert (result.exit_code, result.stderr.count("\n")) == (1, 1), result.output

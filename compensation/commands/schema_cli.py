@@ -1,0 +1,37 @@
+"""`compensate schema`: JSON Schemas for editors."""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import BaseModel
+
+from compensation.budget.geometry import Geometry
+from compensation.datasheet.details import Details
+from foundation.exit_codes import one_line_errors
+from foundation.schemas import write_schemas
+
+DOCUMENTS: Mapping[str, type[BaseModel]] = {"geometry": Geometry, "details": Details}
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command("schema")
+def schema(
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="A folder; else the installed configs/schema.")
+    ] = None,
+) -> None:
+    """Write the JSON Schemas of geometries and of details of a measurement. A file's first line names its schema to
+    an editor: `# yaml-language-server: $schema=schema/geometry.json`.
+
+    Example: compensate schema --out schema
+    """
+    with one_line_errors():
+        installed = Path(str(importlib.resources.files("configs"))) / "schema"
+        for path in write_schemas(out or installed, DOCUMENTS):
+            typer.echo(path)
