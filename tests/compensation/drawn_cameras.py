@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 Float = NDArray[np.float64]
 
@@ -163,6 +162,8 @@ def nodes_degC(camera: Camera, air_degC: Float, powered: Float) -> Float:
 
 def _first_order(gained: Float, keep: float, begin: float) -> Float:
     """s = keep s + gained, for each of the steps."""
+    from scipy.signal import lfilter  # which takes a second, also where nothing is drawn
+
     return np.asarray(lfilter([1.0], [1.0, -keep], gained, zi=[keep * begin])[0])
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
@@ -55,6 +54,8 @@ def answered(
 
 def fuzz(port: int, examples: int) -> tuple[list[str], Counter[int]]:
     """What was answered as it must not be, and how often which status."""
+    import schemathesis  # which takes a second, also where nothing is fuzzed
+
     wrong, seen = list[str](), Counter[int]()
     document = json.loads(answered(port, "GET", "/openapi.json", "", {}, b"")[1])
     schema = schemathesis.openapi.from_dict(document)
