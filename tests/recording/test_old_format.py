@@ -1,11 +1,14 @@
-"""A session of the first format, recorded on 2026-11-22 and kept as it was: every later version opens it."""
+"""Sessions of the first format, recorded by its own recorder and kept as they were: every later version opens them. One
+is a run of the simulated stand, the other has rendered photographs of a target that moves with the temperature."""
 
 import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner, Result
 
+from compensation import evaluate, fit, observe
 from compensation.cli import app as compensate
 from recording.exporting.replay import replay_and_record
 from recording.exporting.trim import trim
@@ -17,6 +20,7 @@ from recording.repair.verify import verify
 from stand.commands.commands import app as stand
 
 SESSION = Path(__file__).parent / "data" / "20260101T180000Z-format-1"
+CYCLE = SESSION.with_name("20260101T180000Z-format-1-cycle")
 
 
 def test_a_session_of_the_first_format_opens_and_verifies():
@@ -83,3 +87,12 @@ def test_its_frames_are_a_table_and_are_looked_at_for_markers(tmp_path):
         found = asked(compensate, command, SESSION, "-o", tmp_path / command)
         assert found.exit_code == 1
         assert "of 54 markers" in found.output.splitlines()[-1]
+
+
+def test_a_thermal_cycle_of_the_first_format_is_fitted():
+    """Its target moves by 0.01 px/K along I and 0.03 px/K along J; held out are 20 and 45 degC, from 24."""
+    observations = observe([CYCLE])
+    assert observations.usable.all()
+    found = evaluate(fit(observations), observations)
+    assert found.rms_before_px == pytest.approx((0.148, 0.443), abs=0.005)
+    assert max(found.rms_after_px) < 0.005
