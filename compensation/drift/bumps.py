@@ -18,9 +18,12 @@ from compensation.history.states import Float
 from compensation.observations import Observations
 from foundation.errors import SessionError
 
-_GAIN, _GAIN_MARKER = 22.0, 25.0
-"""Log likelihood that a step has to explain, chosen on nights of drawn cameras without any: see the tests."""
-_LEAST_PX = 0.020
+_GAIN, _GAIN_MARKER = 17.0, 25.0
+"""Log likelihood that a step has to explain, chosen on nights of drawn cameras without any (numbers 2000 to 2079)."""
+_LEAST_PX, _LEAST_MARKER_PX = 0.035, 0.020
+"""What the forms of thermal states miss comes in steps, too, of up to 30 mpx."""
+_BLURRED = 0.5
+"""How small a step may look amidst an instant."""
 _MOST = 6
 
 
@@ -69,11 +72,10 @@ def _rigid(series: NightSeries) -> Iterator[Bump]:
     Where one is found the series is looked at minute by minute: a step amidst an instant looks like two halves."""
     before_ns: list[int] = []
     while len(before_ns) < _MOST:
-        known = series.at_ns(before_ns)
-        best = _largest(series, known)
-        if best is None:
-            break
+        best, size_px = _largest(series, series.at_ns(before_ns))
         finer = series.finer(best)
+        if size_px < _LEAST_PX * (1.0 if finer is series else _BLURRED):
+            break
         if finer is series:
             before_ns.append(int(series.first_ns[best]))
         series = finer
@@ -84,14 +86,14 @@ def _rigid(series: NightSeries) -> Iterator[Bump]:
         yield _bump(series, own, amounts, tuple(float(one.sigma_px[0]) for one in found), None)
 
 
-def _largest(series: NightSeries, known: Index) -> int | None:
-    """The boundary where one more step explains most; None where it explains too little."""
+def _largest(series: NightSeries, known: Index) -> tuple[int, float]:
+    """The boundary where one more step explains most, and its size, px; 0 where it explains too little."""
     scans = _scans(series, series.boundaries, known)
     gain = np.sum([own.gain for own in scans], axis=0)
     gain[np.isin(series.boundaries, known)] = -np.inf
     best = int(np.argmax(gain))
     size = max(np.hypot(scans[0].amount_px[best], scans[1].amount_px[best]), *(abs(s.amount_px[best]) for s in scans))
-    return int(series.boundaries[best]) if gain[best] >= _GAIN and size >= _LEAST_PX else None
+    return int(series.boundaries[best]), float(size) if gain[best] >= _GAIN else 0.0
 
 
 def _scans(series: NightSeries, boundaries: Index, known: Index) -> list[Scan]:
@@ -133,6 +135,6 @@ def _markers(series: NightSeries) -> Iterator[Bump]:
         gain = i.gain + j.gain
         best = int(np.argmax(gain))
         amount = float(i.amount_px[best]), float(j.amount_px[best])
-        if gain[best] > _GAIN_MARKER and np.hypot(*amount) > _LEAST_PX:
+        if gain[best] > _GAIN_MARKER and np.hypot(*amount) > _LEAST_MARKER_PX:
             sigma = float(i.sigma_px[best]), float(j.sigma_px[best])
             yield _bump(series, int(series.boundaries[best]), (*amount, 0.0, 0.0), (*sigma, 0.0, 0.0), marker)
