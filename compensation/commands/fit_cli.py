@@ -26,6 +26,7 @@ from compensation.drift.choosing import fit as fit_model
 from compensation.drift.evaluation import evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
+from compensation.drift.unrepeated import Cause, find_unrepeated
 from compensation.observations import Observations
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
@@ -89,6 +90,9 @@ def fit(
             utc = next(facts.utc for facts in observations.sessions if facts.session_id == bump.session_id)
             when = f"{utc.date_time(bump.after_ns)} and {utc.date_time(bump.before_ns)}"
             typer.echo(f"bump in {bump.session_id} between {when}: {bump.text}; fitted around it")
+        for one in find_unrepeated(observations, model.facts.bumps):
+            if one.cause is not Cause.NOTHING:
+                typer.echo(f"{one.session_id}: {one.text}")
         typer.echo(table(evaluation))
 
 

@@ -8,11 +8,12 @@ explains (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from compensation.history.states import Float
 
@@ -47,12 +48,8 @@ class Whitened:
 def whitened(features: Float, hours: Float, variance_px2: Float, steps: Float, known: Float) -> Whitened:
     """features (K, H), about 1. hours (K,): of the instants. variance_px2 (K,): of the values' own noise. steps (K, B):
     the candidates, 0 or 1. known (K, S): steps that were found already."""
-    of_features = features @ features.T
-    of_wander = np.exp(-np.abs(hours[:, None] - hours) / _WANDER_H)
-    fixed = _WIDE_PX**2 * (known @ known.T + 1) + np.diag(variance_px2)
     inverses: list[Float] = []
-    for amount, wander, noise in product(_AMOUNTS_PX, _WANDERS_PX, _NOISES_PX):
-        covariance = fixed + amount**2 * of_features + wander**2 * of_wander + noise**2 * np.eye(len(hours))
+    for covariance, _ in _grid(features, hours, variance_px2, known):
         lower = np.linalg.cholesky(covariance)
         inverses.append(np.asarray(solve_triangular(lower, np.eye(len(hours)), lower=True)))
     inverse = np.array(inverses)
@@ -74,3 +71,26 @@ def scan(white: Whitened, values_px: Float) -> Scan:
         amount_px=along[best, at] / square[best, at],
         sigma_px=1 / np.sqrt(square[best, at]),
     )
+
+
+def unexplained(features: Float, hours: Float, variance_px2: Float, known: Float, values_px: Float) -> Float:
+    """(K,): what neither the thermal state nor the known steps explain of values (K,), without their own noise: wander
+    and scatter, as expected with the likeliest of the grid's covariances."""
+    best, found = -np.inf, np.zeros(len(hours))
+    for covariance, of_rest in _grid(features, hours, variance_px2, known):
+        factor = cho_factor(covariance, lower=True)
+        weights = np.asarray(cho_solve(factor, values_px))
+        likelihood = float(-0.5 * values_px @ weights - np.log(np.diagonal(factor[0])).sum())
+        if likelihood > best:
+            best, found = likelihood, of_rest @ weights
+    return found
+
+
+def _grid(features: Float, hours: Float, variance_px2: Float, known: Float) -> Iterator[tuple[Float, Float]]:
+    """Covariances (K, K) of values, and of the part that is wander and scatter."""
+    of_features = features @ features.T
+    of_wander = np.exp(-np.abs(hours[:, None] - hours) / _WANDER_H)
+    fixed = _WIDE_PX**2 * (known @ known.T + 1) + np.diag(variance_px2)
+    for amount, wander, noise in product(_AMOUNTS_PX, _WANDERS_PX, _NOISES_PX):
+        of_rest = wander**2 * of_wander + noise**2 * np.eye(len(hours))
+        yield fixed + amount**2 * of_features + of_rest, of_rest

@@ -5,18 +5,20 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
 
 import numpy as np
 
+from compensation.drift.bump import Bump
 from compensation.drift.bumps import around_bumps, find_bumps
 from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.drift.hysteresis import Hysteresis, hysteresis
 from compensation.drift.training import frame_states
+from compensation.drift.unrepeated import find_unrepeated
 from compensation.observations import Float, Mask, Observations
 from compensation.reporting.equipment import stated
 from compensation.reporting.extras import Extras
@@ -30,6 +32,7 @@ from compensation.reporting.numbers import (
     Pair,
     ScoreNumbers,
     SessionNumbers,
+    UnrepeatedNumbers,
     UnusableFrames,
     WarmUpNumbers,
 )
@@ -53,6 +56,7 @@ def numbers_of(
     """Everything that the report says."""
     extras = extras or Extras()
     validation = extras.validation
+    bumps = find_bumps(observations) if model is None else model.facts.bumps
     return Numbers(
         format=FORMAT,
         versions={name: importlib.metadata.version(name) for name in _LIBRARIES},
@@ -70,18 +74,27 @@ def numbers_of(
         model=None if model is None else _model(model),
         budgets=dict(extras.budgets),
         positions=extras.positions,
-        bumps=tuple(_bumps(observations, model)),
+        bumps=tuple(_bumps(observations, bumps)),
+        unrepeated=tuple(_unrepeated(observations, bumps)),
         validation=None if validation is None else json.loads(validation_json(validation)),
         paper={"before_px": PAPER_BEFORE_PX, "after_px": PAPER_AFTER_PX, "warm_up_px": PAPER_WARM_UP_PX},
     )
 
 
-def _bumps(observations: Observations, model: DriftModel | None) -> Iterator[BumpNumbers]:
+def _bumps(observations: Observations, bumps: Sequence[Bump]) -> Iterator[BumpNumbers]:
     utc = {facts.session_id: facts.utc for facts in observations.sessions}
-    for bump in find_bumps(observations) if model is None else model.facts.bumps:
+    for bump in bumps:
         if bump.session_id in utc:
-            at = [_instant(utc[bump.session_id].utc_ns(ns)) for ns in (bump.after_ns, bump.before_ns)]
-            yield BumpNumbers(bump.session_id, at[0], at[1], bump.motions_px, bump.sigma_px, bump.marker, bump.text)
+            at_ns = bump.after_ns, bump.before_ns
+            at = [_instant(utc[bump.session_id].utc_ns(ns)) for ns in at_ns]
+            moved = bump.motions_px, bump.sigma_px
+            yield BumpNumbers(bump.session_id, at[0], at[1], *at_ns, *moved, bump.marker, bump.text)
+
+
+def _unrepeated(observations: Observations, bumps: Sequence[Bump]) -> Iterator[UnrepeatedNumbers]:
+    for one in find_unrepeated(observations, bumps):
+        left = one.along_px, one.across_px, one.direction_deg
+        yield UnrepeatedNumbers(one.session_id, str(one.cause), *left, one.text)
 
 
 def _session(observations: Observations, index: int) -> SessionNumbers:

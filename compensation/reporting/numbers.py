@@ -107,15 +107,30 @@ class HysteresisNumbers:
 
 @dataclass(frozen=True, slots=True)
 class BumpNumbers:
-    """A step of the image that no thermal state explains, between the frames at `after` and `before`. motions_px,
-    sigma_px (4,): as in compensation/drift/bump.py. marker: the one that moved alone, from 0."""
+    """A step of the image that no thermal state explains, between the frames at `after` and `before`, the same as the
+    session's own instants after_ns and before_ns. motions_px, sigma_px (4,): as in compensation/drift/bump.py. marker:
+    the one that moved alone, from 0."""
 
     session_id: str
     after: str
     before: str
+    after_ns: int
+    before_ns: int
     motions_px: tuple[float, ...]
     sigma_px: tuple[float, ...]
     marker: int | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class UnrepeatedNumbers:
+    """What no thermal state explains, as in compensation/drift/unrepeated.py; cause: nothing, slips or settling."""
+
+    session_id: str
+    cause: str
+    along_px: float
+    across_px: float
+    direction_deg: float
     text: str
 
 
@@ -170,6 +185,7 @@ class Numbers:
     budgets: dict[str, Budget]
     positions: TablePositions
     bumps: tuple[BumpNumbers, ...]
+    unrepeated: tuple[UnrepeatedNumbers, ...]
     validation: object
     paper: dict[str, Pair]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from compensation.drift.evaluation import improvement_percent
+from compensation.drift.unrepeated import Cause
 from compensation.reporting.numbers import Numbers, Pair, ScoreNumbers, percent
 from compensation.reporting.page import Heading, Paragraph, Part, Table
 from compensation.reporting.validation_report import gains_table
@@ -28,6 +29,7 @@ def result_section(numbers: Numbers, validation: Validation | None = None) -> It
     else:
         yield from _gain(numbers, numbers.score)
     yield from _bumps(numbers)
+    yield from _unrepeated(numbers)
     if validation is not None:
         yield Paragraph(
             "In space, the mean absolute deviation of the target from its place at the reference temperature:"
@@ -48,6 +50,12 @@ def _bumps(numbers: Numbers) -> Iterator[Part]:
     )
     rows = [(one.session_id, _clock(one.after), _clock(one.before), one.text) for one in numbers.bumps]
     yield Table(("session", "after, UTC", "before, UTC", "what moved"), rows)
+
+
+def _unrepeated(numbers: Numbers) -> Iterator[Part]:
+    for one in numbers.unrepeated:
+        if one.cause != Cause.NOTHING:
+            yield Paragraph(f"Session {one.session_id}: {one.text}. No model of temperature can follow that.")
 
 
 def _clock(instant: str) -> str:
