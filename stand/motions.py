@@ -17,6 +17,11 @@ class Motions:
         """As in `["linear to 250 mm", "flap closing"]`."""
         return [f"{name} {text}" for name, text in self._under_way.items()]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What moves: axes, the flap."""
+        return tuple(self._under_way)
+
     def moves(self, name: str) -> bool:
         """Whether this one is under way."""
         return name in self._under_way

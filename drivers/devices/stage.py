@@ -229,6 +229,11 @@ class Axis:
         for stop in (below, target) if status.position > below else (target,):
             status = await self._approach(status.position, stop, turn)
 
+    async def stop(self) -> None:
+        """Stop where it is, confirmed; what was under way ends with Superseded. DeviceFault when it does not stop."""
+        self._motion.take(safe=True)
+        await self._stop()
+
     def allow(self) -> None:
         """It may move again after it was made safe."""
         self._motion.allow()

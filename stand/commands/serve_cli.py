@@ -25,6 +25,7 @@ from stand.daemon.serve import serve as serve_stand
 from stand.serving.api.bridge import Bridge
 from stand.serving.api.interface import Interface
 from stand.serving.api.server import serve as serve_clients
+from stand.serving.secop.door import door_at
 from stand.serving.viewing import Viewing
 
 app = typer.Typer(add_completion=False)
@@ -36,6 +37,7 @@ def serve(
     out: Annotated[Path | None, typer.Option(help="Where the sessions go; else recording.directory.")] = None,
     port: Annotated[int | None, typer.Option(help="Listen by TCP, too; without it the Unix socket only.")] = None,
     host: Annotated[str, typer.Option(help="The address to listen at, with --port.")] = "127.0.0.1",
+    secop: Annotated[int | None, typer.Option(help="Serve SECoP on this machine, usually at 10767.")] = None,
 ) -> None:
     """Own the stand until it is told to end: status, devices by hand, and a queue whose runs are its guests.
 
@@ -48,7 +50,10 @@ def serve(
         stand = load_config(path)
         texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
         directory = (out or stand.recording.directory).absolute()
-        interface = Interface(directory, host, port, load_tokens(stand.interface.secrets), stand.interface.hosts)
+        tokens, hosts = load_tokens(stand.interface.secrets), stand.interface.hosts
+        secop_port = stand.interface.secop_port if secop is None else secop
+        others = () if secop_port is None else (door_at(secop_port),)
+        interface = Interface(directory, host, port, tokens, hosts, others)
         interface.check()
 
         @asynccontextmanager
@@ -57,6 +62,7 @@ def serve(
             served = replace(interface, rooms=(_page(viewing),))
             async with serve_clients(desk, hub, clock, directory, stand.name, served):
                 where = f"; http://{host}:{port}/" if port is not None else ""
+                where += f"; SECoP at {secop_port}" if secop_port is not None else ""
                 typer.echo(f"{stand.name} is open; sessions go to {directory}{where}", err=True)
                 with aside() as later:
                     say = later(_say)

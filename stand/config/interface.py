@@ -21,11 +21,13 @@ Token = Annotated[str, Field(pattern=r"^[!-~]{20,200}$")]
 class InterfaceConfig(Document):
     """How a stand is reached over the network, with `stand serve --port`. hosts: names under which browsers and
     programs reach it, besides this machine's own, such as that of a proxy. secrets: a YAML file (mode 0600) with
-    `tokens`, by the name of who has them; `stand token add` writes it, and it is never recorded or shown.
+    `tokens`, by the name of who has them; `stand token add` writes it, and it is never recorded or shown. secop_port:
+    where `stand serve` answers SECoP on this machine, usually 10767, as with --secop; not at all without it.
     """
 
     hosts: tuple[HostName, ...] = Field(default=(), max_length=50)
     secrets: Path | None = None
+    secop_port: int | None = Field(default=None, ge=1, le=65535)
 
 
 class TokenFile(Document):

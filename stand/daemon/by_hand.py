@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 from pydantic import JsonValue
 
 from experiments.steps import MoveTo, SetTemperature, Step, number_steps
-from foundation.errors import ConfigError
+from foundation.errors import ConfigError, DeviceError
+from foundation.items import Batch
 from stand.assembly import Assembly
 from stand.estimating.estimate import price
 from stand.running.run_desk import device_kinds
@@ -91,9 +93,12 @@ class ByHand:
         )
 
     def _of_axis(self, name: str) -> tuple[_Verb, ...]:
-        position = Argument(name="position", unit=self._stand.devices.axes[name].profile.unit)
+        settings = self._assembly.config.axes[name]
+        low, high = settings.limits
+        position = Argument(name="position", unit=settings.unit, minimum=low, maximum=high)
         return (
             _Verb(DeviceVerb(verb="move", text="move to a position", arguments=(position,)), self._move),
+            _Verb(DeviceVerb(verb="stop", text="stop where it is"), self._stop),
             _Verb(DeviceVerb(verb="home", text="find the home switch"), self._home),
         )
 
@@ -116,10 +121,20 @@ class ByHand:
     def _move(self, axis: str, arguments: Arguments) -> Work:
         position = _number(arguments, "position")
         self._check(MoveTo(axis, position))
-        return self._stand.table.move_to(axis, position)
+        return self._then_read(axis, self._stand.table.move_to(axis, position))
+
+    def _stop(self, axis: str, _: Arguments) -> Work:
+        return self._then_read(axis, self._stand.table.stop(axis))
 
     def _home(self, axis: str, _: Arguments) -> Work:
-        return self._stand.table.check_home(axis)
+        return self._then_read(axis, self._stand.table.check_home(axis))
+
+    async def _then_read(self, axis: str, work: Work) -> None:
+        """Who waits for the end of an order sees where the stage is, not where it was when it was polled last."""
+        await work
+        with suppress(DeviceError):  # the poller tells
+            readings = await self._stand.devices.axes[axis].read()
+            self._assembly.hub.publish(Batch(axis, self._assembly.clock.now_ns(), readings))
 
     def _frame(self, name: str, arguments: Arguments) -> Work:
         exposure_s = _number(arguments, "exposure_s", self._assembly.config.cameras[name].exposure_s)

@@ -63,7 +63,7 @@ class Daemon:
         self._clock = assembly.clock
         self._kept, self._keep = kept, keep
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
-        self._hands: set[asyncio.Task[object]] = set()
+        self._hands: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
         self._others: set[asyncio.Task[None]] = set()
         self._extending: list[asyncio.Task[None]] = []
         self._recorded_ns = 0  # when a record was last begun, or could not be
@@ -112,6 +112,11 @@ class Daemon:
         """What halted it has been looked into."""
         self._beside(self._clear_queue())
 
+    @property
+    def busy(self) -> tuple[str, ...]:
+        """The devices that carry out an order: of a run, or by hand."""
+        return tuple(dict.fromkeys((*self._assembly.stand.motions.names, *self._hands.values())))
+
     def refused_by_hand(self) -> str:
         """Why no device takes an order now, "" when they do."""
         if self.has_guest:
@@ -128,8 +133,8 @@ class Daemon:
             raise Conflict(refused)
         what = f"{name} {verb}"
         hand = asyncio.ensure_future(work(name, verb, arguments))
-        self._hands.add(hand)
-        hand.add_done_callback(self._hands.discard)
+        self._hands[hand] = name
+        hand.add_done_callback(self._hands.pop)
         done, _ = await asyncio.wait([hand], timeout=_BY_HAND_S)
         if not done:
             hand.add_done_callback(lambda ended: self._tell_failure(what, ended))

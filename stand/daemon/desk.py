@@ -52,6 +52,7 @@ class DaemonDesk:
             "queue_halted": daemon.orders.queued.halted,
             "counters": {name: round(value, 4) for name, value in daemon.counters.values.items()},
             "fault": state.fault or self._fault(),
+            "busy": daemon.busy,
         }
         if run is None:
             changes["disk_free_bytes"] = daemon.disk_free_bytes

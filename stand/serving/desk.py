@@ -35,8 +35,9 @@ Verb = Literal[
     "device",
     "note",
 ]
-# socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. terminal: a signal or key.
-How = Literal["socket", "loopback", "token", "terminal"]
+# socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. secop: SECoP on this
+# machine. terminal: a signal or key.
+How = Literal["socket", "loopback", "token", "secop", "terminal"]
 When = Literal["now", "step"]
 StepStanding = Literal["waiting", "under_way", "done", "skipped"]
 
@@ -176,10 +177,10 @@ class StandState(Value):
 
     seq: the sequence number of the stream that this state is after. version: of the program. phase: idle between runs.
     reasons: what holds the run. readings: the last of every channel. setpoint_degC: of the chamber, None when it is
-    stopped or unknown. output_percent: of the regulator. flap: "open", "closed", "moving", or "" when it is not known.
-    axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles, ...). moving: what is
-    under way, as in `linear to 250 mm`. drops: items that the interface was too slow for. pausing: a pause comes when
-    the step under way is done.
+    stopped or unknown. output_percent: of the regulator. flap: "open", "closed", "moving", or "" when it is not
+    known. axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles, ...). moving:
+    what is under way, as in `linear to 250 mm`. busy: the devices that carry out an order. drops: items that the
+    interface was too slow for. pausing: a pause comes when the step under way is done.
     """
 
     seq: int = 0
@@ -206,6 +207,7 @@ class StandState(Value):
     counters: dict[str, float] = Field(default_factory=dict)
     disk_free_bytes: int = 0
     moving: tuple[str, ...] = ()
+    busy: tuple[str, ...] = ()
     drops: int = 0
     pausing: bool = False
 

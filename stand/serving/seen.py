@@ -35,6 +35,7 @@ def seen_state(config: StandConfig, stand: Stand, hub: Hub, clock: Clock) -> Sta
         flap="moving" if stand.motions.moves("flap") else "open" if stand.imaging.flap_open else "closed",
         axes={name: _value(readings.get(f"{name}.position")) for name in stand.devices.axes},
         moving=tuple(stand.motions.texts),
+        busy=stand.motions.names,
     )
 
 

@@ -53,6 +53,10 @@ class Table:
             if axis in self._commanded:
                 await stage.move_to(self._commanded[axis])
 
+    async def stop(self, axis: str) -> None:
+        """Stop a stage where it is."""
+        await self._axis(axis).stop()
+
     async def approach_again(self) -> None:
         """Before frames: approach again, from below, each stage whose motor has been switched off since its move."""
         self._interlock.check()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,18 @@ from typing import Any
 from foundation.errors import ConfigError
 from stand.serving.api.access import is_loopback
 from stand.serving.api.bridge import Bridge
+from stand.serving.api.pace import Pace
+
+
+@dataclass(frozen=True, slots=True)
+class OtherDoor:
+    """A TCP port at which another protocol is spoken. option: of the command line, which asks for it. serve: given the
+    listening socket in the thread that serves clients, runs until it is cancelled; what should not happen it tells."""
+
+    option: str
+    host: str
+    port: int
+    serve: Callable[[socket.socket, Bridge, Pace, Callable[[Exception], None]], Coroutine[None, None, None]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +30,8 @@ class Interface:
     """How a stand is reached besides its Unix socket.
 
     host, port: to listen at by TCP; no port, no TCP. tokens: by name. hosts: names of this stand besides this machine's
-    own. sessions: the folder of recorded sessions. rooms: makes what else is served (history, frames, the page) in the
-    thread, as routers, by the bridge.
+    own. doors: other protocols' ports. sessions: the folder of recorded sessions. rooms: makes what else is served
+    (history, frames, the page) in the thread, as routers, by the bridge.
     """
 
     sessions: Path
@@ -27,6 +39,7 @@ class Interface:
     port: int | None = None
     tokens: dict[str, str] = field(default_factory=dict[str, str], repr=False)
     hosts: tuple[str, ...] = ()
+    doors: tuple[OtherDoor, ...] = ()
     rooms: Sequence[Callable[[Bridge], Any]] = ()
 
     @property

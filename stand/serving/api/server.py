@@ -18,7 +18,8 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.tasks import failure_text
 from stand.serving.api.bridge import Bridge
-from stand.serving.api.interface import Interface
+from stand.serving.api.interface import Interface, OtherDoor
+from stand.serving.api.pace import Pace
 from stand.serving.desk import Desk
 from stand.serving.presence import Entry, Presence
 
@@ -41,7 +42,8 @@ async def serve(
     doors = {"socket": presence.appear()}
     try:
         if interface.port is not None:
-            doors["tcp"] = _tcp(interface.host, interface.port)
+            doors["tcp"] = _tcp("--port", interface.host, interface.port)
+        doors.update({each.option: _tcp(each.option, each.host, each.port) for each in interface.doors})
         bridge = Bridge(desk, hub, clock)
     except BaseException:
         for door in doors.values():
@@ -72,13 +74,13 @@ def preload() -> None:
     threading.Thread(target=load, name="interface-imports", daemon=True).start()
 
 
-def _tcp(host: str, port: int) -> socket.socket:
+def _tcp(option: str, host: str, port: int) -> socket.socket:
     from stand.serving.api.listening import listening_at
 
     try:
         return listening_at(host, port)
     except OSError as error:
-        raise ConfigError(f"--port {port}: cannot listen at {host} ({error.strerror or error})") from error
+        raise ConfigError(f"{option} {port}: cannot listen at {host} ({error.strerror or error})") from error
 
 
 def _reporter(hub: Hub, clock: Clock) -> Callable[[str, str], None]:
@@ -141,7 +143,6 @@ class _Thread:
         from stand.serving.api.access import Access
         from stand.serving.api.app import make_app
         from stand.serving.api.listening import Listening
-        from stand.serving.api.pace import Pace
         from stand.serving.api.stream import Stream
 
         pace, stream = Pace(), Stream(self._bridge)
@@ -152,9 +153,11 @@ class _Thread:
         if self._is_over.is_set():
             self._ended.set()
         for door, each in self._doors.items():
-            listening.listen(door, each)
-        self.is_ready.set()
+            if door in ("socket", "tcp"):
+                listening.listen(door, each)
         working = [asyncio.create_task(stream.run()), asyncio.create_task(self._look_after(listening))]
+        working += [asyncio.create_task(self._serve(each, pace)) for each in self._interface.doors]
+        self.is_ready.set()
         try:
             await self._ended.wait()
         finally:
@@ -162,6 +165,12 @@ class _Thread:
                 task.cancel()
             await asyncio.gather(*working, return_exceptions=True)
             await listening.close()
+
+    async def _serve(self, door: OtherDoor, pace: Pace) -> None:
+        try:
+            await door.serve(self._doors[door.option], self._bridge, pace, self._failed)
+        except Exception as error:  # noqa: BLE001 - the other doors stay open
+            self._report("no_control", f"what {door.option} asked for is not served: {failure_text(error)}")
 
     async def _look_after(self, listening: Any) -> None:
         """A logout removes $XDG_RUNTIME_DIR with the socket that is in it."""

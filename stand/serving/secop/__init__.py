@@ -1,0 +1,1 @@
+"""The SECoP node: chamber, thermometers, flap, stages and runs for sample-environment programs, on this machine."""

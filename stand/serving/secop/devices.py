@@ -1,0 +1,246 @@
+"""The modules of a stand: one for each temperature, the chamber, the flap, each stage, and one for runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+from pydantic import JsonValue
+
+from stand.serving.desk import DeviceState, ReadingState, RunRequest, RunStatus, StandState
+from stand.serving.secop import datainfo
+from stand.serving.secop.messages import Refusal
+from stand.serving.secop.modules import (
+    BUSY,
+    DRIVE_CODES,
+    ERROR,
+    IDLE,
+    RAMPING,
+    SENSOR_CODES,
+    WARN,
+    Command,
+    Known,
+    Module,
+    Order,
+    Parameter,
+    Seen,
+    by_hand,
+    driven,
+    measured,
+    status,
+)
+
+BAND_K = 0.5  # so close to its set-point the chamber has arrived
+CHAMBER, RUN = "chamber", "run"
+_CLOSED, _OPEN, _MOVING = 0, 1, 2
+_PHASES = {"idle": 0, "running": 1, "held": 2, "stopping": 3}
+
+
+def modules(devices: Iterable[DeviceState], readings: Mapping[str, ReadingState]) -> dict[str, Module]:
+    """By name, in the order in which clients show them: the channel's with an underscore for a temperature."""
+    found: dict[str, Module] = {}
+    for name, module in (*_of(devices, readings), (RUN, _run())):
+        while name in found:  # such as an axis that is called chamber
+            name += "_"
+        found[name] = module
+    return found
+
+
+def _of(devices: Iterable[DeviceState], readings: Mapping[str, ReadingState]) -> Iterator[tuple[str, Module]]:
+    for device in devices:
+        match device.kind:
+            case "regulator":
+                yield CHAMBER, _chamber(device)
+            case "flap":
+                yield device.name, _flap(device)
+            case "axis":
+                yield device.name, _axis(device, readings)
+            case "thermometers" | "camera":
+                for channel in device.channels:
+                    if readings[channel].unit == "degC":
+                        yield channel.replace(".", "_"), _thermometer(device, channel)
+            case _:
+                pass
+
+
+def _thermometer(device: DeviceState, channel: str) -> Module:
+    return Module(
+        f"temperature {channel}",
+        "Readable",
+        device.name,
+        {
+            "value": Parameter("the temperature", datainfo.double("degC"), lambda seen: seen.number(channel)),
+            "status": status(SENSOR_CODES, lambda seen: measured(seen, channel)),
+        },
+    )
+
+
+def _chamber(device: DeviceState) -> Module:
+    name, pv, sp = device.name, f"{device.name}.pv", f"{device.name}.sp"
+    low, high = _range(device, "set")
+
+    def read_ns(state: StandState) -> int:
+        reading = state.readings.get(sp)
+        return -1 if reading is None else reading.time_ns
+
+    def read_status(seen: Seen) -> tuple[int, str]:
+        code, sentence = driven(seen, pv, read_ns(seen.state))
+        target = seen.state.setpoint_degC
+        if code not in (IDLE, WARN):
+            return code, sentence
+        if target is None:
+            return code, sentence or "neither heats nor cools"
+        if abs((seen.number(pv).value or 0.0) - target) > BAND_K:  # pyright: ignore[reportOperatorIssue]
+            return RAMPING, f"on the way to {target:g} degC"
+        return code, sentence or f"at {target:g} degC"
+
+    def read_target(seen: Seen) -> Known:
+        return seen.number(sp) if seen.drive.ordered is None else Known(seen.drive.ordered)
+
+    def change(value: JsonValue) -> Order:
+        return by_hand(name, "set", setpoint_degC=value)
+
+    parameters = {
+        "value": Parameter("the air, as the regulator reads it", datainfo.double("degC"), lambda s: s.number(pv)),
+        "status": status(DRIVE_CODES, read_status),
+        "target": Parameter("the set-point", datainfo.double("degC", low, high), read_target, change),
+        "control_active": Parameter(
+            "whether it heats or cools", datainfo.boolean(), lambda s: Known(s.state.setpoint_degC is not None)
+        ),
+        "_tolerance": Parameter("so close to the target it is IDLE", datainfo.double("K"), lambda _: Known(BAND_K, 0)),
+        "_output": Parameter("heat; below zero cold", datainfo.double("%"), _output),
+        "_heat_permitted": Parameter(
+            "whether heat is permitted", datainfo.boolean(), lambda s: Known(s.state.heater_permitted)
+        ),
+        "_compressor_on": Parameter(
+            "whether the compressor's relay is on", datainfo.boolean(), lambda s: Known(s.state.compressor_on)
+        ),
+    }
+    stop = Command("stop heating and cooling; the air drifts to the laboratory's", lambda _: by_hand(name, "stop"))
+    return Module("the chamber's temperature", "Drivable", CHAMBER, parameters, {"stop": stop}, name, read_ns)
+
+
+def _output(seen: Seen) -> Known:
+    if seen.state.output_percent is None:
+        raise Refusal("ReadFailed", "the regulator's output is not known")
+    return Known(seen.state.output_percent)
+
+
+def _flap(device: DeviceState) -> Module:
+    name, channel = device.name, f"{device.name}.position"
+    places = {"closed": _CLOSED, "open": _OPEN}
+
+    def read(seen: Seen) -> int:
+        return {**places, "moving": _MOVING}.get(seen.state.flap, _MOVING)
+
+    def read_status(seen: Seen) -> tuple[int, str]:
+        return (BUSY, "under way") if read(seen) == _MOVING else driven(seen, channel, seen.state.now_ns)
+
+    def read_target(seen: Seen) -> Known:
+        ordered = seen.drive.ordered
+        return Known(ordered if ordered is not None else min(read(seen), _OPEN))
+
+    def change(value: JsonValue) -> Order:
+        return by_hand(name, "open" if value == _OPEN else "close")
+
+    parameters = {
+        "value": Parameter(
+            "where it is", datainfo.choice({**places, "moving": _MOVING}), lambda seen: Known(read(seen))
+        ),
+        "status": status(DRIVE_CODES, read_status),
+        "target": Parameter("where it is to be", datainfo.choice(places), read_target, change),
+    }
+    stop = Command("nothing: a flap is not left half open, its move of seconds is completed", None)
+    return Module("the flap between chamber and camera", "Drivable", name, parameters, {"stop": stop}, name)
+
+
+def _axis(device: DeviceState, readings: Mapping[str, ReadingState]) -> Module:
+    name, channel = device.name, f"{device.name}.position"
+    reading = readings.get(channel)
+    info = datainfo.double("" if reading is None else reading.unit)
+
+    def read_ns(state: StandState) -> int:
+        reading = state.readings.get(channel)
+        return -1 if reading is None else reading.time_ns
+
+    def read_status(seen: Seen) -> tuple[int, str]:
+        return driven(seen, channel, read_ns(seen.state))
+
+    def read_target(seen: Seen) -> Known:
+        return seen.number(channel) if seen.drive.ordered is None else Known(seen.drive.ordered)
+
+    def change(value: JsonValue) -> Order:
+        return by_hand(name, "move", position=value)
+
+    parameters = {
+        "value": Parameter("where it is", info, lambda seen: seen.number(channel)),
+        "status": status(DRIVE_CODES, read_status),
+        "target": Parameter("where it is to be", {**info, **_limits(device, "move")}, read_target, change),
+    }
+    commands = {
+        "stop": Command("stop where it is", lambda _: by_hand(name, "stop")),
+        "_home": Command("find the home switch", lambda _: by_hand(name, "home")),
+    }
+    return Module(f"the stage {name}", "Drivable", "stages", parameters, commands, name, read_ns, is_read_after=True)
+
+
+def _run() -> Module:
+    def parameter(text: str, info: datainfo.DataInfo, read: Callable[[RunStatus], JsonValue], none: JsonValue):
+        return Parameter(text, info, lambda s: Known(none if s.state.run is None else read(s.state.run)))
+
+    parameters = {
+        "value": Parameter("the phase of the stand", datainfo.choice(_PHASES), lambda s: Known(_PHASES[s.state.phase])),
+        "status": status(DRIVE_CODES, _run_status),
+        "_recipe": parameter("what is run", datainfo.text(), lambda run: run.recipe, ""),
+        "_session": parameter("the name of its session", datainfo.text(), lambda run: run.run_id, ""),
+        "_doing": parameter("the step under way", datainfo.text(), lambda run: run.doing, ""),
+        "_step": parameter("the number of the step under way", datainfo.whole(), lambda run: run.step, 0),
+        "_steps": parameter("how many there are", datainfo.whole(), lambda run: run.steps, 0),
+        "_frames_saved": parameter("frames on the disk", datainfo.whole(), lambda run: run.frames_saved, 0),
+        "_frames_lost": parameter("frames that were lost", datainfo.whole(), lambda run: run.frames_lost, 0),
+        "_prompt": Parameter(
+            "what an operator is asked for",
+            datainfo.text(),
+            lambda s: Known(s.state.prompt.text if s.state.prompt else ""),
+        ),
+        "_held_by": Parameter("what holds it", datainfo.text(), lambda s: Known(", ".join(s.state.reasons))),
+        "_fault": Parameter(
+            "what has tripped", datainfo.text(), lambda s: Known("" if s.state.fault is None else s.state.fault.text)
+        ),
+    }
+    commands = {
+        "stop": Command(
+            "STOP: make the stand safe and end the run, in every state, at once",
+            lambda _: lambda desk, who: desk.stop(who),
+            is_stop=True,
+        ),
+        "clear_errors": Command("the cause of a trip has been removed", lambda _: lambda desk, who: desk.clear(who)),
+        "_pause": Command("hold the run before its next action", lambda _: lambda desk, who: desk.pause(who)),
+        "_continue": Command("end a pause", lambda _: lambda desk, who: desk.continue_(who)),
+        "_submit": Command(
+            "queue an installed recipe; gives its number in the queue", _submit, datainfo.text(), datainfo.whole()
+        ),
+    }
+    return Module("runs, and the stand as a whole", "Readable", RUN, parameters, commands)
+
+
+def _run_status(seen: Seen) -> tuple[int, str]:
+    state = seen.state
+    if state.fault is not None:
+        return ERROR, state.fault.text
+    if state.reasons:
+        return (BUSY if state.run else WARN), f"held: {', '.join(state.reasons)}"
+    return (IDLE, "") if state.phase == "idle" else (BUSY, "a run is under way" if state.run is None else "")
+
+
+def _submit(recipe: JsonValue) -> Order:
+    return lambda desk, who: desk.submit(who, RunRequest(recipe=str(recipe)))
+
+
+def _range(device: DeviceState, verb: str) -> tuple[float | None, float | None]:
+    arguments = [each.arguments[0] for each in device.verbs if each.verb == verb and each.arguments]
+    return (arguments[0].minimum, arguments[0].maximum) if arguments else (None, None)
+
+
+def _limits(device: DeviceState, verb: str) -> dict[str, JsonValue]:
+    low, high = _range(device, verb)
+    return {} if low is None or high is None else {"min": low, "max": high}

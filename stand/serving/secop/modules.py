@@ -1,0 +1,190 @@
+"""What a module of the node is: parameters that are read from the state of the stand, and what they order."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pydantic import JsonValue
+
+from stand.serving.desk import Desk, Done, QueuedRun, ReadingState, StandState, Who
+from stand.serving.secop import datainfo
+from stand.serving.secop.datainfo import DataInfo
+from stand.serving.secop.messages import Refusal
+
+# Codes of a status (specification, "status"); BUSY is 300 to 399.
+IDLE, WARN, BUSY, RAMPING, ERROR = 100, 200, 300, 370, 400
+SENSOR_CODES = {"IDLE": IDLE, "WARN": WARN, "ERROR": ERROR}
+DRIVE_CODES = {"IDLE": IDLE, "WARN": WARN, "BUSY": BUSY, "RAMPING": RAMPING, "ERROR": ERROR}
+
+InterfaceClass = Literal["Readable", "Writable", "Drivable"]
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A value. time_ns: when it was obtained, on the stand's clock; None: as long as the state says so."""
+
+    value: JsonValue
+    time_ns: int | None = None
+
+
+Report = Known | Refusal
+
+
+class Drive:
+    """What is under way with one device. ordered: where to, by this node; None when somebody else moved it since."""
+
+    def __init__(self) -> None:
+        self.ordered: JsonValue = None
+        self._busy_ns = -1
+        self._is_ours = False
+
+    def order(self, target: JsonValue, now_ns: int) -> None:
+        """An order of this node is accepted; busy until something is read that is newer."""
+        self.ordered, self._is_ours = target, True
+        self._busy_ns = max(self._busy_ns, now_ns)
+
+    def look(self, is_busy: bool, now_ns: int, read_ns: int) -> None:
+        """The device as it is now; read_ns: when it was read last."""
+        if is_busy:
+            self._busy_ns = now_ns
+            if not self._is_ours:
+                self.ordered = None
+        elif not self.is_busy(read_ns):
+            self._is_ours = False
+
+    def is_busy(self, read_ns: int) -> bool:
+        """Until it has been read after the end of its order: who waits for the end reads where it is, not was."""
+        return read_ns <= self._busy_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What parameters are read from."""
+
+    state: StandState
+    drive: Drive
+
+    def reading(self, channel: str) -> ReadingState:
+        """Refusal when it was never read."""
+        found = self.state.readings.get(channel)
+        if found is None:
+            raise Refusal("ReadFailed", f"{channel} has not been read")
+        return found
+
+    def number(self, channel: str) -> Known:
+        """The value of a channel; Refusal when it is BAD: never an old one."""
+        reading = self.reading(channel)
+        if reading.value is None:
+            kind = "CommunicationFailed" if reading.cause == "wire" else "HardwareError"
+            raise Refusal(kind, reading.reason or "this is no measurement")
+        return Known(reading.value, reading.time_ns)
+
+
+# What is done on the control loop.
+Order = Callable[[Desk, Who], Awaitable[Done | QueuedRun] | Done]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """read: a Refusal that it raises is reported instead of a value. change: the order for a value of that type;
+    without it the parameter is read-only."""
+
+    text: str
+    info: DataInfo
+    read: Callable[[Seen], Known]
+    change: Callable[[JsonValue], Order] | None = None
+
+    def report(self, seen: Seen) -> Report:
+        """What is read now."""
+        try:
+            return self.read(seen)
+        except Refusal as refusal:
+            return refusal
+
+    def described(self) -> dict[str, object]:
+        """For the node's description."""
+        return {"description": self.text, "datainfo": self.info, "readonly": self.change is None}
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """order: by the argument; None for what needs nothing to be done. is_stop: passes every queue."""
+
+    text: str
+    order: Callable[[JsonValue], Order] | None
+    argument: DataInfo | None = None
+    result: DataInfo | None = None
+    is_stop: bool = False
+
+    def described(self) -> dict[str, object]:
+        """For the node's description."""
+        return {"description": self.text, "datainfo": datainfo.command(self.argument, self.result)}
+
+
+@dataclass(frozen=True, slots=True)
+class Module:
+    """device: whose orders keep it busy, "" for none. read_ns: when that was read last. is_read_after: whether the end
+    of each order is followed by a reading, and not only by the next poll."""
+
+    text: str
+    interface: InterfaceClass
+    group: str
+    parameters: Mapping[str, Parameter]
+    commands: Mapping[str, Command] = field(default_factory=dict[str, Command])
+    device: str = ""
+    read_ns: Callable[[StandState], int] = lambda state: state.now_ns
+    is_read_after: bool = False
+
+    def described(self) -> dict[str, object]:
+        """For the node's description."""
+        return {
+            "description": self.text,
+            "interface_classes": [self.interface],
+            "features": [],
+            "group": self.group,
+            "accessibles": {
+                name: accessible.described() for name, accessible in (*self.parameters.items(), *self.commands.items())
+            },
+        }
+
+
+def status(codes: Mapping[str, int], read: Callable[[Seen], tuple[int, str]]) -> Parameter:
+    """The parameter of that name."""
+
+    def reported(seen: Seen) -> Known:
+        code, sentence = read(seen)
+        return Known([code, sentence])
+
+    return Parameter("what it does, and why", datainfo.status(codes), reported)
+
+
+def measured(seen: Seen, channel: str) -> tuple[int, str]:
+    """The status of what is read from one channel."""
+    reading = seen.state.readings.get(channel)
+    if reading is None or reading.value is None:
+        return ERROR, "has not been read" if reading is None else reading.reason or "this is no measurement"
+    return (WARN, reading.reason) if reading.quality != "good" else (IDLE, "")
+
+
+def driven(seen: Seen, channel: str, read_ns: int) -> tuple[int, str]:
+    """The status of what moves, but for what only the device itself knows."""
+    code, sentence = measured(seen, channel)
+    state = seen.state
+    if code == ERROR:
+        return code, sentence
+    if state.fault is not None:
+        return ERROR, f"the stand has tripped, and nobody has cleared it: {state.fault.text}"
+    if seen.drive.is_busy(read_ns):
+        return BUSY, "under way"
+    if code == IDLE and state.phase != "idle":
+        return IDLE, "a run has the stand"
+    if code == IDLE and state.reasons:
+        return WARN, f"the stand is held: {', '.join(state.reasons)}"
+    return code, sentence
+
+
+def by_hand(device: str, verb: str, **arguments: JsonValue) -> Order:
+    """An order to a device, through the gate of all that is done by hand."""
+    return lambda desk, who: desk.device(who, device, verb, arguments)

@@ -1,0 +1,265 @@
+"""The node: what each request is answered, and what has changed since the last look. No socket.
+
+What is read comes from the bridge's snapshot; what is ordered passes the bridge as the HTTP interface's orders do, and
+is an event of the recording. Nothing here is called by the control loop.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass
+
+from pydantic import JsonValue
+
+from foundation.clock import NS_PER_S
+from foundation.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceFault,
+    GarbledReply,
+    StandError,
+    StandTripped,
+    Unreachable,
+)
+from stand.serving.api.bridge import Bridge, NoAnswer, Snapshot
+from stand.serving.desk import Conflict, Desk, DeviceState, Done, QueuedRun, StandState, Who
+from stand.serving.secop.datainfo import taken
+from stand.serving.secop.devices import modules
+from stand.serving.secop.messages import (
+    ANSWERS,
+    IDENTIFICATION,
+    IDENTIFY,
+    ErrorClass,
+    Refusal,
+    Request,
+    message,
+    report,
+)
+from stand.serving.secop.modules import Command, Drive, Known, Module, Order, Report, Seen
+
+WHO = Who(name="", how="secop")
+_OLD_S = 10.0  # a snapshot is made twice a second: the control loop hangs
+_SILENT = Refusal("CommunicationFailed", "the stand's control loop does not answer")
+_HELP = (
+    "*IDN?, describe, activate [module], deactivate [module], read module:parameter, change module:parameter value, "
+    "do module:command [argument], ping id; `do run:stop` makes the stand safe"
+)
+
+Place = tuple[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """A parameter as clients know it; t_s: s since the epoch, UTC."""
+
+    report: Report
+    t_s: float
+
+
+class Node:
+    """Of a stand with these devices. `tell` is given each parameter that has changed, with the line that says so;
+    `failed` what should not happen."""
+
+    def __init__(
+        self,
+        bridge: Bridge,
+        devices: Iterable[DeviceState],
+        tell: Callable[[Place, bytes], None],
+        failed: Callable[[Exception], None],
+    ) -> None:
+        state = bridge.snapshot.state
+        self.modules: dict[str, Module] = modules(devices, state.readings)
+        self.description = message("describing", ".", _description(state, self.modules))
+        self._bridge = bridge
+        self._tell, self._failed = tell, failed
+        self._drives = {name: Drive() for name in self.modules}
+        self._told: dict[Place, _Told] = {}
+        self.look()
+
+    def look(self) -> None:
+        """Tell what is not as it was at the last look."""
+        snapshot = self._bridge.snapshot
+        for name, module in self.modules.items():
+            is_busy = module.device in snapshot.state.busy
+            self._drives[name].look(is_busy, snapshot.state.now_ns, module.read_ns(snapshot.state))
+            for parameter in module.parameters:
+                if self._has_changed(snapshot, name, parameter):
+                    self._tell((name, parameter), self.update((name, parameter)))
+
+    def places(self, module: str = "") -> list[Place]:
+        """Every parameter, of one module or of all."""
+        return [place for place in self._told if module in ("", place[0])]
+
+    def update(self, place: Place) -> bytes:
+        """The line that tells a parameter's value, or why there is none."""
+        return self._line("update", "error_update", place)
+
+    def is_stop(self, request: Request) -> bool:
+        """Whether this is STOP, which nothing may delay."""
+        module, name = request.place
+        command = self.modules[module].commands.get(name) if module in self.modules else None
+        return request.action == "do" and command is not None and command.is_stop
+
+    async def stop(self, request: Request) -> bytes:
+        """STOP; Refusal when the control loop does not answer."""
+        try:
+            await self._bridge.stop(WHO)
+        except NoAnswer as error:
+            raise Refusal("TimeoutError", str(error)) from error
+        await self._bridge.fresh()
+        self.look()
+        return self._done(request, None)
+
+    async def answer(self, request: Request) -> bytes:
+        """The answer to all but `activate`, `deactivate` and STOP; Refusal."""
+        match request.action:
+            case "describe":
+                return self.description
+            case "read":
+                place = self._parameter(request, "value")
+                return self._line("reply", "error_read", place, request.specifier)
+            case "change":
+                return await self._change(request)
+            case "do":
+                return await self._do(request)
+            case "ping":
+                return message("pong", request.specifier, report(None, self._now_s()))
+            case "help":
+                return message("helping", "", _HELP)
+            case action if action == IDENTIFY:
+                return f"{IDENTIFICATION}\n".encode()
+            case _:
+                raise Refusal("ProtocolError", f"there are {IDENTIFY}, {', '.join(ANSWERS)}")
+
+    def module(self, name: str) -> Module:
+        """Refusal when there is none of that name."""
+        if name not in self.modules:
+            raise Refusal("NoSuchModule", f"there are {', '.join(self.modules)}")
+        return self.modules[name]
+
+    async def _change(self, request: Request) -> bytes:
+        name, parameter = place = self._parameter(request, "target")
+        module = self.modules[name]
+        found = module.parameters[parameter]
+        if found.change is None:
+            raise Refusal("ReadOnly", f"{name}:{parameter} can only be read")
+        value = taken(found.info, request.value())
+        await self._ordered(found.change(value), name, value)
+        return self._line("changed", "error_change", place, request.specifier)
+
+    async def _do(self, request: Request) -> bytes:
+        name, word = request.place
+        module = self.module(name)
+        command = module.commands.get(word)
+        if command is None:
+            raise Refusal("NoSuchCommand", f"{name} has {', '.join(module.commands) or 'no commands'}")
+        argument = self._argument(command, request)
+        if command.order is None:
+            return self._done(request, None)
+        came = await self._ordered(command.order(argument), name, None)
+        return self._done(request, came.id if isinstance(came, QueuedRun) else None)
+
+    def _argument(self, command: Command, request: Request) -> JsonValue:
+        value = request.value()
+        if command.argument is not None:
+            return taken(command.argument, value)
+        if value is not None:
+            raise Refusal("WrongType", "this command takes no argument")
+        return None
+
+    async def _ordered(self, order: Order, name: str, target: JsonValue) -> Done | QueuedRun:
+        """What came of it; what it changes at once has been told when this returns."""
+
+        module, began_ns = self.modules[name], self._bridge.snapshot.state.now_ns
+
+        def call(desk: Desk) -> Awaitable[Done | QueuedRun] | Done:
+            return order(desk, WHO)
+
+        try:
+            came: Done | QueuedRun = await self._bridge.ask(call)
+        except (StandError, NoAnswer) as error:
+            raise _refusal(error, (await self._bridge.fresh()).state) from error
+        except Exception as error:
+            self._failed(error)
+            raise Refusal("InternalError", f"failed ({type(error).__name__}); the stand's events say more") from error
+        snapshot = await self._bridge.fresh()
+        if module.device:
+            self._drives[name].order(target, began_ns if module.is_read_after else snapshot.state.now_ns)
+        self.look()
+        return came
+
+    def _parameter(self, request: Request, default: str) -> Place:
+        name, parameter = request.place
+        module = self.module(name)
+        parameter = parameter or default
+        if parameter not in module.parameters:
+            raise Refusal("NoSuchParameter", f"{name} has {', '.join(module.parameters)}")
+        return name, parameter
+
+    def _has_changed(self, snapshot: Snapshot, name: str, parameter: str) -> bool:
+        place, state = (name, parameter), snapshot.state
+        seen = Seen(state, self._drives[name])
+        now = _SILENT if snapshot.age_s > _OLD_S else self.modules[name].parameters[parameter].report(seen)
+        before = self._told.get(place)
+        if before is not None and before.report == now:
+            return False
+        time_ns = now.time_ns if isinstance(now, Known) else None
+        self._told[place] = _Told(now, _utc_s(state, state.now_ns if time_ns is None else time_ns))
+        return True
+
+    def _line(self, word: str, error_word: str, place: Place, specifier: str = "") -> bytes:
+        told, specifier = self._told[place], specifier or ":".join(place)
+        if isinstance(told.report, Refusal):
+            qualifiers = {"t": round(told.t_s, 6)}
+            return message(error_word, specifier, [told.report.error, told.report.text, qualifiers])
+        return message(word, specifier, report(told.report.value, told.t_s))
+
+    def _done(self, request: Request, result: JsonValue) -> bytes:
+        return message("done", request.specifier, report(result, self._now_s()))
+
+    def _now_s(self) -> float:
+        snapshot = self._bridge.snapshot
+        return _utc_s(snapshot.state, snapshot.state.now_ns) + snapshot.age_s
+
+
+def _utc_s(state: StandState, time_ns: int) -> float:
+    return (time_ns + state.utc_offset_ns) / NS_PER_S
+
+
+def _description(state: StandState, found: dict[str, Module]) -> dict[str, object]:
+    return {
+        "equipment_id": f"thermostand.{re.sub(r'[^A-Za-z0-9_.-]+', '-', state.stand)}",
+        "firmware": f"thermostand {state.version}",
+        "description": f"{state.stand}: a thermal chamber for cameras" + (", simulated" if state.simulated else ""),
+        "modules": {name: module.described() for name, module in found.items()},
+    }
+
+
+def _refusal(error: Exception, state: StandState) -> Refusal:
+    """SECoP's class of what an order was refused for. What a device said is the cause of a Conflict."""
+    while isinstance(error, Conflict) and isinstance(error.__cause__, StandError):
+        error = error.__cause__
+    return Refusal(_class_of(error, state), str(error))
+
+
+def _class_of(error: Exception, state: StandState) -> ErrorClass:
+    match error:
+        case NoAnswer():
+            return "TimeoutError"
+        case ConfigError():
+            return "RangeError"
+        case Unreachable() | GarbledReply():
+            return "CommunicationFailed"
+        case DeviceFault():
+            return "HardwareError"
+        case StandTripped():
+            return "Disabled"
+        case DeviceError():
+            return "Impossible"
+        case Conflict() if state.phase != "idle" and state.fault is None:
+            return "IsBusy"
+        case Conflict() if state.fault is not None or state.reasons:
+            return "Disabled"
+        case _:
+            return "Impossible"

@@ -1,0 +1,444 @@
+"""The SECoP node, line by line: the specification's own exchanges, refusals, and clients who mean no good."""
+
+import asyncio
+import json
+import random
+import time
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stand.gate import INTERLOCK
+from stand.serving.desk import FaultState
+from stand.serving.secop import door
+from stand.serving.secop.messages import LINE_LIMIT_BYTES, Request, message, parsed
+from tests.stand.secop_desk import JAM, NO, WIRE, SecopDesk, node
+from tests.stand.test_interface_access import EVIL, PROXIED, TOKEN
+
+LIMIT_S = 20.0
+
+
+class Talk:
+    """One client."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+        self.updates: list[str] = []
+
+    def say(self, *lines: str) -> None:
+        self.writer.write("".join(f"{line}\n" for line in lines).encode())
+
+    async def line(self) -> str:
+        async with asyncio.timeout(LIMIT_S):
+            return (await self.reader.readline()).decode().removesuffix("\n")
+
+    async def ask(self, line: str) -> str:
+        """The answer; updates that come before it are kept."""
+        self.say(line)
+        while "update " in (answer := await self.line()).replace("error_update", "update")[:7]:
+            self.updates.append(answer)
+        return answer
+
+    async def asked(self, line: str) -> tuple[str, str, Any]:
+        """The answer's action, specifier and content."""
+        action, specifier, content = (await self.ask(line)).split(" ", 2)
+        return action, specifier, json.loads(content)
+
+    async def until(self, begin: str) -> str:
+        """The first line that begins so."""
+        while not (line := await self.line()).startswith(begin):
+            assert line, "the connection has ended"
+        return line
+
+    async def end(self) -> bytes:
+        """What came until the node hung up."""
+        async with asyncio.timeout(LIMIT_S):
+            with suppress(ConnectionError):
+                return await self.reader.read()
+        return b""
+
+
+@asynccontextmanager
+async def talking(port: int) -> AsyncGenerator[Talk]:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1 << 20)
+    try:
+        yield Talk(reader, writer)
+    finally:
+        writer.close()
+        with suppress(ConnectionError):
+            await writer.wait_closed()
+
+
+@pytest.mark.parametrize(
+    ("line", "request_"),
+    [
+        (b"*IDN?", Request("*IDN?")),
+        (b"describe\r", Request("describe")),
+        (b"", Request("help")),
+        (b"ping  ", Request("ping", "", "")),
+        (b"read mf:status", Request("read", "mf:status")),
+        (b"change mf:target 12", Request("change", "mf:target", "12")),
+        (b'do t1:setpid {"p": 100.0, "i": 5.0}', Request("do", "t1:setpid", '{"p": 100.0, "i": 5.0}')),
+    ],
+)
+def test_lines_are_split_at_the_first_two_spaces(line: bytes, request_: Request):
+    assert parsed(line) == request_
+
+
+def test_a_message_is_one_line_whatever_it_says():
+    assert message("pong", "", [None, {}]) == b"pong  [null, {}]\n"  # the specification's two spaces
+    assert message("active") == b"active\n"
+    assert message("update", "a:value", ["two\nlines", {}]) == b'update a:value ["two\\nlines", {}]\n'
+    with pytest.raises(ValueError, match="JSON"):
+        message("update", "a:value", [float("nan"), {}])
+
+
+async def test_identification_description_and_heartbeat(tmp_path: Path):
+    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+        assert await talk.ask("*IDN?") == "ISSE&SINE2020,SECoP,V2019-09-16,v1.0"
+        action, dot, described = await talk.asked("describe")
+        assert (action, dot, described["equipment_id"]) == ("describing", ".", "thermostand.a-stand")
+        found = {name: module["interface_classes"] for name, module in described["modules"].items()}
+        assert found == {
+            "chamber": ["Drivable"],
+            "thermometers_air": ["Readable"],
+            "thermometers_granite": ["Readable"],
+            "flap": ["Drivable"],
+            "linear": ["Drivable"],
+            "camera_temperature": ["Readable"],
+            "run": ["Readable"],
+        }
+        target = described["modules"]["chamber"]["accessibles"]["target"]
+        assert target["datainfo"] == {"type": "double", "unit": "degC", "min": -10.0, "max": 60.0}
+        assert (target["readonly"], described["modules"]["linear"]["accessibles"]["value"]["readonly"]) == (False, True)
+        for module in described["modules"].values():
+            needed = {"value", "status"} | ({"target", "stop"} if "Drivable" in module["interface_classes"] else set())
+            assert needed <= module["accessibles"].keys()
+            assert all(each["description"] for each in (module, *module["accessibles"].values()))
+        action, token, (nothing, qualifiers) = await talk.asked("ping 123")
+        assert (action, token, nothing) == ("pong", "123", None)
+        assert abs(qualifiers["t"] - time.time()) < 5  # noqa: TID251 - the host's clock is what it must be
+        assert (await talk.ask("ping")).startswith("pong  [null")
+        assert (await talk.ask("help")).startswith('helping  "')
+
+
+async def test_what_is_read_has_its_time_and_what_is_no_measurement_is_an_error(tmp_path: Path):
+    desk = SecopDesk()
+    read_s = desk.hub.readings["thermometers.air"].time_ns / 1e9
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        action, specifier, (value, qualifiers) = await talk.asked("read thermometers_air:value")
+        assert (action, specifier, value) == ("reply", "thermometers_air:value", 24.0)
+        assert qualifiers["t"] == pytest.approx(read_s, abs=1e-5)
+        assert (await talk.asked("read thermometers_air"))[:2] == ("reply", "thermometers_air")  # its value
+        assert (await talk.asked("read thermometers_air:status:of:it"))[2][0] == [100, ""]
+        action, _, (error, text, qualifiers) = await talk.asked("read thermometers_granite")
+        assert (action, error, text) == ("error_read", "HardwareError", "wire is broken")
+        assert "t" in qualifiers
+        assert (await talk.asked("read thermometers_granite:status"))[2][0] == [400, "wire is broken"]
+
+
+async def test_who_is_active_is_told_all_and_then_what_changes(tmp_path: Path):
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        assert await talk.ask("activate") == "active"
+        described = (await talk.asked("describe"))[2]["modules"]
+        parameters = {
+            f"{name}:{each}"
+            for name, module in described.items()
+            for each, accessible in module["accessibles"].items()
+            if accessible["datainfo"]["type"] != "command"
+        }
+        assert {line.split(" ")[1] for line in talk.updates} >= parameters
+        broken = [line for line in talk.updates if line.startswith("error_update")]
+        assert any(line.startswith('error_update thermometers_granite:value ["HardwareError"') for line in broken)
+        desk.air_degC = 25.5
+        desk.poll()
+        assert "[25.5," in await talk.until("update chamber:value ")
+        desk.lose("regulator.pv")
+        assert '["CommunicationFailed", "no answer within 0.5 s"' in await talk.until("error_update chamber:value ")
+        assert "[400," in await talk.until("update chamber:status ")
+        assert await talk.ask("deactivate") == "inactive"
+        assert await talk.ask("activate linear") == "active linear"
+        talk.updates.clear()
+        desk.air_degC = desk.linear_mm = 30.0
+        desk.poll()
+        assert "[30.0," in await talk.until("update linear:value ")
+        assert [line for line in talk.updates if " linear:" not in line] == []
+        assert await talk.ask("*IDN?") == "ISSE&SINE2020,SECoP,V2019-09-16,v1.0"  # and nothing is followed any more
+        desk.linear_mm = 40.0
+        desk.poll()
+        await asyncio.sleep(0.7)  # a snapshot is made each half second
+        talk.updates.clear()
+        await talk.ask("ping 1")
+        assert talk.updates == []
+
+
+async def test_a_set_point_is_busy_from_before_its_answer_until_the_air_has_arrived(tmp_path: Path):
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port, talking(port) as talk, talking(port) as other:
+        await other.ask("activate chamber")
+        assert (await talk.asked("change chamber:target 30.5"))[2][0] == 30.5
+        assert "[300," in await other.until("update chamber:status ")
+        assert (await talk.asked("read chamber:status"))[2][0][0] == 300
+        desk.poll()
+        assert "[370," in await other.until("update chamber:status ")
+        desk.air_degC = 30.2
+        desk.poll()
+        assert '[100, "at 30.5 degC"]' in await other.until("update chamber:status ")
+        assert (await talk.asked("do chamber:stop"))[:2] == ("done", "chamber:stop")
+        desk.poll()
+        assert "false" in await other.until("update chamber:control_active ")
+    who, verb, arguments = desk.orders[0]
+    assert (who.how, verb, arguments["device"], arguments["verb"]) == ("secop", "device", "regulator", "set")
+    assert [order[2]["verb"] for order in desk.orders] == ["set", "stop"]
+
+
+async def test_a_stage_is_busy_until_it_has_been_read_where_it_is(tmp_path: Path):
+    desk = SecopDesk()
+    desk.is_slow = True
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        assert (await talk.asked("change linear:target 12"))[2][0] == 12.0
+        desk.busy = ()
+        desk.tell("the move has ended")
+        await asyncio.sleep(0.3)
+        assert (await talk.asked("read linear:status"))[2][0][0] == 300  # else its old position would be taken for it
+        await talk.ask("activate linear")
+        desk.poll()
+        assert "[100," in await talk.until("update linear:status ")
+        assert (await talk.asked("read linear"))[2][0] == 12.0
+        assert (await talk.asked("do linear:_home"))[0] == "done"
+        assert (await talk.asked("change flap:target 1"))[2][0] == 1
+        assert (await talk.asked('change flap:target "closed"'))[2][0] == 0  # an enum takes its names, too
+    assert [order[2]["verb"] for order in desk.orders] == ["move", "home", "open", "close"]
+
+
+async def test_stop_and_what_concerns_runs(tmp_path: Path):
+    desk = SecopDesk()
+    desk.phase = "running"
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        assert (await talk.asked("read run"))[2][0] == 1
+        for line in ("_pause", "_continue", "stop"):
+            assert (await talk.asked(f"do run:{line}"))[:2] == ("done", f"run:{line}")
+        assert (await talk.asked('do run:_submit "overnight"'))[2][0] == 1  # its number in the queue
+        assert (await talk.asked("do run:clear_errors"))[2][:2] == [
+            "IsBusy",
+            "there is nothing to clear: no interlock holds this run",
+        ]
+    assert [verb for _, verb, _ in desk.orders] == ["pause", "continue", "stop", "submit"]
+    assert {who.how for who, _, _ in desk.orders} == {"secop"}
+
+
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        ("read tx:target", "NoSuchModule"),
+        ("change ts:target 12", "NoSuchModule"),
+        ("read chamber:volt", "NoSuchParameter"),
+        ("do chamber:explode", "NoSuchCommand"),
+        ("do chamber", "NoSuchCommand"),
+        ("change chamber:value 3", "ReadOnly"),
+        ("change thermometers_air 3", "NoSuchParameter"),
+        ("change chamber:target 61", "RangeError"),
+        ("change chamber:target -1e999", "RangeError"),
+        ('change chamber:target "30"', "WrongType"),
+        ("change chamber:target true", "WrongType"),
+        ("change chamber:target null", "WrongType"),
+        ("change chamber:target", "WrongType"),
+        ("change chamber:target NaN", "BadJSON"),
+        ("change chamber:target {", "BadJSON"),
+        ("change chamber:target " + "[" * 10_000, "BadJSON"),
+        ("change flap:target 2", "RangeError"),
+        ("change flap:target 1.0", "WrongType"),
+        ("do chamber:stop 1", "WrongType"),
+        ("do run:_submit", "WrongType"),
+        ("do run:_submit " + json.dumps("x" * 300), "RangeError"),
+        ("meas:volt?", "ProtocolError"),
+        ("logging chamber true", "ProtocolError"),
+        ("activate nothing", "NoSuchModule"),
+    ],
+)
+async def test_what_is_wrong_has_its_class_and_a_sentence(tmp_path: Path, line: str, error: str):
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        await talk.ask("*IDN?")
+        action, _, (found, text, _) = await talk.asked(line)
+        assert (action, found) == (f"error_{line.split(' ')[0]}", error)
+        assert len(text) > 5
+        assert (await talk.asked("read chamber"))[0] == "reply"
+    assert desk.orders == []
+
+
+@pytest.mark.parametrize(
+    ("failure", "error"),
+    [(WIRE, "CommunicationFailed"), (JAM, "HardwareError"), (NO, "Impossible"), (KeyError("x"), "Impossible")],
+)
+async def test_what_a_device_says_has_its_class(tmp_path: Path, failure: Exception, error: str):
+    desk = SecopDesk()
+    desk.fails = failure
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        assert (await talk.asked("change linear:target 3"))[2][:2] == [error, str(failure)]
+
+
+async def test_a_run_and_a_trip_refuse_orders_with_classes_of_their_own(tmp_path: Path):
+    desk = SecopDesk()
+    desk.phase = "running"
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        assert (await talk.asked("change linear:target 3"))[2][0] == "IsBusy"
+        desk.phase = "held"
+        desk.fault = FaultState(rule="air_too_warm", text="the air is at 71 degC", since_ns=0)
+        desk.gate.hold(INTERLOCK)
+        desk.tell("tripped")
+        await talk.ask("activate")
+        while "[400, " not in await talk.until("update run:status "):
+            pass
+        assert (await talk.asked("change linear:target 3"))[2][0] == "Disabled"
+        assert (await talk.asked("read chamber:status"))[2][0][0] == 400
+        assert (await talk.asked("do run:clear_errors"))[0] == "done"
+
+
+async def test_a_control_loop_that_hangs_is_an_error_and_no_old_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("stand.serving.secop.node._OLD_S", -1.0)
+    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+        assert (await talk.asked("read chamber"))[2][0] == "CommunicationFailed"
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        f"POST / HTTP/1.1\r\nHost: evil.example\r\nOrigin: {EVIL}\r\n",
+        "POST /do HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: null\r\nSec-Fetch-Site: cross-site\r\n",
+        f"PUT / HTTP/1.0\r\nAuthorization: Bearer {TOKEN}\r\n" + "".join(f"{n}: {v}\r\n" for n, v in PROXIED.items()),
+        "GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n",
+        "\x16\x03\x01\x02\x00\x01",
+        "EHLO evil.example\r\n",
+    ],
+)
+async def test_who_was_made_to_speak_here_orders_nothing(tmp_path: Path, head: str):
+    """A page of another site can send this port what it likes, but not as its first line."""
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        talk.say(f"{head}\r\n*IDN?", "do run:stop", "change chamber:target 60", 'do run:_submit "overnight"')
+        told = await talk.end()
+        assert told.count(b"\n") <= 1
+        async with talking(port) as other:
+            assert (await other.asked("read chamber"))[0] == "reply"
+    assert desk.orders == []
+
+
+@pytest.mark.parametrize(
+    "sent", [b"x" * (2 * LINE_LIMIT_BYTES), b"ping 1\n" + b"y" * (2 * LINE_LIMIT_BYTES), b"\xff\xfe\n"]
+)
+async def test_long_lines_and_garbage_end_the_connection(tmp_path: Path, sent: bytes):
+    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+        talk.writer.write(sent)
+        assert b"ProtocolError" in (await talk.end() or b"ProtocolError")  # it may be reset before it is read
+        async with talking(port) as other:
+            assert (await other.asked("read chamber"))[0] == "reply"
+
+
+async def test_requests_are_answered_in_their_order_whole_byte_by_byte_and_beyond_the_most(tmp_path: Path):
+    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+        for byte in b"ping 1\r\nping 2\n":
+            talk.writer.write(bytes([byte]))
+            await talk.writer.drain()
+        assert [(await talk.line())[:6] for _ in range(2)] == ["pong 1", "pong 2"]
+        talk.say(*(f"ping {number}" for number in range(200)))
+        answers = [await talk.line() for _ in range(200)]
+        pongs = [int(line.split(" ")[1]) for line in answers if line.startswith("pong")]
+        assert pongs == sorted(pongs)
+        assert len(pongs) >= 64
+        assert all("IsBusy" in line for line in answers if not line.startswith("pong"))
+
+
+async def test_there_is_room_for_one_more_and_strangers_leave_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port, talking(port) as known:
+        await known.ask("*IDN?")
+        strangers = [await asyncio.open_connection("127.0.0.1", port) for _ in range(3 * door.MOST_CLIENTS)]
+        async with talking(port) as last:
+            assert (await last.asked("do run:stop"))[0] == "done"
+        assert (await known.asked("ping 1"))[0] == "pong"
+        monkeypatch.setattr(door, "_SPEAK_WITHIN_S", 0.0)
+        async with asyncio.timeout(LIMIT_S):
+            assert [await reader.read() for reader, _ in strangers] == [b""] * len(strangers)
+        for _, writer in strangers:
+            writer.close()
+    assert [verb for _, verb, _ in desk.orders] == ["stop"]
+
+
+async def test_who_does_not_read_keeps_little_and_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(door, "_SEND_LIMIT_S", 0.3)
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port, talking(port) as talk, talking(port) as other:
+        talk.writer.transport.pause_reading()  # type: ignore[attr-defined]
+        began_s = time.monotonic()
+        with suppress(ConnectionError):
+            while time.monotonic() < began_s + LIMIT_S:
+                talk.say(*["describe"] * 50)
+                await talk.writer.drain()
+                assert (await other.asked("ping 1"))[0] == "pong"
+        assert time.monotonic() < began_s + LIMIT_S
+
+
+async def test_a_flood_of_requests_and_stops_delays_no_stop_of_another(tmp_path: Path):
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port, talking(port) as flood, talking(port) as other:
+
+        async def pour() -> None:
+            while True:
+                flood.say(*["describe", "do run:stop"] * 20)
+                await flood.writer.drain()
+
+        async def drink() -> None:
+            while await flood.reader.read(1 << 16):
+                pass
+
+        tasks = [asyncio.create_task(pour()), asyncio.create_task(drink())]
+        waits: list[float] = []
+        for _ in range(5):
+            began_s = time.monotonic()
+            assert (await other.asked("do run:stop"))[0] == "done"
+            waits.append(time.monotonic() - began_s)
+            await asyncio.sleep(0.1)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    assert sorted(waits)[2] < 1.0
+    stops = sum(verb == "stop" for _, verb, _ in desk.orders)
+    assert stops < 60  # at most ten a second are done, and recorded
+
+
+async def test_hostile_lines_hurt_nobody(tmp_path: Path):
+    """Drawn from a seed: words of the protocol, cut, joined and turned; the node goes on and orders nothing."""
+    draw = random.Random(1)
+    words = ["read", "change", "describe", "activate", "deactivate", "ping", "chamber", ":", "target", "do ", "value"]
+    words += [
+        " ",
+        " ",
+        "{}",
+        "[1,",
+        '"',
+        "1e400",
+        "-",
+        "\x00",
+        "\x1b[2J",
+        "\ud800".encode("utf-16", "surrogatepass").decode("latin-1"),
+        "ä",
+        "<script>",
+        "\r",
+        "*IDN?",
+    ]
+    desk = SecopDesk()
+    async with node(desk, tmp_path) as port:
+        for _ in range(20):
+            async with talking(port) as talk:
+                talk.say("*IDN?")
+                talk.say(*("".join(draw.choices(words, k=draw.randint(1, 8))) for _ in range(50)), "ping last")
+                while not (line := await talk.line()).startswith(("pong last", "error_ping last")):
+                    assert line
+        async with talking(port) as talk:
+            assert (await talk.asked("read chamber"))[0] == "reply"
+    assert [order for order in desk.orders if order[2].get("verb") != "stop"] == []
