@@ -13,7 +13,7 @@ from contextlib import suppress
 from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
 from foundation.errors import ConfigError, Unreachable
-from stand.config.stand_config import StandConfig
+from stand.config.stand_config import SimulatedCamera, StandConfig
 
 _STOP_LIMIT_S = 5.0
 _CAMERA_BOOT_S = 3.0  # a stand that waits for less has a camera that takes less
@@ -60,11 +60,20 @@ def laboratory_of(
         },
         "flap": {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
         "cameras": {
-            name: {"address": None if is_anywhere else camera.address, "serial_number": camera.serial_number}
+            name: {
+                "address": None if is_anywhere else camera.address,
+                "serial_number": camera.serial_number,
+                **_dress_of(simulation.cameras.get(name, SimulatedCamera())),
+            }
             for name, camera in config.cameras.items()
         },
         "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
     }
+
+
+def _dress_of(camera: SimulatedCamera) -> dict[str, str | None]:
+    """Optics and the GenICam file, the latter from where we are."""
+    return {"optics": camera.optics, "genicam": None if camera.genicam is None else str(camera.genicam.resolve())}
 
 
 def _inputs_of(config: StandConfig) -> dict[str, object]:

@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 from drivers.sim import gvcp, gvsp
 from drivers.sim.camera_registers import Registers
 from drivers.sim.camera_schedule import Schedule, Shot
+from drivers.sim.dressed_registers import DressedRegisters
 from drivers.sim.genicam import TICKS_PER_S, features
+from drivers.sim.genicam_file import GenicamFile
 from drivers.sim.gvcp import Nack, Resend, Status
 from drivers.sim.gvcp_device import ControlChannel, Peer
+from drivers.sim.gvsp_pixels import encoded
 from drivers.sim.gvsp_sender import CameraFaults, StreamCounts, StreamSender
 from foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 
@@ -60,7 +63,8 @@ class FakeCamera:
     `real_time` a frame leaves when its exposure has ended on the clock; without, a triggered frame leaves at once
     (virtual time stands still meanwhile) and a free-running one after `advance`. Timestamps are ns since power-on, at
     the start of the exposure. `boot_s` is simulated time from power-on to the first answer; a camera that has power
-    when it is built is ready. `faults` and `counts` are open to all.
+    when it is built is ready. `faults` and `counts` are open to all. With `genicam` it shows that file's features
+    instead of ours, and is a camera of that make to its client.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class FakeCamera:
         boot_s: float = 3.0,
         extended_ids: bool = False,
         faults: CameraFaults | None = None,
+        genicam: GenicamFile | None = None,
     ) -> None:
         self.address = address
         self._plant = plant
@@ -89,8 +94,9 @@ class FakeCamera:
         self._control = _bound(address, gvcp.PORT)
         self._control.settimeout(_TICK_s)
         self._stream = _bound(address, 0)
-        self._registers = Registers(
-            features(*size_px, serial, stream_port=self._stream.getsockname()[1]), address, serial
+        table = features(*size_px, serial, stream_port=self._stream.getsockname()[1])
+        self._registers = (
+            Registers(table, address, serial) if genicam is None else DressedRegisters(table, address, serial, genicam)
         )
         self._channel = ControlChannel(self._registers, self)
         self._schedule = Schedule(self._registers, real_time)
@@ -147,6 +153,8 @@ class FakeCamera:
                 thread.join()
         self._control.close()
         self._stream.close()
+        if isinstance(self._registers, DressedRegisters):
+            self._registers.close()
 
     def restart(self) -> None:
         """It restarts by itself: control and settings are lost."""
@@ -257,8 +265,8 @@ class FakeCamera:
 
     def _resize(self, now_ns: int) -> None:
         pixels = self._registers.integer("Width") * self._registers.integer("Height")
-        mono12 = self._registers.integer("PixelFormat") == gvsp.PixelFormat.MONO12
-        self._registers.put("PayloadSize", pixels * (2 if mono12 else 1))
+        pixel_format = gvsp.PixelFormat(self._registers.integer("PixelFormat"))
+        self._registers.put("PayloadSize", pixel_format.size_bytes(pixels))
 
     def _latch_timestamp(self, now_ns: int) -> None:
         self._registers.put("GevTimestampValue", now_ns - self._ticks_from_ns)
@@ -314,12 +322,13 @@ class FakeCamera:
         value = self._registers.integer
         x, y, width, height = value("OffsetX"), value("OffsetY"), value("Width"), value("Height")
         pixels = image[y : y + height, x : x + width]
+        if pixels.shape != (height, width) and isinstance(self._registers, DressedRegisters):
+            # its file may have a larger sensor: dark beyond ours
+            missing = (height - pixels.shape[0], width - pixels.shape[1])
+            pixels = np.pad(pixels, [(0, each) for each in missing])
         if pixels.shape != (height, width):
             raise ValueError(f"the renderer gave {image.shape}, too small for {width} x {height} at ({x}, {y})")
-        if value("PixelFormat") == gvsp.PixelFormat.MONO12:
-            data = (pixels.astype(np.uint16) << 4).astype("<u2").tobytes()
-        else:
-            data = pixels.tobytes()
+        data = encoded(pixels, gvsp.PixelFormat(value("PixelFormat")))
         leader = gvsp.Leader(self._stamp(shot.start_ns), value("PixelFormat"), width, height, x, y)
         block_id = shot.index + 1 if self._extended_ids else shot.index % _SHORT_IDS + 1
         return gvsp.Block(block_id, leader, memoryview(data), value("GevSCPSPacketSize"), self._extended_ids)

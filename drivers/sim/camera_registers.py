@@ -19,16 +19,26 @@ _FEATURES_ADDRESS = 0x10000
 
 
 class Registers:
-    """Big-endian memory laid out by the feature table; reads and writes as GVCP asks for them raise Nack."""
+    """Big-endian memory laid out by the feature table; reads and writes as GVCP asks for them raise Nack.
 
-    def __init__(self, table: tuple[Feature, ...], address: str, serial: str) -> None:
+    `xml` at `xml_address` is what a client reads as the camera's description, the table's own by default.
+    """
+
+    def __init__(
+        self,
+        table: tuple[Feature, ...],
+        address: str,
+        serial: str,
+        xml: bytes = b"",
+        xml_address: int = XML_ADDRESS,
+    ) -> None:
         self._table = {feature.name: feature for feature in table}
         self._at: dict[int, list[Feature]] = {}
         for feature in table:
             self._at.setdefault(feature.address, []).append(feature)
-        self._xml = to_xml(table)
+        self._xml, self._xml_address = xml or to_xml(table), xml_address
         xml_padded = self._xml + bytes(-len(self._xml) % 4)  # clients read whole words
-        self._segments = {0: bytearray(0x1000), _FEATURES_ADDRESS: bytearray(0x400), XML_ADDRESS: bytearray(xml_padded)}
+        self._segments = {0: bytearray(0x1000), _FEATURES_ADDRESS: bytearray(0x400), xml_address: bytearray(xml_padded)}
         self._write_bootstrap(address, serial)
         self.reset()
 
@@ -48,7 +58,7 @@ class Registers:
         }
         for offset, word in words.items():
             struct.pack_into(">I", self._segments[0], offset, word)
-        url = f"Local:{XML_NAME};{XML_ADDRESS:X};{len(self._xml):X}".encode()
+        url = f"Local:{XML_NAME};{self._xml_address:X};{len(self._xml):X}".encode()
         self._segments[0][0x0200 : 0x0200 + len(url)] = url
         self.offer_resend(True)
 
@@ -75,11 +85,11 @@ class Registers:
     def integer(self, name: str) -> int:
         """The value of an integer, enumeration or boolean feature."""
         feature = self._table[name]
-        return _field(feature, int.from_bytes(self.read(feature.address, feature.length), "big"))
+        return _field(feature, int.from_bytes(self._load(feature.address, feature.length), "big"))
 
     def real(self, name: str) -> float:
         """The value of a float feature."""
-        (value,) = struct.unpack(">d", self.read(self._table[name].address, 8))
+        (value,) = struct.unpack(">d", self._load(self._table[name].address, 8))
         return value
 
     def put(self, name: str, value: float) -> None:
@@ -88,7 +98,7 @@ class Registers:
         if feature.kind == "float":
             self._store(feature.address, struct.pack(">d", value))
             return
-        word = int.from_bytes(self.read(feature.address, feature.length), "big")
+        word = int.from_bytes(self._load(feature.address, feature.length), "big")
         word = word & ~(_mask(feature) << feature.lsb) | int(value) << feature.lsb
         self._store(feature.address, word.to_bytes(feature.length, "big"))
 
@@ -101,8 +111,7 @@ class Registers:
 
     def read(self, address: int, count: int) -> bytes:
         """`count` bytes from `address`; Nack outside the memory."""
-        segment, offset = self._find(address, count)
-        return bytes(segment[offset : offset + count])
+        return self._load(address, count)
 
     def write(self, address: int, data: bytes) -> tuple[str, ...]:
         """Write one whole register; the names of the features that changed and the commands that were given.
@@ -160,6 +169,10 @@ class Registers:
             if begin <= address and address + count <= begin + len(segment):
                 return segment, address - begin
         raise Nack(Status.BAD_ADDRESS, f"{count} bytes at {address:#x}")
+
+    def _load(self, address: int, count: int) -> bytes:
+        segment, offset = self._find(address, count)
+        return bytes(segment[offset : offset + count])
 
     def _store(self, address: int, data: bytes) -> None:
         segment, offset = self._find(address, len(data))

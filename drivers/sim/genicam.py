@@ -128,7 +128,7 @@ def _image(width: int, height: int) -> tuple[Feature, ...]:
             0x10120,
             "ImageFormatControl",
             default=PixelFormat.MONO8,
-            entries=(("Mono8", PixelFormat.MONO8), ("Mono12", PixelFormat.MONO12)),
+            entries=tuple((each.name.capitalize(), each) for each in PixelFormat),
             locked=True,
         ),
     )

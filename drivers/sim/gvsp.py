@@ -34,10 +34,20 @@ class Kind(IntEnum):
 
 
 class PixelFormat(IntEnum):
-    """PFNC codes; Mono12 has two bytes a pixel, little endian."""
+    """PFNC codes; bits 16 to 23 of each are its bits per pixel."""
 
     MONO8 = 0x01080001
+    MONO10 = 0x01100003
     MONO12 = 0x01100005
+    MONO16 = 0x01100007
+    MONO10PACKED = 0x010C0004
+    MONO12PACKED = 0x010C0006
+    MONO10P = 0x010A0046
+    MONO12P = 0x010C0047
+
+    def size_bytes(self, pixels: int) -> int:
+        """Bytes of an image."""
+        return -(-pixels * (self >> 16 & 0xFF) // 8)
 
 
 class Malformed(ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -15,9 +16,10 @@ from drivers.sim.camera import FakeCamera
 from drivers.sim.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
 from drivers.sim.faults import LinkFaults
 from drivers.sim.flap import FakeFlap
+from drivers.sim.genicam_file import read_genicam
 from drivers.sim.link_faults import Link
 from drivers.sim.modbus import RtuEngine, TcpEngine, Unit
-from drivers.sim.optics import true_centres_px
+from drivers.sim.optics import CameraKind, true_centres_px
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.regulator import FakeRegulator
 from drivers.sim.relays import FakeRelays
@@ -55,6 +57,13 @@ class EndpointSpec(Document):
     serial_number: str | None
 
 
+class CameraSpec(EndpointSpec):
+    """A camera; optics: none is as `camera_kind`. genicam: the file of another make, which it then shows."""
+
+    optics: CameraKind | None = None
+    genicam: Path | None = None
+
+
 class ChamberUnitSpec(Document):
     """A commercial climate chamber: its protocol, where it answers, and the set-points that its controller allows (by
     default as the stand asks for)."""
@@ -75,7 +84,7 @@ class LaboratorySpec(Document):
     control: str
     start_ns: int = Field(ge=0)
     seed: int
-    camera_kind: Literal["modified", "unmodified"]
+    camera_kind: CameraKind
     laboratory_degC: float
     chamber_seed: int | None = None
     bus: str
@@ -90,7 +99,7 @@ class LaboratorySpec(Document):
     thermometer_channels: dict[str, int]
     axes: dict[Literal["linear", "rotary"], AxisSpec]
     flap: EndpointSpec
-    cameras: dict[str, EndpointSpec]
+    cameras: dict[str, CameraSpec]
     camera_boot_s: float = Field(default=3.0, ge=0)
     faults: tuple[str, ...] = ()
 
@@ -114,15 +123,15 @@ class Laboratory:
         self.spec = spec
         self._followed = FollowedClock(spec.start_ns) if spec.virtual else None
         self._clock = self._followed or WallClock()
+        kinds = {camera.optics or spec.camera_kind for camera in spec.cameras.values()} or {spec.camera_kind}
         plant_spec = PlantSpec(
-            camera=spec.camera_kind,
+            camera="unmodified" if "unmodified" in kinds else "modified",
             seed=spec.seed,
             laboratory_degC=spec.laboratory_degC,
             chamber_seed=spec.chamber_seed,
             camera_powered=spec.relays_unit is None,
         )
         self.plant = Plant(plant_spec, self._clock.now_ns())
-        self._scene = Scene(SceneSpec(), spec.seed)
         self.axes: dict[str, FakeAxis] = {}
         self.cameras: dict[str, FakeCamera] = {}
         self.addresses: dict[str, str] = {}
@@ -209,11 +218,13 @@ class Laboratory:
             return {"now_ns": now_ns, **self.plant.state()}
 
     def true_centres_px(self) -> list[list[float]]:
-        """Noise-free marker centres (x, y), marker 1 first."""
+        """Noise-free marker centres (x, y) as the camera named so, or the first, sees them; marker 1 first."""
         with self.plant.lock:
             now_ns = self._clock.now_ns()
             self.plant.advance(now_ns)
-            return true_centres_px(self.plant.optics(now_ns)).tolist()
+            leading = self.spec.cameras.get("camera") or next(iter(self.spec.cameras.values()), None)
+            kind = self.spec.camera_kind if leading is None else leading.optics or self.spec.camera_kind
+            return true_centres_px(self.plant.optics(now_ns, kind)).tolist()
 
     def close(self) -> None:
         """Take everything down, last built first."""
@@ -254,12 +265,8 @@ class Laboratory:
         self._closers.append(usb.close)
         self.addresses["flap"] = usb.address
         for name, settings in spec.cameras.items():
-            serial_number = settings.serial_number or ""
-            camera = (
-                self._camera_at(settings.address, serial_number)
-                if settings.address
-                else self._camera_at_a_free_address(serial_number)
-            )
+            is_first = not self.cameras
+            camera = self._camera(settings, Scene(SceneSpec(), spec.seed if is_first else spec.seed + _noise_of(name)))
             self._closers.append(camera.close)
             camera.start()
             self.cameras[name], self.addresses[name] = camera, camera.address
@@ -277,30 +284,31 @@ class Laboratory:
         chamber.limits_degC = spec.limits_degC or chamber.limits_degC
         return chamber
 
-    def _camera_at(self, address: str, serial_number: str) -> FakeCamera:
-        spec = self.spec
-        return FakeCamera(
-            self.plant,
-            self._clock,
-            self._render,
-            address,
-            serial_number,
-            real_time=not spec.virtual,
-            pace_MBps=_PACE_MBps[spec.virtual],
-            boot_s=spec.camera_boot_s,
-        )
+    def _camera(self, settings: CameraSpec, scene: Scene) -> FakeCamera:
+        """At its address, or at a free one: GVCP's port is fixed, but any of 127.0.0.0/8 will do."""
+        genicam = read_genicam(settings.genicam) if settings.genicam is not None else None
+        kind = settings.optics or self.spec.camera_kind
 
-    def _camera_at_a_free_address(self, serial_number: str) -> FakeCamera:
-        """GVCP's port is fixed, so cameras side by side need addresses of their own: any of 127.0.0.0/8 will do."""
-        number, tries_left = secrets.SystemRandom(), _FREE_ADDRESS_TRIES
-        while True:
-            address = f"127.{number.randrange(64, 255)}.{number.randrange(256)}.{number.randrange(1, 255)}"
-            try:
-                return self._camera_at(address, serial_number)
-            except OSError:
-                tries_left -= 1
-                if not tries_left:
-                    raise
+        def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
+            with self.plant.lock:
+                self.plant.advance(time_ns if self._followed is None else self._clock.now_ns())
+                optics, flap_open = self.plant.optics(time_ns, kind), self.plant.flap_open_at(time_ns)
+            return scene.render(optics, time_ns, exposure_s, gain_dB, flap_open, rows)
+
+        def at(address: str) -> FakeCamera:
+            return FakeCamera(
+                self.plant,
+                self._clock,
+                render,
+                address,
+                settings.serial_number or "",
+                real_time=not self.spec.virtual,
+                pace_MBps=_PACE_MBps[self.spec.virtual],
+                boot_s=self.spec.camera_boot_s,
+                genicam=genicam,
+            )
+
+        return at(settings.address) if settings.address else _at_a_free_address(at)
 
     def _conduct(self, time_ns: int, dt_s: float) -> None:
         """A welded solid-state relay conducts regardless of the regulator; a camera without cooling stays hot."""
@@ -319,8 +327,19 @@ class Laboratory:
         self.addresses[name] = wire.address
         self._links[name] = Link(wire, faults)
 
-    def _render(self, time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
-        with self.plant.lock:
-            self.plant.advance(time_ns if self._followed is None else self._clock.now_ns())
-            optics, flap_open = self.plant.optics(time_ns), self.plant.flap_open_at(time_ns)
-        return self._scene.render(optics, time_ns, exposure_s, gain_dB, flap_open, rows)
+
+def _at_a_free_address(at: Callable[[str], FakeCamera]) -> FakeCamera:
+    number, tries_left = secrets.SystemRandom(), _FREE_ADDRESS_TRIES
+    while True:
+        address = f"127.{number.randrange(64, 255)}.{number.randrange(256)}.{number.randrange(1, 255)}"
+        try:
+            return at(address)
+        except OSError:
+            tries_left -= 1
+            if not tries_left:
+                raise
+
+
+def _noise_of(name: str) -> int:
+    """What a camera's noise is seeded with beside the laboratory's seed: two that expose together differ."""
+    return zlib.crc32(name.encode())

@@ -133,8 +133,9 @@ class Plant:
             self._step()
             self.now_ns += STEP_ns
 
-    def optics(self, time_ns: int) -> Optics:
-        """The true camera and target pose: temperatures of the last grid time, stage positions of `time_ns`."""
+    def optics(self, time_ns: int, camera: CameraKind | None = None) -> Optics:
+        """The true camera and target pose: temperatures of the last grid time, stage positions of `time_ns`. Of another
+        kind of camera than the spec's, if asked: an unmodified one has joints only where the spec's is unmodified."""
         nodes = Nodes(
             sensor_degC=self.sensor_degC,
             body_degC=self.body_degC,
@@ -150,7 +151,7 @@ class Plant:
             camera_roll_deg=self.spec.camera_roll_deg,
             distance_mm=self.spec.distance_mm,
         )
-        return optics_at(self.spec.camera, nodes, placement)
+        return optics_at(camera or self.spec.camera, nodes, placement)
 
     def state(self) -> dict[str, float]:
         """Every temperature, input and power by its attribute's name, at grid time; booleans as 0 or 1."""

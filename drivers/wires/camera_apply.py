@@ -207,54 +207,76 @@ def _set_trigger(name: str, device: GigeDevice, settings: GigeCameraSettings) ->
     configured one with a trigger."""
     if settings.trigger == "software":
         return _set_software_trigger(name, device), "", settings.frame_rate_hz
-    entry = next((each for each in words.FIXED_RATE_SOURCES if each in _offered(device, "TriggerSource")), "")
-    if entry:
-        _choose_trigger(name, device, entry)
-    if enable := _found(device, words.FRAME_RATE_ON):  # without it the rate is only a number
+    if enable := _found(device, words.FRAME_RATE_ON):  # without it the rate is only a number, or not there
         device.set_boolean(enable, True)
+    _select_frame_trigger(name, device)
+    paced = _start_frames_by(name, device, words.FIXED_RATE_SOURCES)
     feature = _found(device, words.FRAME_RATE)
     if not feature:
-        raise Refused(name, f"the camera has no {' and no '.join(words.FRAME_RATE)}; take trigger: software")
-    lowest, highest = device.bounds(feature)
-    device.set_number(feature, min(max(settings.frame_rate_hz, lowest), highest))
+        hint = "; take trigger: software" if device.kind("TriggerMode") and device.kind("TriggerSoftware") else ""
+        raise Refused(name, f"the camera has no {' and no '.join(words.FRAME_RATE)}: it keeps no rate of ours{hint}")
+    device.set_number(feature, _within_bounds(device, feature, settings.frame_rate_hz))
     rate_hz = device.get_number(feature)
     if not math.isclose(rate_hz, settings.frame_rate_hz, rel_tol=FRAME_RATE_TOLERANCE):
         raise Refused(name, f"{settings.frame_rate_hz:g} frames/s were asked for, the camera gives {rate_hz:g}")
-    return entry, feature, rate_hz
+    return paced, feature, rate_hz
+
+
+def _within_bounds(device: GigeDevice, feature: str, value: float) -> float:
+    """The value, or the nearest that the camera allows; it need not be able to say what it allows."""
+    try:
+        lowest, highest = device.bounds(feature)
+    except AravisError as error:
+        if is_silence(error):
+            raise
+        return value
+    return min(max(value, lowest), highest)
 
 
 def _set_software_trigger(name: str, device: GigeDevice) -> str:
-    if not device.kind("TriggerSoftware") or not device.kind("TriggerMode"):
-        missing = "TriggerMode" if device.kind("TriggerSoftware") else "TriggerSoftware"
-        raise Refused(name, f"the camera has no {missing}; take trigger: free_run")
+    hint = "; take trigger: free_run" if any(device.kind(each) for each in words.FRAME_RATE) else ""
+    for feature in ("TriggerMode", "TriggerSoftware"):
+        if not device.kind(feature):
+            raise Refused(name, f"the camera has no {feature}: it has no software trigger{hint}")
     if enable := _found(device, words.FRAME_RATE_ON):
         device.set_boolean(enable, False)
-    offered = _offered(device, "TriggerSource")
-    source = next((each for each in words.SOFTWARE_SOURCES if each in offered), "")
-    if device.kind("TriggerSource") and not source:
-        text = f"the camera has no TriggerSource Software, only {', '.join(offered) or 'nothing'}"
-        raise Refused(name, f"{text}; take trigger: free_run")
-    selector = _choose_trigger(name, device, source)
+    selector = _select_frame_trigger(name, device)
+    source = _start_frames_by(name, device, words.SOFTWARE_SOURCES)
+    if not source and device.kind("TriggerSource"):
+        offered = ", ".join(_offered(device, "TriggerSource")) or "none"
+        raise Refused(name, f"the camera has no TriggerSource Software; it offers {offered}{hint}")
+    if not source:  # its only source
+        device.set_string("TriggerMode", "On")
     if not device.available("TriggerSoftware"):
-        raise Refused(name, "the camera does not offer its TriggerSoftware; take trigger: free_run")
+        raise Refused(name, f"the camera does not offer its TriggerSoftware now{hint}")
     return " ".join(each for each in (selector, source or "TriggerSoftware") if each)
 
 
-def _choose_trigger(name: str, device: GigeDevice, source: str) -> str:
-    """Each trigger of `source` ("": there is one only) starts one frame; returns the selector's entry."""
+def _select_frame_trigger(name: str, device: GigeDevice) -> str:
+    """The trigger that starts a frame, by the selector's entry; "" when there is no choice."""
     offered = _offered(device, "TriggerSelector")
+    if not offered:
+        return ""
     selector = next((each for each in words.FRAME_TRIGGERS if each in offered), "")
-    if offered and not selector:
+    if not selector:
         raise Refused(name, f"the camera has no TriggerSelector FrameStart, only {', '.join(offered)}")
-    if selector and device.get_string("TriggerSelector") != selector:
+    if device.get_string("TriggerSelector") != selector:
         device.set_string("TriggerSelector", selector)
-    device.set_string("TriggerMode", "On")
-    if source:
-        device.set_string("TriggerSource", source)
-    taken = device.get_string("TriggerMode"), device.get_string("TriggerSource") if source else ""
-    if taken != ("On", source):
-        raise Refused(name, f"a trigger by {source} was asked for, the camera has mode {taken[0]}, source {taken[1]}")
     return selector
+
+
+def _start_frames_by(name: str, device: GigeDevice, sources: tuple[str, ...]) -> str:
+    """The selected trigger is on, by the first of these sources that is offered; "" when none is: nothing is done."""
+    offered = _offered(device, "TriggerSource")
+    source = next((each for each in sources if each in offered), "")
+    if not source:
+        return ""
+    device.set_string("TriggerMode", "On")
+    device.set_string("TriggerSource", source)
+    mode, taken = device.get_string("TriggerMode"), device.get_string("TriggerSource")
+    if mode != "On" or taken not in sources:  # two names may stand for one
+        raise Refused(name, f"a trigger by {source} was asked for, the camera has mode {mode}, source {taken}")
+    return taken
 
 
 def _set_packets(name: str, device: GigeDevice, settings: GigeCameraSettings) -> tuple[int, int]:

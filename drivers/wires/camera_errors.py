@@ -10,6 +10,7 @@ SILENT = {2, 4, 5, 6}  # not connected, transfer error, timeout, device not foun
 # Genicam data not found, no stream channel, busy: what a camera says, or Aravis for it, while it restarts. Every GigE
 # Vision camera has its data and a stream channel; Aravis (arvgvdevice.c) takes a count it could not read for 0.
 NOT_READY = {8, 9, 18}
+EVALUATION_ERRORS = "Aravis"  # the domain of arvevaluator.c
 NO_CONTROL = {10, 17}  # not controller, access denied
 NO_CONTROL_HINT = "another client controls the camera, or one that died holds it until the heartbeat times out"
 
@@ -34,4 +35,6 @@ def device_error(name: str, error: AravisError) -> DeviceError:
         return Refused(name, f"{error} (Aravis device error {error.code})")
     if error.domain == GENICAM_ERRORS:
         return Refused(name, f"{error} (GenICam error {error.code})")
+    if error.domain == EVALUATION_ERRORS:
+        return Refused(name, f"{error}: a formula of the camera's own description cannot be evaluated")
     return Unreachable(name, f"{error} ({error.domain} {error.code})")  # the host's network said no

@@ -96,8 +96,17 @@ class RecordingConfig(Document):
 FaultText = Annotated[str, Field(pattern=r"^[A-Za-z_]+\.[A-Za-z_]+(=.+)?(@[\d.]+(s|min|h)?)?(:[\d.]+(s|min|h)?)?$")]
 
 
+class SimulatedCamera(Document):
+    """One camera of a simulated laboratory; optics: modified or as bought. genicam: a camera's own GenICam file, whose
+    features it then shows (`arv-tool-0.8 -a ADDRESS genicam > FILE` writes that of a real one)."""
+
+    optics: Literal["modified", "unmodified"] | None = None
+    genicam: Annotated[Path, AfterValidator(_printable)] | None = None
+
+
 class SimulationConfig(Document):
-    """The simulated laboratory behind these addresses; a real laboratory has no such section. chamber_seed: another
+    """The simulated laboratory behind these addresses; a real laboratory has no such section. camera: the optics of all
+    cameras; cameras: what one of the stand's cameras, by its name, has of its own. chamber_seed: another
     chamber than the standard one, its conductances, lags and powers drawn within +-30 %. faults: what breaks, each
     NAME[=VALUE][@TIME][:DURATION], times in s unless they end in s, min or h (`stand simulate --faults` lists the
     names)."""
@@ -106,6 +115,7 @@ class SimulationConfig(Document):
     start: Annotated[AwareDatetime, AfterValidator(_of_this_century)] = datetime(2026, 1, 1, 18, tzinfo=UTC)
     seed: int = Field(default=1, ge=0)
     camera: Literal["modified", "unmodified"] = "modified"
+    cameras: dict[DeviceName, SimulatedCamera] = Field(default_factory=dict)
     laboratory_degC: float = Field(default=24.0, ge=-10, le=40)
     chamber_seed: int | None = Field(default=None, ge=0)
     faults: tuple[FaultText, ...] = Field(default=(), max_length=1000)
@@ -177,6 +187,8 @@ class StandConfig(Document):
         addresses += [camera.address for camera in self.cameras.values()]
         if twice := [address for address in addresses if addresses.count(address) > 1]:
             yield f"bus, axes and cameras need addresses of their own, {twice[0]} is given twice"
+        if unknown := [] if self.simulation is None else sorted(set(self.simulation.cameras) - set(self.cameras)):
+            yield f"simulation.cameras has {unknown[0]}, and no camera of the stand is named so"
         names = [*self.axes, *self.cameras, *_DEVICES]
         if twice := [name for name in names if names.count(name) > 1]:
             yield f"the name {twice[0]} is that of two devices; axes and cameras need names of their own"

@@ -61,6 +61,7 @@ async def refusal(asked: GigeCameraSettings) -> str:
         (DEVICE_ERRORS, 17, Refused, "another client controls the camera"),
         (DEVICE_ERRORS, 1, Refused, "error 1"),
         (GENICAM_ERRORS, 8, Refused, "GenICam error 8"),
+        ("Aravis", 11, Refused, "description cannot be evaluated"),
         ("g-io-error-quark", 38, Unreachable, "g-io-error-quark 38"),
     ],
 )

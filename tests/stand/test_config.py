@@ -278,6 +278,20 @@ def test_yaml_that_python_cannot_hold_is_refused_with_a_sentence(tmp_path: Path,
     assert "\n" not in str(caught.value)
 
 
+def test_a_camera_of_the_simulation_is_one_of_the_stand(tmp_path: Path):
+    data = yaml.safe_load((CONFIGS / "simulated.yaml").read_text())
+    file = tmp_path / "stand.yaml"
+    data["simulation"]["cameras"] = {"camera": {"optics": "unmodified"}}
+    file.write_text(yaml.safe_dump(data))
+    simulation = load_config(file).simulation
+    assert simulation is not None
+    assert (simulation.camera, simulation.cameras["camera"].optics) == ("modified", "unmodified")
+    data["simulation"]["cameras"] = {"side": {"genicam": "side.xml"}}
+    file.write_text(yaml.safe_dump(data))
+    with pytest.raises(ConfigError, match=r"simulation.cameras has side, and no camera of the stand is named so"):
+        load_config(file)
+
+
 def test_a_missing_file_lists_what_there_is():
     with pytest.raises(ConfigError, match=r"thermal_cycle: no such file.*calibration, demo, .*warm-up"):
         packaged("recipes", "thermal_cycle")

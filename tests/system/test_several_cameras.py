@@ -19,6 +19,7 @@ from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import resume, run_virtual
 from stand.running.stop import Interrupted
+from tests.dialects import DIALECTS
 
 from .conftest import require_aravis
 from .test_run import at_step
@@ -56,6 +57,9 @@ def test_each_camera_exposes_at_each_capture_and_a_model_takes_the_leading_ones_
     data = simulated()
     data["cameras"]["side"] = {"address": "127.0.0.21", "serial_number": "TS-0002", "boot_s": 4.0, "poll_s": 5.0}
     data["recording"]["frame_encoding"] = encoding
+    file = tmp_path / "another make.xml"
+    file.write_bytes(DIALECTS["abs"].xml("abs"))
+    data["simulation"]["cameras"] = {"side": {"optics": "unmodified", "genicam": str(file)}}
     session = Session.open(recorded(data, CAPTURES, tmp_path))
     assert verify(session.path).files is Files.SOUND
     assert session.metadata["camera_serial"] == "TS-0001, TS-0002"

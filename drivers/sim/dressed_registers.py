@@ -1,0 +1,150 @@
+"""The registers of a simulated camera in another camera's clothes: its GenICam file instead of ours.
+
+What the client writes lands in a memory laid out by the file; after each write Aravis says what the file's features
+are now, and the camera behind is set to that. Commands are the registers that they write. The bootstrap registers stay
+ours.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+from drivers.sim.camera_registers import Registers
+from drivers.sim.genicam import Feature
+from drivers.sim.genicam_file import GenicamFile
+from drivers.sim.genicam_memory import Evaluated
+from drivers.sim.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
+from drivers.sim.gvsp import PixelFormat
+from drivers.wires.aravis_library import AravisError
+
+XML_ADDRESS = 0x7E000000  # no register of the makes known lies there
+_BOOTSTRAP_bytes = 0x1000
+
+# Ours from theirs, the first that the file has: names of the makes as their GenICam files give them.
+_NUMBERS = {
+    "Width": ("Width",),
+    "Height": ("Height",),
+    "OffsetX": ("OffsetX",),
+    "OffsetY": ("OffsetY",),
+    "ExposureTime": ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw"),
+    "Gain": ("Gain", "GainAbs"),
+    "AcquisitionFrameRateEnable": ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"),
+    "AcquisitionFrameRate": ("AcquisitionFrameRate", "AcquisitionFrameRateAbs"),
+}
+_SOFTWARE = ("Software", "SoftwareTrigger", "SoftTrigger")
+_PACED = ("FixedRate", "Freerun")  # sources of a trigger that is none
+
+
+class DressedRegisters(Registers):
+    """`table` is the camera's own, `file` what the client sees; sizes are those that the file allows."""
+
+    def __init__(self, table: tuple[Feature, ...], address: str, serial: str, file: GenicamFile) -> None:
+        names = {"DeviceVendorName": file.vendor, "DeviceModelName": file.model}
+        dressed = tuple(replace(each, default=names.get(each.name, each.default)) for each in table)
+        self._file = Evaluated(file)
+        self._temperature_degC: float | None = None
+        self._commands = {name: self._command(name) for name in COMMANDS if name in file}
+        super().__init__(dressed, address, serial, file.xml, XML_ADDRESS)
+
+    def close(self) -> None:
+        """Free what evaluates the file."""
+        self._file.close()
+
+    def reset(self) -> None:
+        """Every feature to its default, as after power-on."""
+        super().reset()
+        self._file.memory.restore({})
+        start_values(self._file, self.integer("WidthMax"), self.integer("HeightMax"))
+        self._temperature_degC = None
+        self._wear()
+        self.put("PayloadSize", self.integer("Width") * self.integer("Height"))
+
+    def put(self, name: str, value: float) -> None:
+        """Set a feature from inside: no access rules. What the client may read shows it, too."""
+        super().put(name, value)
+        if name == "PayloadSize" and name in self._file.file:
+            sizes = {register for each in ("Width", "Height") for register in self._file.file.registers(each)}
+            reach(self._file, name, value, sizes)
+        if name == "DeviceTemperature" and value != self._temperature_degC:
+            self._temperature_degC = value
+            for feature in TEMPERATURES:
+                if feature in self._file.file:
+                    reach(self._file, feature, value)
+
+    def covers(self, name: str, address: int, count: int) -> bool:
+        """Whether a read of `count` bytes at `address` touches the feature's register."""
+        if name != "DeviceTemperature":
+            return super().covers(name, address, count)
+        places = [self._file.place(register) for each in TEMPERATURES for register in self._registers_of(each)]
+        return any(address < begin + length and begin < address + count for begin, length in places)
+
+    def read(self, address: int, count: int) -> bytes:
+        """`count` bytes from `address`, zeros where nothing was written yet; Nack outside bootstrap and file."""
+        if address < _BOOTSTRAP_bytes or (address >= XML_ADDRESS and self._in_xml(address)):
+            return super().read(address, count)
+        return self._file.memory.read(address, count)
+
+    def write(self, address: int, data: bytes) -> tuple[str, ...]:
+        """Write; the names of our features that changed and of the commands that were given."""
+        if address in self._at and address < _BOOTSTRAP_bytes:
+            return super().write(address, data)
+        self._file.memory.write(address, data)
+        given = [name for name in self._commands if self._was_given(name, address, len(data))]
+        for name in given:  # they clear themselves
+            register, value = self._commands[name]
+            if value:
+                self._file.set(register, 0)
+        return (*self._wear(), *given)
+
+    # ---------------------------------------------------------------------------------------------------- the clothes
+
+    def _in_xml(self, address: int) -> bool:
+        return address < XML_ADDRESS + len(self._file.file.xml) + 4
+
+    def _registers_of(self, feature: str) -> tuple[str, ...]:
+        return self._file.file.registers(feature) if feature in self._file.file else ()
+
+    def _command(self, name: str) -> tuple[str, int]:
+        """The register that a command writes, "" for none, and the value."""
+        registers = self._file.file.registers(name)
+        return (registers[0] if registers else "", self._file.command_value(name))
+
+    def _was_given(self, name: str, address: int, count: int) -> bool:
+        """Whether that write was the command; start and stop may be values of one register."""
+        register, value = self._commands[name]
+        if not register:
+            return False
+        begin, length = self._file.place(register)
+        return address < begin + length and begin < address + count and self._file.get(register) == value
+
+    def _wear(self) -> tuple[str, ...]:
+        """Set the camera behind to what the file's features are now; the names of those that changed."""
+        changed: list[str] = []
+        for name, value in self._worn().items():
+            known = self._value(self._table[name])
+            if value != known:
+                super().put(name, value)
+                changed.append(name)
+        return tuple(changed)
+
+    def _worn(self) -> dict[str, float]:
+        """Our features as the client set theirs."""
+        file, worn = self._file.file, dict[str, float]()
+        for name, theirs in _NUMBERS.items():
+            feature = next((each for each in theirs if each in file), None)
+            if feature is not None:
+                with suppress(AravisError):
+                    worn[name] = self._file.get(feature)
+        if "AcquisitionFrameRateEnable" not in worn and "AcquisitionFrameRate" in worn:
+            worn["AcquisitionFrameRateEnable"] = 1
+        entry = self._file.entry("PixelFormat").upper()
+        if entry in PixelFormat.__members__:
+            worn["PixelFormat"] = PixelFormat[entry]
+        source = self._file.entry("TriggerSource") if "TriggerSource" in file else _SOFTWARE[0]
+        worn["TriggerSource"] = int(source not in _SOFTWARE)
+        if "TriggerMode" in file:
+            worn["TriggerMode"] = int(self._file.entry("TriggerMode") == "On" and source not in _PACED)
+        if "AcquisitionMode" in file:
+            worn["AcquisitionMode"] = int(self._file.entry("AcquisitionMode") == "SingleFrame")
+        return worn

@@ -1,0 +1,95 @@
+"""A camera's own GenICam file: its nodes, and which registers a node's value is made of.
+
+Only the structure is read here; values, converters and SwissKnives are evaluated by Aravis (genicam_memory.py).
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+from foundation.errors import ConfigError
+
+LARGEST_bytes = 16 << 20  # ten times the largest of 27 makes and models
+REGISTERS = frozenset({"IntReg", "MaskedIntReg", "FloatReg", "StructEntry"})
+
+# What a node's value follows from: its own value, and the variables of a formula.
+_MADE_OF = frozenset({"pValue", "pVariable", "pValueIndexed", "pValueDefault"})
+_NOT_A_NODE = frozenset({"EnumEntry", "pVariable", "Constant", "Expression"})
+
+
+class GenicamFile:
+    """The file's text as a camera serves it, and its nodes by name. ConfigError when it is none."""
+
+    def __init__(self, text: bytes, what: str) -> None:
+        begin = text.find(b"<")  # arv-tool writes the camera's name in front
+        self.xml = text[max(begin, 0) :].rstrip()
+        try:
+            root = ET.fromstring(self.xml)
+        except (ET.ParseError, ValueError) as error:
+            raise ConfigError(f"{what} is no GenICam file: {error}") from error
+        if _tag(root) != "RegisterDescription":
+            raise ConfigError(f"{what} is no GenICam file: it begins with <{_tag(root)}>, not <RegisterDescription>")
+        self.vendor = root.get("VendorName", "")
+        self.model = root.get("ModelName", "")
+        self._nodes: dict[str, ET.Element] = {}
+        for element in root.iter():
+            name = element.get("Name")
+            if name and _tag(element) not in _NOT_A_NODE:
+                self._nodes.setdefault(name, element)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._nodes and self.kind(name) != "Category"
+
+    def kind(self, name: str) -> str:
+        """The node's kind: Integer, Float, Enumeration, MaskedIntReg, ..."""
+        return _tag(self._nodes[name])
+
+    def named(self, name: str, property_name: str) -> str:
+        """The node that a property such as pMax or pValue names; "" when the node has no such property."""
+        return next((child.text or "" for child in self._nodes[name] if _tag(child) == property_name), "").strip()
+
+    def entries(self, name: str) -> dict[str, tuple[str, ...]]:
+        """An enumeration's entries, each with the nodes that say whether it is there."""
+        return {entry.get("Name", ""): _conditions(entry) for entry in self._nodes[name] if _tag(entry) == "EnumEntry"}
+
+    def conditions(self, name: str) -> Iterator[str]:
+        """The nodes that say whether a node is there, and whether what its value is made of is."""
+        for each in self.reached(name):
+            yield from _conditions(self._nodes[each])
+
+    def registers(self, name: str) -> tuple[str, ...]:
+        """The registers that a node's value is made of, nearest first."""
+        return tuple(each for each in self.reached(name) if self.kind(each) in REGISTERS)
+
+    def reached(self, name: str) -> list[str]:
+        """The node, and all that its value is made of, nearest first."""
+        reached = [name]
+        for each in reached:
+            for child in self._nodes[each]:
+                target = (child.text or "").strip()
+                if _tag(child) in _MADE_OF and target in self._nodes and target not in reached:
+                    reached.append(target)
+        return reached
+
+
+def read_genicam(path: Path) -> GenicamFile:
+    """The file at `path`; ConfigError when it cannot be read or is none."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(LARGEST_bytes + 1)
+    except OSError as error:
+        raise ConfigError(f"the GenICam file {path} cannot be read: {error.strerror}") from error
+    if len(text) > LARGEST_bytes:
+        raise ConfigError(f"{path} is no GenICam file: it has more than {LARGEST_bytes >> 20} MB")
+    return GenicamFile(text, str(path))
+
+
+def _tag(element: ET.Element) -> str:
+    return element.tag.rpartition("}")[2]
+
+
+def _conditions(element: ET.Element) -> tuple[str, ...]:
+    found = (child for child in element if _tag(child) in ("pIsImplemented", "pIsAvailable"))
+    return tuple((child.text or "").strip() for child in found)

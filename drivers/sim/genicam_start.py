@@ -1,0 +1,211 @@
+"""Sensible start values of a camera whose file is known and whose registers are not.
+
+A feature is there when the registers that say so do; a value is what its registers make of it. Where Aravis cannot
+write a node (a formula has no inverse), the registers it is made of are tried until it evaluates as wanted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator
+
+from drivers.sim.genicam_memory import Evaluated
+from drivers.wires.aravis_library import AravisError
+
+# What a camera of these wants is there: enumerations with the entries that matter, from the GenICam files of 12 makes.
+ENTRIES = {
+    "PixelFormat": ("Mono8", "Mono10", "Mono12", "Mono16", "Mono10Packed", "Mono12Packed", "Mono10p", "Mono12p"),
+    "AcquisitionMode": ("Continuous", "SingleFrame"),
+    "TriggerSelector": ("FrameStart", "FrameBurstStart", "ExposureStart", "AcquisitionStart"),
+    "TriggerMode": ("Off", "On"),
+    "TriggerSource": ("Software", "SoftwareTrigger", "SoftTrigger", "FixedRate"),
+    "ExposureMode": ("Timed",),
+    "ExposureAuto": ("Off",),
+    "GainAuto": ("Off",),
+    "AcquisitionFrameRateAuto": ("Off",),
+    "GainSelector": ("All", "AnalogAll"),
+    "DeviceTemperatureSelector": ("Sensor", "Mainboard"),
+    "TemperatureSelector": ("Sensorboard", "Coreboard"),
+}
+COMMANDS = ("AcquisitionStart", "AcquisitionStop", "TriggerSoftware")
+TEMPERATURES = ("DeviceTemperature", "TemperatureAbs", "CurrentTemperature")
+ROOM_degC = 40.0
+
+# Feature: value, minimum, maximum, increment; None for the sensor's width or height.
+Wish = tuple[float | None, float | None, float | None, float]
+Limit = tuple[str, float]
+WISHES: dict[str, Wish] = {
+    **dict.fromkeys(("SensorWidth", "WidthMax", "SensorHeight", "HeightMax"), (None, None, None, 1)),
+    **dict.fromkeys(("BinningHorizontal", "BinningVertical"), (1, 1, 4, 1)),
+    **dict.fromkeys(("OffsetX", "OffsetY"), (0, 0, None, 1)),
+    **dict.fromkeys(("Width", "Height"), (None, 16, None, 4)),
+    "ExposureTimeBaseAbs": (20, None, None, 1),
+    **dict.fromkeys(("ExposureTime", "ExposureTimeAbs"), (10_000, 20, 10e6, 1)),
+    "ExposureTimeRaw": (10_000, 1, 10e6, 1),
+    **dict.fromkeys(("Gain", "GainAbs"), (0, 0, 24, 1)),
+    "GainRaw": (0, 0, 480, 1),
+    **dict.fromkeys(("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"), (0, None, None, 1)),
+    **dict.fromkeys(("AcquisitionFrameRate", "AcquisitionFrameRateAbs"), (10, 0.01, 14, 1)),
+    **dict.fromkeys(TEMPERATURES, (ROOM_degC, None, None, 1)),
+}
+
+_NEAR, _NEAR_ENOUGH = 1e-3, 0.03  # of a value; the second where a register has coarse steps
+_ALL_BITS = 2**32 - 1
+_LARGEST_RAW = float(2**31 - 1)  # of a register with a sign
+_BISECTIONS = 40
+_A_DIVISOR = 1e6  # as a clock's ticks in a second
+
+
+def start_values(camera: Evaluated, width: int, height: int) -> None:
+    """Put them into the camera's memory: everything known is there, the sensor has width x height px unless the file
+    fixes another size."""
+    for names in ((*ENTRIES, *COMMANDS, *WISHES), *[(*ENTRIES, *WISHES)] * 2):  # some are there with a trigger only
+        _choose_entries(camera)  # selectors say which registers count
+        for condition in dict.fromkeys(_conditions(camera, names)):
+            _make_true(camera, condition)
+    spared = {register for name in WISHES if name in camera.file for register in camera.file.registers(name)}
+    sides = {"Width": float(width), "Height": float(height)}
+    for name, (value, lowest, highest, step) in WISHES.items():
+        if name not in camera.file or (name == "ExposureTimeRaw" and "ExposureTimeAbs" in camera.file):
+            continue
+        axis = "Height" if "Height" in name or name.endswith("Y") else "Width"
+        start = sides[axis] if value is None else value
+        reach(camera, name, start)
+        for bound, wanted in _limits(camera, name, (lowest, sides[axis] if highest is None else highest, step)):
+            reach(camera, bound, wanted, spared)
+            spared.update(camera.file.registers(bound))
+        reach(camera, name, start)
+        if value is None and (fixed := _got(camera, name) or 0.0) > 0:
+            sides[axis] = min(sides[axis], fixed)
+    _choose_entries(camera)
+
+
+def _limits(camera: Evaluated, name: str, wanted: tuple[float | None, float | None, float]) -> Iterator[Limit]:
+    """The nodes that bound a feature, and the raw values behind it, each with what it should be."""
+    for node in camera.file.reached(name):
+        values = wanted if node == name else (1.0, _LARGEST_RAW, 1.0)
+        for property_name, value in zip(("pMin", "pMax", "pInc"), values, strict=True):
+            bound = camera.file.named(node, property_name)
+            if value is not None and bound in camera.file and bound not in WISHES:
+                yield bound, value
+
+
+def _choose_entries(camera: Evaluated) -> None:
+    for name, entries in ENTRIES.items():
+        if name in camera.file and camera.file.kind(name) == "Enumeration":
+            offered = camera.file.entries(name)
+            first = next((entry for entry in entries if entry in offered and _is_offered(camera, offered[entry])), "")
+            if first:
+                _quietly(camera.choose, name, first)
+
+
+def _is_offered(camera: Evaluated, conditions: Iterable[str]) -> bool:
+    return all(_got(camera, condition) != 0 for condition in conditions if condition in camera.file)
+
+
+def reach(camera: Evaluated, name: str, value: float, spared: Collection[str] = ()) -> bool:
+    """Make a node evaluate to `value`, through its converters or by trying its registers but those spared; whether it
+    does."""
+    if _is(camera, name, value):
+        return True
+    own = [register for register in camera.file.registers(name) if register not in spared]
+    if not own:  # a constant of the file
+        return False
+    _quietly(camera.set, name, value)
+    if _is(camera, name, value):
+        return True
+    if any(_tried(camera, name, register, value) for register in own):
+        return True
+    for register in own:  # a formula may divide by one that is zero
+        if _got(camera, register) == 0:
+            _quietly(camera.set, register, _A_DIVISOR)
+    _quietly(camera.set, name, value)
+    return _is(camera, name, value) or any(_tried(camera, name, register, value) for register in own)
+
+
+def _tried(camera: Evaluated, name: str, register: str, value: float) -> bool:
+    """Try one register: the value itself, then where a rising or falling formula meets it."""
+    before = _got(camera, register)
+    if before is None:
+        return False
+    _quietly(camera.set, register, value)
+    if _is(camera, name, value):
+        return True
+    low, high = 1.0, _LARGEST_RAW  # not 0, by which a formula may divide
+    ends = [_with(camera, register, end, name) for end in (low, high)]
+    if ends[1] is None or ends[1] == ends[0]:  # a register of fewer bits takes no more
+        while high > 1 and (ends[1] is None or ends[1] == ends[0]):
+            high = (high - 1) / 2
+            ends[1] = _with(camera, register, high, name)
+    if None not in ends:
+        rises = (ends[1] or 0.0) > (ends[0] or 0.0)
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            found = _with(camera, register, middle, name)
+            if found is None or _is(camera, name, value):
+                break
+            low, high = (middle, high) if (found < value) == rises else (low, middle)
+        if _nearest(camera, name, value):
+            return True
+    _quietly(camera.set, register, before)
+    return False
+
+
+def _make_true(camera: Evaluated, condition: str) -> None:
+    """Make a condition hold, by as few registers as will do."""
+    if condition not in camera.file or (_got(camera, condition) or 0) != 0:
+        return
+    registers = camera.file.registers(condition)
+    choices: list[tuple[str, ...]] = [*((register,) for register in registers), registers]
+    for chosen in choices:
+        before = [int(_got(camera, register) or 0) for register in chosen]
+        for bits in (1, *(1 << bit for bit in range(31, 0, -1)), _ALL_BITS):
+            for register, was in zip(chosen, before, strict=True):
+                _quietly(camera.set, register, was | bits)  # other conditions are bits of the same register
+            if (_got(camera, condition) or 0) != 0:
+                return
+        for register, was in zip(chosen, before, strict=True):
+            _quietly(camera.set, register, was)
+
+
+def _conditions(camera: Evaluated, names: Iterable[str]) -> Iterator[str]:
+    """Of everything a camera is used for, entries and limits included."""
+    file = camera.file
+    for name in names:
+        if name not in file:
+            continue
+        yield from file.conditions(name)
+        for entry, conditions in (file.entries(name) if file.kind(name) == "Enumeration" else {}).items():
+            if entry in ENTRIES.get(name, ()):
+                yield from conditions
+
+
+def _with(camera: Evaluated, register: str, raw: float, name: str) -> float | None:
+    _quietly(camera.set, register, raw)
+    return _got(camera, name)
+
+
+def _nearest(camera: Evaluated, name: str, value: float) -> bool:
+    """Whether bisection came as near as a register's steps allow."""
+    found = _got(camera, name)
+    return found is not None and math.isclose(found, value, rel_tol=_NEAR_ENOUGH)
+
+
+def _is(camera: Evaluated, name: str, value: float) -> bool:
+    found = _got(camera, name)
+    return found is not None and math.isclose(found, value, rel_tol=_NEAR, abs_tol=1e-9)
+
+
+def _got(camera: Evaluated, name: str) -> float | None:
+    """The node's value; None when it cannot be evaluated (a register at an address that nothing stands for)."""
+    try:
+        return camera.get(name)
+    except AravisError:
+        return None
+
+
+def _quietly(write: Callable[..., None], *arguments: object) -> None:
+    try:
+        write(*arguments)
+    except AravisError:
+        return

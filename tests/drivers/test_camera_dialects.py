@@ -1,0 +1,152 @@
+"""Cameras of other makes: the simulated camera shows another camera's GenICam file, and the driver gets along with it,
+or refuses it by the name of what is missing. Small files of our own are always tried; `$GENICAM` is a folder of real
+ones (27 of 12 makes: etc/genicam of the public repository areaDetector/aravisGigE)."""
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.devices.camera_gige import Camera
+from drivers.sim.camera import FakeCamera
+from drivers.sim.genicam_file import GenicamFile, read_genicam
+from drivers.wires.camera_settings import GigeCameraSettings
+from foundation.clock import WallClock
+from foundation.errors import ConfigError, Refused
+from foundation.readings import Quality
+from tests.addresses import camera_address
+from tests.dialects import DIALECTS, HEIGHT, WIDTH, Dialect
+from tests.system.conftest import require_aravis
+
+ADDRESS = camera_address()
+FOLDER = os.environ.get("GENICAM", "")
+
+
+class Plant:
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.sensor_degC, self.body_degC = 41.5, 33.0
+        self.camera_powered, self.camera_power_on_ns = True, 0
+
+    def advance(self, now_ns: int) -> None:
+        pass
+
+
+def scene(rows: int, width: int) -> NDArray[np.uint8]:
+    y, x = np.mgrid[:rows, :width]
+    return ((x + 3 * y) % 251).astype(np.uint8)
+
+
+@contextmanager
+def dressed(file: GenicamFile, size_px: tuple[int, int] = (WIDTH, HEIGHT)) -> Iterator[None]:
+    def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
+        return scene(rows, size_px[0])
+
+    camera = FakeCamera(
+        Plant(), WallClock(), render, ADDRESS, "SN1", size_px=size_px, real_time=True, boot_s=0, genicam=file
+    )
+    camera.start()
+    try:
+        yield
+    finally:
+        camera.close()
+
+
+@asynccontextmanager
+async def opened(**changes: object):
+    usual = {"address": ADDRESS, "exposure_s": 0.01, "packet_size": 1500}
+    camera = Camera("eye", GigeCameraSettings.model_validate({**usual, **changes}), WallClock())
+    try:
+        await camera.open()
+        yield camera
+    finally:
+        await camera.close()
+
+
+def of(dialect: Dialect, name: str) -> GenicamFile:
+    require_aravis()
+    return GenicamFile(dialect.xml(name), name)
+
+
+@pytest.mark.parametrize("name", [name for name, dialect in DIALECTS.items() if not dialect.missing])
+async def test_a_camera_that_has_what_is_needed_is_set_and_grabs(name: str):
+    dialect = DIALECTS[name]
+    with dressed(of(dialect, name)):
+        async with opened(**dict(dialect.settings)) as camera:
+            frame = await camera.grab()
+            (reading,) = await camera.read()
+            features = camera.effective.features
+            used = (features["exposure"], features["gain"], features["trigger"] or features["frame_rate"])
+            place = (await camera.temperature_place()).partition(";")[0]
+            assert camera.identity.vendor == "Dialects"
+    expected = scene(HEIGHT, WIDTH).astype(np.uint16) * (1 if frame.image.dtype == np.uint8 else 16)
+    assert (frame.image == expected).all()
+    assert frame.exposure_s == pytest.approx(0.01, rel=1e-3)
+    assert (", ".join(used), place) == (dialect.used, dialect.temperature)
+    if dialect.temperature:
+        assert reading.value == pytest.approx(41.5, abs=0.6)  # some show whole degrees
+    else:
+        assert reading.quality is Quality.BAD
+
+
+@pytest.mark.parametrize("name", [name for name, dialect in DIALECTS.items() if dialect.missing])
+async def test_a_camera_that_lacks_something_is_refused_by_its_name(name: str):
+    dialect = DIALECTS[name]
+    with dressed(of(dialect, name)), pytest.raises(Refused) as refused:
+        async with opened(**dict(dialect.settings)):
+            pass
+    assert dialect.missing in str(refused.value)
+
+
+async def test_a_region_is_what_is_asked_for_and_a_new_exposure_is_taken():
+    with dressed(of(DIALECTS["abs"], "abs")):
+        async with opened(width_px=32, height_px=16) as camera:
+            frame = await camera.grab(0.02)
+    assert (frame.image == scene(HEIGHT, WIDTH)[:16, :32]).all()
+    assert frame.exposure_s == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (b"no camera at all", "is no GenICam file"),
+        (b"<RegisterDescription", "is no GenICam file"),
+        (b"<html></html>", "it begins with <html>, not <RegisterDescription>"),
+    ],
+)
+def test_what_is_no_genicam_file_is_refused_with_a_sentence(text: bytes, sentence: str, tmp_path: Path):
+    path = tmp_path / "camera.xml"
+    path.write_bytes(text)
+    with pytest.raises(ConfigError, match=sentence):
+        read_genicam(path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_genicam(tmp_path / "none.xml")
+
+
+# Of the makes that are known: what is missing from those that cannot be used.
+REFUSED = {
+    "JAI_RM-6740GE": "no ExposureTime and no ExposureTimeAbs and no ExposureTimeRaw",
+    "Photonic_Science_FDI3": "its ExposureTimeRaw states no unit; give exposure_step_s",
+    "Photonic_Science_LC_SCMOS": "its ExposureTimeRaw states no unit; give exposure_step_s",
+    "Sony_CVC_EH6300": "no PixelFormat Mono8",
+}
+
+
+@pytest.mark.skipif(not FOLDER, reason="$GENICAM names no folder of GenICam files")
+@pytest.mark.parametrize("path", sorted(Path(FOLDER).glob("*.xml")) if FOLDER else [], ids=lambda path: path.stem)
+async def test_real_files_open_and_grab_or_are_refused_by_the_name_of_what_is_missing(path: Path):
+    require_aravis()
+    with dressed(read_genicam(path), (640, 480)):
+        if path.stem in REFUSED:
+            with pytest.raises(Refused, match=REFUSED[path.stem]):
+                async with opened():
+                    pass
+            return
+        async with opened() as camera:
+            frame = await camera.grab()
+    assert (frame.image[:480, :640] == scene(480, 640)[: frame.image.shape[0], : frame.image.shape[1]]).all()
