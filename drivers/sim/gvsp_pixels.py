@@ -18,7 +18,7 @@ def encoded(image: NDArray[np.uint8], pixel_format: PixelFormat) -> bytes:
         return (image.astype("<u2") << _BITS[pixel_format] - 8).astype("<u2").tobytes()
     if pixel_format in _IN_THREE_BYTES:
         bits = _IN_THREE_BYTES[pixel_format]
-        return _in_three_bytes(image.reshape(-1).astype(np.uint16) << bits - 8, bits)
+        return _in_three_bytes((image.reshape(-1).astype(np.uint16) << bits - 8).astype(np.uint16), bits)
     if pixel_format in _GAPLESS:
         bits = _GAPLESS[pixel_format]
         values = image.reshape(-1, 1).astype(np.uint16) << bits - 8

@@ -4,7 +4,7 @@ ones (27 of 12 makes: etc/genicam of the public repository areaDetector/aravisGi
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 
@@ -31,7 +31,8 @@ class Plant:
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.sensor_degC, self.body_degC = 41.5, 33.0
-        self.camera_powered, self.camera_power_on_ns = True, 0
+        self.camera_powered = True
+        self.camera_power_on_ns: int | None = 0
 
     def advance(self, now_ns: int) -> None:
         pass
@@ -43,7 +44,7 @@ def scene(rows: int, width: int) -> NDArray[np.uint8]:
 
 
 @contextmanager
-def dressed(file: GenicamFile, size_px: tuple[int, int] = (WIDTH, HEIGHT)) -> Iterator[None]:
+def dressed(file: GenicamFile, size_px: tuple[int, int] = (WIDTH, HEIGHT)) -> Generator[None]:
     def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
         return scene(rows, size_px[0])
 

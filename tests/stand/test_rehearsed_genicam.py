@@ -1,0 +1,36 @@
+"""A camera's GenICam file before the camera is there: which features would be used, or which one is missing."""
+
+from pathlib import Path
+
+import pytest
+
+from foundation.errors import ConfigError
+from stand.commissioning.genicam import rehearse
+from tests.dialects import DIALECTS
+from tests.system.conftest import require_aravis
+
+
+async def test_a_file_tells_which_features_would_be_used(tmp_path: Path):
+    require_aravis()
+    file = tmp_path / "abs.xml"
+    file.write_bytes(DIALECTS["abs"].xml("abs"))
+    told = await rehearse(file)
+    assert (told.camera, told.refusal) == ("Dialects abs", "")
+    assert told.features["exposure"] == "ExposureTimeAbs"
+    assert told.features["temperature"].startswith("TemperatureAbs of TemperatureSelector 'Sensorboard'")
+    assert told.features["frame"].startswith("2448 x 2048 px, Mono8")
+
+
+async def test_a_file_that_lacks_something_says_what(tmp_path: Path):
+    require_aravis()
+    file = tmp_path / "none.xml"
+    file.write_bytes(DIALECTS["no exposure"].xml("none"))
+    told = await rehearse(file)
+    assert "the camera has no ExposureTime" in told.refusal
+
+
+async def test_what_is_no_genicam_file_is_refused(tmp_path: Path):
+    file = tmp_path / "other.xml"
+    file.write_text("<html/>")
+    with pytest.raises(ConfigError, match="is no GenICam file"):
+        await rehearse(file)
