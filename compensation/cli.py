@@ -29,6 +29,7 @@ app = lazy_app(
         "budget": Lazy("compensation.commands.budget_cli", "The stand's error budget, in um and px."),
         "schema": Lazy("compensation.commands.schema_cli", "JSON Schemas of geometries and details, for editors."),
     },
+    has_completion=True,
 )
 
 

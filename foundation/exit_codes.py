@@ -3,12 +3,14 @@ and recorded but could not be reported, 130 interrupted."""
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Generator
 from contextlib import contextmanager
 
 import typer
 
 from foundation.errors import ConfigError, StandError
+from foundation.output import output
 from foundation.usage import tell
 
 FAILED = 1
@@ -23,13 +25,20 @@ def one_line_errors() -> Generator[None]:
     try:
         yield
     except ConfigError as error:
-        tell(error)
+        _tell(error)
         raise typer.Exit(BAD_INPUT) from error
     except BrokenPipeError:  # the reader of our output has closed it; typer ends quietly
         raise
     except (StandError, OSError) as error:
-        tell(error)
+        _tell(error)
         raise typer.Exit(FAILED) from error
     except KeyboardInterrupt as error:
         typer.echo("interrupted", err=True)
         raise typer.Exit(INTERRUPTED) from error
+
+
+def _tell(error: BaseException) -> None:
+    """Its sentence; with -v where it came from first."""
+    if output().verbose:
+        typer.echo("".join(traceback.format_exception(error)), err=True, nl=False)
+    tell(error)

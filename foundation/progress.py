@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn,
 from rich.text import Text
 
 from foundation.clock import NS_PER_S, WallClock
+from foundation.output import output
 
 # Plain output: a line each time this share of the work is done, so that a log stays readable.
 _PLAIN_STEP = 0.1
@@ -30,7 +31,9 @@ class Report(Protocol):
 @contextmanager
 def progress(title: str, total: float) -> Generator[Report]:
     """Show progress of `title` on standard error while inside; `total` in any unit."""
-    if sys.stderr.isatty():
+    if output().quiet:
+        yield lambda done, text: None
+    elif sys.stderr.isatty():
         with _bar(title, total) as report:
             yield report
     else:
@@ -46,6 +49,9 @@ def unwatched(title: str, total: float) -> Generator[Report]:
 @contextmanager
 def late_progress(title: str, total: float) -> Generator[Report]:
     """As `progress`, but shown only once the work has taken a while."""
+    if output().quiet:
+        yield lambda done, text: None
+        return
     with ExitStack() as stack:
         yield _Late(title, total, stack)
 

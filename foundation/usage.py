@@ -41,8 +41,9 @@ class Lazy(NamedTuple):
     help: str
 
 
-def lazy_app(help_text: str, commands: Mapping[str, Lazy]) -> typer.Typer:
-    """A command line whose commands are listed without being imported: their libraries take seconds."""
+def lazy_app(help_text: str, commands: Mapping[str, Lazy], *, has_completion: bool = False) -> typer.Typer:
+    """A command line whose commands are listed without being imported: their libraries take seconds. has_completion:
+    of a program, whose shell may complete its commands and their options."""
 
     class Commands(OneLineUsage):
         """Imports the command that is given."""
@@ -56,22 +57,24 @@ def lazy_app(help_text: str, commands: Mapping[str, Lazy]) -> typer.Typer:
                 self.commands[args[0]] = _imported(commands[args[0]].module, args[0])
             return super().resolve_command(ctx, args)
 
-    app = typer.Typer(cls=Commands, no_args_is_help=True, add_completion=False, help=help_text)
+    app = typer.Typer(cls=Commands, no_args_is_help=True, add_completion=has_completion, help=help_text)
     app.callback()(_root)  # typer refuses an application with neither commands nor a callback
     return app
 
 
-def _show_version(asked: bool) -> None:
+def show_version(asked: bool) -> None:
+    """The callback of --version."""
     if asked:
         typer.echo(f"thermostand {importlib.metadata.version('thermostand')}")
         raise typer.Exit
 
 
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", help="Show the version and end.", is_eager=True, callback=_show_version)
-    ] = False,
-) -> None:
+VersionOption = Annotated[
+    bool, typer.Option("--version", help="Show the version and end.", is_eager=True, callback=show_version)
+]
+
+
+def _root(version: VersionOption = False) -> None:
     """What both command lines take before a command."""
 
 

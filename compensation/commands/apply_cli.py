@@ -23,15 +23,17 @@ from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
 from compensation.history.history import recorded_history, states_at
 from compensation.history.states import States
+from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, whole_file
+from foundation.output import say, show
 from foundation.progress import progress
 from markers.image_file import read_image
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")]
 CameraOption = Annotated[
@@ -92,6 +94,7 @@ def apply_model(
             image = read_image(source)
             write_image(out, corrected_image(image, used, states), form, image.dtype)
             _warn(middle_flags(used, states))
+        show({"out": out}, ())
 
 
 def _of_image(
@@ -150,8 +153,7 @@ def export_model(
         written = [] if out is None else [*export(used, out)]
         written += [] if c is None else [export_c(used, c)]
         written += [] if ros2 is None else [*export_ros2(used, ros2)]
-        for path in written:
-            typer.echo(path)
+        show(written, written)
 
 
 def _refuse(*options: tuple[str, object], why: str) -> None:
@@ -178,7 +180,7 @@ def _correct_points(
     write_corrected(out, rows, xy_px, model, states)
     outside = int((model.flags(xy_px, states) != 0).sum())
     if outside:
-        typer.echo(f"warning: {outside} of {len(rows)} points are outside the model's valid range", err=True)
+        say(f"warning: {outside} of {len(rows)} points are outside the model's valid range")
 
 
 def _without_history(model: DriftModel) -> DriftModel:
@@ -191,10 +193,9 @@ def _without_history(model: DriftModel) -> DriftModel:
             f"a model of the form {model.form} needs the thermal state, which is not known here; give --session"
         )
     left, usual = (" and ".join(f"{px:.3f}" for px in one.discrepancy_px) for one in (model.other, model))
-    typer.echo(
+    say(
         f"the camera's temperature alone: corrected with the paper's form of the model ({model.other.title}), which "
-        f"leaves {left} px along x and y; with the history of a session (--session) the thermal form leaves {usual} px",
-        err=True,
+        f"leaves {left} px along x and y; with the history of a session (--session) the thermal form leaves {usual} px"
     )
     return model.other
 
@@ -250,4 +251,4 @@ def _selected(frames: str | None, count: int) -> range:
 
 def _warn(flags: int) -> None:
     if flags:
-        typer.echo(f"warning: outside the model's valid range ({outside_text(flags)})", err=True)
+        say(f"warning: outside the model's valid range ({outside_text(flags)})")

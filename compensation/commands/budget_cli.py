@@ -12,12 +12,14 @@ from compensation.budget.budget import Budget, budget, table
 from compensation.budget.geometry import load_geometry
 from compensation.commands.options import Incomplete, TargetOption, named_target, said_if
 from compensation.observations import session_target
+from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
+from foundation.output import show
 from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 
 @app.command("budget")
@@ -34,7 +36,8 @@ def budget_of_session(
     with one_line_errors():
         stand = load_geometry(geometry)
         recorded = open_whole(session, said_if(incomplete))
-        typer.echo(table(budget(recorded, named_target(target) or session_target(recorded), stand)))
+        found = budget(recorded, named_target(target) or session_target(recorded), stand)
+        show(found, [table(found)])
 
 
 def budgets_of_sessions(paths: Sequence[Path], geometry: str, target: Target | None) -> dict[str, Budget]:

@@ -17,14 +17,16 @@ from compensation.calibration.stages import TableSigma
 from compensation.commands.options import Incomplete, TargetOption, named_target, said_if
 from compensation.observations import session_target
 from compensation.reporting.calibration_report import report_page
+from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable, check_writable, write_whole
+from foundation.output import show
 from foundation.progress import progress
 from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 _TABLE = TableSigma()
 
@@ -73,7 +75,7 @@ def calibrate_session(
             write_exports(export, file.lens, file.camera_serial or "camera", file.fit.rms_px)
         if report is not None:
             write_whole(report, report_page(file, found))
-        typer.echo(summary(file, used))
+        show(file.model_dump(mode="json"), [summary(file, used)])
 
 
 def summary(file: CameraFile, target: Target) -> str:

@@ -24,12 +24,14 @@ from compensation.drift.model_file import load_model
 from compensation.reporting.datasheet_page import datasheet_json, datasheet_page
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.pdf import pdf_of
+from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, write_whole, write_whole_bytes
+from foundation.output import show
 from recording.reading.session import Session
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 _FORMATS = (".html", ".pdf", ".json")
 
@@ -70,4 +72,5 @@ def write_datasheet(
         else:
             write_whole(out, datasheet_page(sheet, equipment))
         known = sum(one.value == one.value for one in sheet.quantities)
-        typer.echo(f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)")
+        line = f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)"
+        show({"file": out, "quantities": sheet.quantities}, [line])

@@ -16,10 +16,12 @@ from compensation.commands.options import (
     said_if,
 )
 from compensation.observations import read_frames, session_target
+from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from foundation.output import say, show
 from foundation.progress import Report, late_progress
 from foundation.usage import one_line
 from markers.detection import Detection, DetectionError, Image, detect, nothing_found
@@ -29,7 +31,7 @@ from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 MegapixelsOption = Annotated[
     float, typer.Option("--max-megapixels", min=0.001, max=2000.0, help="Larger images are refused, unread.")
@@ -60,10 +62,9 @@ def detect_images(
         failures: list[str] = []
         with late_progress("find markers", sum(_count(source) for source in opened)) as report:
             write_detections(out, chosen, _detections(opened, chosen, failures, report))
-        typer.echo(CENTRES)
-        typer.echo(chosen.orientation)
+        show({"table": out, "target": chosen.name, "not_found": failures}, [CENTRES, chosen.orientation])
         for failure in failures:
-            typer.echo(f"not found in {one_line(failure)}", err=True)
+            say(f"not found in {failure}")
 
 
 def _open(path: Path, incomplete: bool) -> Session | Path:

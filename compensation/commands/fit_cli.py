@@ -21,24 +21,34 @@ from compensation.commands.options import (
     named_target,
 )
 from compensation.datasheet.details import load_details
+from compensation.drift.bump import Bump
 from compensation.drift.choosing import Form, check_request
 from compensation.drift.choosing import fit as fit_model
-from compensation.drift.evaluation import evaluate, table
+from compensation.drift.evaluation import Evaluation, evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
 from compensation.drift.unrepeated import Cause, find_unrepeated
 from compensation.observations import Observations
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
-from compensation.reporting.report import NoModel, can_be_scored, check_report_writable, fitted, write_report
+from compensation.reporting.report import (
+    NoModel,
+    can_be_scored,
+    check_report_writable,
+    fitted,
+    numbers_path,
+    write_report,
+)
 from compensation.reporting.table_positions import table_positions
 from compensation.validation3d.reading import load_validation
+from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
+from foundation.output import show
 from recording.reading.session import Session
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of recorded sessions.")]
 DegreeOption = Annotated[
@@ -85,15 +95,31 @@ def fit(
         model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
         save_model(model, out)
-        typer.echo(f"{model.form}: {model.title}")
-        for bump in model.facts.bumps:
-            utc = next(facts.utc for facts in observations.sessions if facts.session_id == bump.session_id)
-            when = f"{utc.date_time(bump.after_ns)} and {utc.date_time(bump.before_ns)}"
-            typer.echo(f"bump in {bump.session_id} between {when}: {bump.text}; fitted around it")
-        for one in find_unrepeated(observations, model.facts.bumps):
-            if one.cause is not Cause.NOTHING:
-                typer.echo(f"{one.session_id}: {one.text}")
-        typer.echo(table(evaluation))
+        bumps = list(model.facts.bumps)
+        unrepeated = find_unrepeated(observations, model.facts.bumps)
+        told = [one for one in unrepeated if one.cause is not Cause.NOTHING]
+        data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
+        stepped = [_bump_line(each, observations) for each in bumps]
+        stepped += [f"{one.session_id}: {one.text}" for one in told]
+        lines = [f"{model.form}: {model.title}", *stepped, table(evaluation)]
+        show({**data, "unrepeated": told, **_scores(evaluation)}, lines)
+
+
+def _bump_line(bump: Bump, observations: Observations) -> str:
+    utc = next(facts.utc for facts in observations.sessions if facts.session_id == bump.session_id)
+    when = f"{utc.date_time(bump.after_ns)} and {utc.date_time(bump.before_ns)}"
+    return f"bump in {bump.session_id} between {when}: {bump.text}; fitted around it"
+
+
+def _scores(evaluation: Evaluation) -> dict[str, object]:
+    """What compensation gains, for programs; RMS along x and y, px."""
+    return {
+        "method": evaluation.method,
+        "frames": evaluation.frames,
+        "rms_before_px": evaluation.rms_before_px,
+        "rms_after_px": evaluation.rms_after_px,
+        "coverage_95": evaluation.coverage_95,
+    }
 
 
 def _of_table(paths: list[Path]) -> Observations:
@@ -150,4 +176,6 @@ def report(
         if refusal:
             raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
         alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
-        typer.echo(alone if evaluation is None else table(evaluation))
+        scores = {} if evaluation is None else _scores(evaluation)
+        data = {"report": out, "numbers": numbers_path(out), **scores}
+        show(data, [alone if evaluation is None else table(evaluation)])

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from foundation.errors import ConfigError
-from foundation.usage import one_line
+from foundation.output import say
 from markers.target import Target, load_target
 
 TargetOption = Annotated[
@@ -53,4 +53,4 @@ def named_target(name: str | None) -> Target | None:
 
 def said_if(incomplete: bool) -> Callable[[str], None] | None:
     """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
-    return (lambda text: typer.echo(one_line(f"warning: {text}"), err=True)) if incomplete else None
+    return (lambda text: say(f"warning: {text}")) if incomplete else None

@@ -16,17 +16,18 @@ from compensation.calibration.pinhole import NAMES
 from compensation.calibration.view_uncertainty import in_words
 from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
 from compensation.commands.options import installed_target
+from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from foundation.output import say, show
 from foundation.progress import Report, progress
-from foundation.usage import one_line
 from markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
 from markers.detection import DetectionError, Image, detect
 from markers.image_file import read_image
 from markers.target import Target
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 
 @app.command("calibrate-photographs")
@@ -62,12 +63,16 @@ def calibrate_photographs(
         with progress("find markers", len(images)) as report:
             views = _views(images, board, failures, report)
         for failure in failures:
-            typer.echo(f"not used: {one_line(failure)}", err=True)
+            say(f"not used: {failure}")
         known = board_of(board) if isinstance(board, Target) else board_of_corners(board)
         found = calibrate_views(views, known)
         write_exports(export, found.scene.lens, "camera", found.rms_px)
         at_mm = distance_mm or float(np.mean(found.scene.translations_mm[:, 2]))
-        typer.echo(summary(found, views, cross_validated_px(views, known), at_mm, board))
+        held_out_px = cross_validated_px(views, known)
+        lens = dict(zip(NAMES, found.scene.lens.vector, strict=False))
+        data = {"lens": lens, "lens_sigma": found.lens_sigma, "rms_px": found.rms_px, "held_out_px": held_out_px}
+        more = {"discrepancy_px": found.discrepancy_px, "not_used": failures, "exports": export}
+        show({**data, **more}, [summary(found, views, held_out_px, at_mm, board)])
 
 
 def summary(

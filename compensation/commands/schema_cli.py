@@ -12,12 +12,14 @@ from pydantic import BaseModel
 
 from compensation.budget.geometry import Geometry
 from compensation.datasheet.details import Details
+from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
+from foundation.output import show
 from foundation.schemas import write_schemas
 
 DOCUMENTS: Mapping[str, type[BaseModel]] = {"geometry": Geometry, "details": Details}
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 
 @app.command("schema")
@@ -33,5 +35,5 @@ def schema(
     """
     with one_line_errors():
         installed = Path(str(importlib.resources.files("configs"))) / "schema"
-        for path in write_schemas(out or installed, DOCUMENTS):
-            typer.echo(path)
+        written = list(write_schemas(out or installed, DOCUMENTS))
+        show(written, written)

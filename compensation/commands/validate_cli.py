@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -26,12 +27,14 @@ from compensation.validation3d.positions import validation_frames
 from compensation.validation3d.stand_part import StandPart, stand_part
 from compensation.validation3d.summary import summary
 from compensation.validation3d.validation import LensModel, camera_of, check_same, validate
+from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, write_whole
+from foundation.output import show
 from recording.reading.session import Session
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 
 @app.command("validate")
@@ -77,7 +80,7 @@ def validate_session(
         found = validate(observations, frames, camera_of(file, lens), drift, stand_at)
         write_whole(out, validation_page(found))
         write_whole(beside, as_json(found))
-        typer.echo(summary(found))
+        show(json.loads(as_json(found)), [summary(found)])
 
 
 def _numbers_beside(page: Path) -> Path:

@@ -6,11 +6,13 @@ from typing import Annotated
 
 import typer
 
+from foundation.command_app import App
 from foundation.errors import ConfigError, StandError
 from foundation.exit_codes import one_line_errors
-from foundation.usage import OneLineUsage, one_line
+from foundation.output import show
+from foundation.usage import one_line
 
-app = typer.Typer(cls=OneLineUsage, no_args_is_help=True, add_completion=False)
+app = App(no_args_is_help=True)
 _LIMIT_S = 20.0
 
 
@@ -49,4 +51,5 @@ def try_them(
         if failures:
             raise StandError(f"{len(failures)} of {len(found.urls) + bool(found.alive_url)} were not reached")
         alive = ", and the sign of life was taken" if found.alive_url else "; no alive_url is given"
-        typer.echo(f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}")
+        told = f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}"
+        show({"receivers": len(found.urls), "alive": bool(found.alive_url)}, [told])

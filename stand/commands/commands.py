@@ -39,4 +39,5 @@ app = lazy_app(
             "Recorded sessions: list, look at, verify, salvage, replay, export, trim.",
         ),
     },
+    has_completion=True,
 )

@@ -7,20 +7,19 @@ from typing import Annotated
 
 import typer
 
+from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import write_whole
+from foundation.output import say, show
 from foundation.schemas import write_schemas
-from foundation.usage import OneLineUsage
 from stand.config.migration import migrated
 from stand.config.schemas import DOCUMENTS
 from stand.config.stand_config import packaged
 
-app = typer.Typer(
-    cls=OneLineUsage,
+app = App(
     no_args_is_help=True,
-    add_completion=False,
     help="Configuration files: JSON Schemas for editors, and files of older versions.\n\n"
     "Example: stand config migrate my-stand.yaml",
 )
@@ -41,7 +40,7 @@ def migrate(
         text = read_document(file)
         found = migrated(text, str(file))
         if found is None:
-            typer.echo(f"{file}: has today's form already; nothing was written")
+            show({"file": None}, [f"{file}: has today's form already; nothing was written"])
             return
         place = out or file.resolve()
         if out is None:
@@ -50,9 +49,10 @@ def migrate(
                 raise ConfigError(f"{kept}: is there already; move it away, or name another place with --out")
             write_whole(kept, text)
         write_whole(place, found.text)
-        typer.echo(place)
-        for section in found.without_comments_of:
-            typer.echo(f"comments were not kept in: {section}", err=True)
+        lost = list(found.without_comments_of)
+        show({"file": place, "without_comments": lost}, [place])
+        for section in lost:
+            say(f"comments were not kept in: {section}")
 
 
 @app.command()
@@ -67,5 +67,5 @@ def schema(
     Example: stand config schema --out schema
     """
     with one_line_errors():
-        for path in write_schemas(out or packaged("", "simulated").parent / "schema", DOCUMENTS):
-            typer.echo(path)
+        written = list(write_schemas(out or packaged("", "simulated").parent / "schema", DOCUMENTS))
+        show(written, written)

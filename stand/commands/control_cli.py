@@ -14,24 +14,18 @@ from typing import Annotated, cast
 
 import typer
 
+from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.instants import duration, local_text
+from foundation.output import output, show
 from foundation.usage import one_line
-from stand.commands.reached import (
-    ConfigOption,
-    DirectoryArgument,
-    JsonOption,
-    TokenOption,
-    UrlOption,
-    reached,
-)
+from stand.commands.reached import on_stand
 from stand.commands.session_text import size
 from stand.gate import INTERLOCK, OPERATOR
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import RunStatus, StandState
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 StepArgument = Annotated[str, typer.Argument(metavar="STEP", help="Its number in `stand status --plan`, or its id.")]
 _WATCH_S = 2.0
@@ -39,12 +33,9 @@ _LABEL = 14
 
 
 @app.command()
+@on_stand(anywhere=True)
 def status(
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
+    server: Server,
     plan: Annotated[bool, typer.Option("--plan", help="The steps of the plan in force, and where they are.")] = False,
 ) -> None:
     """What the running session is doing: step, state, expected end, temperatures, frames, disk, last warning.
@@ -53,54 +44,42 @@ def status(
 
     Example: stand status /data/sessions
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file, anywhere=True)
-        if plan:
-            _show_plan(server, as_json=as_json)
-            return
-        _show(server, server.state(), as_json=as_json)
+    if plan:
+        _show_plan(server)
+        return
+    _show(server, server.state())
 
 
 @app.command()
-def watch(
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
-) -> None:
+@on_stand(anywhere=True)
+def watch(server: Server) -> None:
     """What happens, as it happens, above a panel with step, temperatures, frames, disk and end; without a terminal a
     line a minute. With --json the events, one a line. Ctrl-C ends watching, not the run.
 
     Example: stand watch
     """
-    with one_line_errors():
-        from stand.watching.live import view
-        from stand.watching.there import There, event_line
+    from stand.watching.live import view
+    from stand.watching.there import There, event_line
 
-        server = reached(directory, config, url, token_file, anywhere=True)
-        there = There(server)
-        with suppress(KeyboardInterrupt):
-            if as_json:
-                while True:
-                    for event in there.events():
-                        typer.echo(json.dumps(event))
-                    threading.Event().wait(_WATCH_S)
-            with view() as shown:
-                while True:
-                    for event in there.events():
-                        shown.tell(event_line(event))
-                    shown.show(there.moment(server.state()))
-                    threading.Event().wait(_WATCH_S)
+    there = There(server)
+    with suppress(KeyboardInterrupt):
+        if output().as_json:
+            while True:
+                for event in there.events():
+                    typer.echo(json.dumps(event))
+                threading.Event().wait(_WATCH_S)
+        with view() as shown:
+            while True:
+                for event in there.events():
+                    shown.tell(event_line(event))
+                shown.show(there.moment(server.state()))
+                threading.Event().wait(_WATCH_S)
 
 
 @app.command()
+@on_stand()
 def pause(
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
+    server: Server,
     at_next_step: Annotated[
         bool, typer.Option("--at-next-step", help="When the step under way is done, not before the next action.")
     ] = False,
@@ -112,137 +91,90 @@ def pause(
 
     Example: stand pause && stand continue
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file)
-        answer = server.order("pause", {"when": "step" if at_next_step else "now"})
-        moving = cast("list[str]", answer.get("moving", []))
-        when = "pauses when the step under way is done" if at_next_step else "paused"
-        _say(server, answer, f"{when}; `stand continue` ends the pause; {_moving(moving)}", as_json=as_json)
+    answer = server.order("pause", {"when": "step" if at_next_step else "now"})
+    moving = cast("list[str]", answer.get("moving", []))
+    when = "pauses when the step under way is done" if at_next_step else "paused"
+    _say(server, answer, f"{when}; `stand continue` ends the pause; {_moving(moving)}")
 
 
 @app.command("continue")
-def continue_(
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
-) -> None:
+@on_stand()
+def continue_(server: Server) -> None:
     """End a pause.
 
     Example: stand continue sessions/20260101T180000Z-thermal-cycle
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file)
-        answer = server.order("continue")
-        _say(server, answer, _still(answer), as_json=as_json)
+    answer = server.order("continue")
+    _say(server, answer, _still(answer))
 
 
 @app.command()
-def clear(
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
-) -> None:
+@on_stand()
+def clear(server: Server) -> None:
     """Continue a run that an interlock holds, once you have removed the cause.
 
     Example: stand clear
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file)
-        answer = server.order("clear")
-        _say(server, answer, f"cleared; {_still(answer)}", as_json=as_json)
+    answer = server.order("clear")
+    _say(server, answer, f"cleared; {_still(answer)}")
 
 
 @app.command()
+@on_stand()
 def skip(
+    server: Server,
     step: StepArgument,
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
 ) -> None:
     """Leave a step out; a soak, capture, cool-down or prompt under way is broken off.
 
     Example: stand skip 12
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file)
-        answer = server.order("skip", {"step_id": _step_id(server, step)})
-        _say(server, answer, f"step {step} is left out", as_json=as_json)
+    answer = server.order("skip", {"step_id": _step_id(server, step)})
+    _say(server, answer, f"step {step} is left out")
 
 
 @app.command()
+@on_stand()
 def extend(
+    server: Server,
     step: StepArgument,
     minutes: Annotated[float, typer.Argument(help="So much longer, in minutes.")],
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
 ) -> None:
     """Soak for longer in a step.
 
     Example: stand extend 12 30
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file)
-        answer = server.order("extend", {"step_id": _step_id(server, step), "by_s": 60.0 * minutes})
-        _say(server, answer, f"step {step} takes {minutes:g} min longer", as_json=as_json)
+    answer = server.order("extend", {"step_id": _step_id(server, step), "by_s": 60.0 * minutes})
+    _say(server, answer, f"step {step} takes {minutes:g} min longer")
 
 
 @app.command()
-def stop(
-    directory: DirectoryArgument = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
-) -> None:
+@on_stand(anywhere=True)
+def stop(server: Server) -> None:
     """Make the stand safe and end the run, as Ctrl-C does.
 
     Example: stand stop
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file, anywhere=True)
-        answer = server.order("stop")
-        _say(server, answer, str(answer["text"]), as_json=as_json)
+    answer = server.order("stop")
+    _say(server, answer, str(answer["text"]))
 
 
-def _say(server: Server, answer: Mapping[str, object], text: str, *, as_json: bool) -> None:
-    typer.echo(json.dumps(dict(answer), indent=2) if as_json else f"{server.name}: {text}")
+def _say(server: Server, answer: Mapping[str, object], text: str) -> None:
+    show(dict(answer), [f"{server.name}: {text}"])
 
 
-def _show(server: Server, state: StandState, *, as_json: bool) -> None:
-    if as_json:
-        run = {} if state.run is None else state.run.model_dump(mode="json")
-        typer.echo(
-            json.dumps(
-                {**run, "session": run.get("session") or server.name, "stand": state.model_dump(mode="json")}, indent=2
-            )
-        )
-        return
-    for line in (
-        idle_lines(server.name, state)
-        if state.run is None
-        else status_lines(state.run.session or server.name, state.run)
-    ):
-        typer.echo(line)
-    if state.prompt is not None:
-        typer.echo(_row("asks", f"{state.prompt.text}; `stand continue` when it is done"))
+def _show(server: Server, state: StandState) -> None:
+    run = {} if state.run is None else state.run.model_dump(mode="json")
+    data = {**run, "session": run.get("session") or server.name, "stand": state.model_dump(mode="json")}
+    lines = idle_lines(server.name, state) if state.run is None else status_lines(str(data["session"]), state.run)
+    asked = [] if state.prompt is None else [_row("asks", f"{state.prompt.text}; `stand continue` when it is done")]
+    show(data, [*lines, *asked])
 
 
-def _show_plan(server: Server, *, as_json: bool) -> None:
+def _show_plan(server: Server) -> None:
     steps = cast("list[Answer]", server.request("GET", f"{API}/plan"))
-    if as_json:
-        typer.echo(json.dumps(steps, indent=2))
-        return
-    for step in steps:
-        typer.echo(one_line(f"{_number(step):>5}  {str(step['standing']).replace('_', ' '):<10}  {step['text']}"))
+    lines = [f"{_number(step):>5}  {str(step['standing']).replace('_', ' '):<10}  {step['text']}" for step in steps]
+    show(steps, map(one_line, lines))
 
 
 def _step_id(server: Server, step: str) -> str:

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
 from drivers.wires.discovery import FoundCamera, SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
+from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
-from foundation.usage import OneLineUsage, one_line
-from stand.commands.session_args import JsonOption
+from foundation.output import show
+from foundation.usage import one_line
 from stand.config.stand_config import load_config, packaged
 
-app = typer.Typer(cls=OneLineUsage, add_completion=False)
+app = App()
 
 
 @app.command()
@@ -31,7 +31,6 @@ def devices(
         ),
     ] = None,
     wait_s: Annotated[float, typer.Option(min=0.1, max=60.0, help="How long cameras have for their answer.")] = 1.0,
-    as_json: JsonOption = False,
 ) -> None:
     """Serial ports, USB devices and GigE cameras, with the addresses that a stand's file takes. Nothing is opened or
     changed, and no network is asked that was not named.
@@ -48,12 +47,9 @@ def devices(
         except (OSError, ValueError) as error:
             raise ConfigError(f"cameras cannot be asked at {', '.join(addresses)}: {error}") from error
         ports, usb = serial_ports(), usb_devices()
-        if as_json:
-            found = {"serial": ports, "usb": usb, "cameras": cameras}
-            typer.echo(json.dumps({kind: [asdict(each) for each in some] for kind, some in found.items()}, indent=2))
-            return
-        for line in _lines(ports, usb, cameras, addresses):
-            typer.echo(one_line(line))
+        found = {"serial": ports, "usb": usb, "cameras": cameras}
+        data = {kind: [asdict(each) for each in some] for kind, some in found.items()}
+        show(data, map(one_line, _lines(ports, usb, cameras, addresses)))
 
 
 def _lines(

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, cast
 from urllib.parse import quote
 
 import typer
 
+from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
+from foundation.output import show
 from foundation.usage import one_line
-from stand.commands.reached import ConfigOption, DirectoryOption, JsonOption, TokenOption, UrlOption, reached
+from stand.commands.reached import on_stand
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import DeviceState, QueuedRun
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 _LIMIT_S = 60.0  # the wires of the stand are asked when a run is queued, and a device may move for so long
 
 
 @app.command()
+@on_stand(by_option=True)
 def submit(
+    server: Server,
     recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
-    directory: DirectoryOption = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
     attended: Annotated[bool, typer.Option("--attended", help="Somebody does what the plan prompts for.")] = False,
     key: Annotated[str, typer.Option(help="Your own word for this run: given again, nothing is queued twice.")] = "",
 ) -> None:
@@ -36,61 +35,55 @@ def submit(
 
     Example: stand submit night.yaml --key monday
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file)
-        body: dict[str, object] = {"attended": attended, "key": key}
-        path = Path(recipe)
-        if path.is_file():
-            body["recipe_text"] = _text(path)
-        else:
-            body["recipe"] = recipe
-        run = QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, _LIMIT_S))
-        typer.echo(run.model_dump_json(indent=2) if as_json else run.id)
+    body: dict[str, object] = {"attended": attended, "key": key}
+    path = Path(recipe)
+    if path.is_file():
+        body["recipe_text"] = _text(path)
+    else:
+        body["recipe"] = recipe
+    run = QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, _LIMIT_S))
+    show(run.model_dump(mode="json"), [run.id])
 
 
 @app.command()
+@on_stand(by_option=True)
 def device(
+    server: Server,
     name: Annotated[str, typer.Argument(help="The device; without one all are listed, with what they take.")] = "",
     verb: Annotated[str, typer.Argument(help="What it is told.")] = "",
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="What the verb takes.")
     ] = None,
-    directory: DirectoryOption = None,
-    config: ConfigOption = "simulated",
-    as_json: JsonOption = False,
-    url: UrlOption = "",
-    token_file: TokenOption = None,
 ) -> None:
     """Tell a device something by hand, between runs, through the same gate as a run.
 
     Example: stand device flap open
     """
-    with one_line_errors():
-        server = reached(directory, config, url, token_file)
-        if not verb:
-            _show(server, name, as_json=as_json)
-            return
-        body: dict[str, object] = {"arguments": dict(map(_argument, arguments or ()))}
-        path = f"{API}/devices/{quote(name, safe='')}/{quote(verb, safe='')}"
-        answer = cast("Answer", server.request("POST", path, body, _LIMIT_S))
-        typer.echo(json.dumps(answer, indent=2) if as_json else one_line(answer["text"] or f"{name}: {verb}"))
+    if not verb:
+        _show_devices(server, name)
+        return
+    body: dict[str, object] = {"arguments": dict(map(_argument, arguments or ()))}
+    path = f"{API}/devices/{quote(name, safe='')}/{quote(verb, safe='')}"
+    answer = cast("Answer", server.request("POST", path, body, _LIMIT_S))
+    show(answer, [one_line(answer["text"] or f"{name}: {verb}")])
 
 
-def _show(server: Server, name: str, *, as_json: bool) -> None:
+def _show_devices(server: Server, name: str) -> None:
     found = cast("list[object]", server.request("GET", f"{API}/devices"))
     devices = [each for each in map(DeviceState.model_validate, found) if name in ("", each.name)]
     if not devices:
         raise ConfigError(f"there is no device {name}; `stand device` lists them")
-    if as_json:
-        typer.echo(json.dumps([each.model_dump(mode="json") for each in devices], indent=2))
-        return
+    show([each.model_dump(mode="json") for each in devices], _device_lines(devices))
+
+
+def _device_lines(devices: Sequence[DeviceState]) -> Iterator[str]:
     for each in devices:
-        typer.echo(one_line(f"{each.name} ({each.kind})" + (f": {each.refused}" if each.refused else "")))
+        yield one_line(f"{each.name} ({each.kind})" + (f": {each.refused}" if each.refused else ""))
         for verb in each.verbs:
             takes = " ".join(
                 f"{one.name}={_range(one.minimum, one.maximum, one.choices, one.unit)}" for one in verb.arguments
             )
-            typer.echo(one_line(f"  {verb.verb} {takes}".rstrip() + f"    {verb.text}"))
+            yield one_line(f"  {verb.verb} {takes}".rstrip() + f"    {verb.text}")
 
 
 def _range(minimum: float | None, maximum: float | None, choices: tuple[str, ...], unit: str) -> str:

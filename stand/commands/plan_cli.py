@@ -11,8 +11,10 @@ import typer
 
 from experiments.steps import Step, kind_of, parameters_of
 from foundation.clock import NS_PER_S, WallClock
+from foundation.command_app import App
 from foundation.ending import Ending
 from foundation.exit_codes import one_line_errors
+from foundation.output import say, show
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import PricedStep
 from stand.estimating.learned import load_learned
@@ -20,7 +22,7 @@ from stand.estimating.night import price_night
 from stand.running.order import load_order
 from stand.simulator import Simulator, laboratory_of, list_faults
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 _ENDING = {signal.SIGINT, signal.SIGTERM}
 
@@ -31,7 +33,6 @@ def plan(
     config: Annotated[
         str, typer.Option("--config", help="A configuration file, or the name of an installed one.")
     ] = "simulated",
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
 ) -> None:
     """The steps of a recipe with durations, frames, bytes and end time, without running anything.
 
@@ -51,18 +52,13 @@ def plan(
             "bytes": round(sum(step.size_bytes for step in steps)),
             "end": end,
         }
-        if as_json:
-            typer.echo(json.dumps({"steps": [step.as_json() for step in steps], **totals}, indent=2))
-            return
-        for step in steps:
-            typer.echo(_line(step))
-        if night.after_s:
-            typer.echo(f"then back to the laboratory's temperature, {_hours(night.after_s)}")
-        typer.echo(
+        back = [f"then back to the laboratory's temperature, {_hours(night.after_s)}"] if night.after_s else []
+        total = (
             f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
             f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
         )
-        typer.echo(str(learned))
+        data = {"steps": [step.as_json() for step in steps], **totals}
+        show(data, [*map(_line, steps), *back, total, str(learned)])
 
 
 @app.command()
@@ -80,14 +76,14 @@ def simulate(
     """
     with one_line_errors():
         if faults:
-            for row in list_faults():
-                typer.echo(f"{row['name']:<32}{json.dumps(row['worst']):<18}{row['text']}")
+            rows = list_faults()
+            show(rows, (f"{row['name']:<32}{json.dumps(row['worst']):<18}{row['text']}" for row in rows))
             return
         stand_config = load_config(packaged("", config))
         laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
         planned = (*(stand_config.simulation.faults if stand_config.simulation else ()), *(fault or ()))
         simulator = Simulator({**laboratory, "faults": list(planned)})
-        typer.echo(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it", err=True)
+        say(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it")
         ending.wait()
         simulator.stop()
 

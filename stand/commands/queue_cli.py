@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from foundation.clock import WallClock
+from foundation.command_app import App
 from foundation.exit_codes import INTERRUPTED, one_line_errors
 from foundation.instants import date_time, duration
-from foundation.usage import OneLineUsage, one_line
+from foundation.output import say, show
+from foundation.usage import one_line
 from stand.config.stand_config import load_config, packaged
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry, Queue
@@ -21,10 +22,8 @@ from stand.queueing.queue_work import Notes, work
 from stand.running.order import load_order
 from stand.running.stop import Interrupted
 
-app = typer.Typer(
-    cls=OneLineUsage,
+app = App(
     no_args_is_help=True,
-    add_completion=False,
     help="A queue of runs: add, list, move, remove, start.\n\nExample: stand queue add thermal-cycle",
 )
 
@@ -33,7 +32,6 @@ OutOption = Annotated[
     Path | None, typer.Option("--out", help="Where the queue is and its sessions go; else recording.directory.")
 ]
 RunArgument = Annotated[int, typer.Argument(metavar="ID", help="The run's number in `stand queue list`.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
 
 _COLUMNS = ("id", "next", "recipe", "state", "added (local)", "took", "session", "reason")
 
@@ -51,11 +49,12 @@ def add(
     with one_line_errors():
         order = load_order(recipe, config)
         directory = out or order.config.recording.directory
-        typer.echo(queue.add(directory, order, config, WallClock().now_ns()).id)
+        number = queue.add(directory, order, config, WallClock().now_ns()).id
+        show({"id": number}, [number])
 
 
 @app.command("list")
-def list_runs(config: ConfigOption = "simulated", out: OutOption = None, as_json: JsonOption = False) -> None:
+def list_runs(config: ConfigOption = "simulated", out: OutOption = None) -> None:
     """The runs in the queue: what has ended, what is running, what comes next.
 
     Example: stand queue list --out /data/sessions
@@ -63,17 +62,13 @@ def list_runs(config: ConfigOption = "simulated", out: OutOption = None, as_json
     with one_line_errors():
         directory = _directory(config, out)
         found = queue.queued(directory)
-        if as_json:
-            texts = {"config_text", "recipe_text", "target_text"}
-            entries = [entry.model_dump(mode="json", exclude=texts) for entry in found.entries]
-            typer.echo(json.dumps({"halted": found.halted, "runs": entries}, indent=2))
-            return
-        for line in queue_lines(found) if found.entries else ():
-            typer.echo(line)
+        texts = {"config_text", "recipe_text", "target_text"}
+        entries = [entry.model_dump(mode="json", exclude=texts) for entry in found.entries]
+        show({"halted": found.halted, "runs": entries}, queue_lines(found) if found.entries else ())
         if not found.entries:
-            _say(f"{directory}: nothing is queued there")
+            say(f"{directory}: nothing is queued there")
         if found.halted:
-            _say(f"halted by {found.halted}; remove the cause, then `stand queue start --clear`")
+            say(f"halted by {found.halted}; remove the cause, then `stand queue start --clear`")
 
 
 @app.command()
@@ -89,6 +84,7 @@ def move(
     """
     with one_line_errors():
         queue.move(_directory(config, out), number, position)
+        show({"id": number, "position": position}, ())
 
 
 @app.command()
@@ -99,9 +95,10 @@ def remove(number: RunArgument, config: ConfigOption = "simulated", out: OutOpti
     """
     with one_line_errors():
         queue.remove(_directory(config, out), number)
+        show({"id": number}, ())
 
 
-@app.command()
+@app.command(has_json=False)
 def start(
     config: ConfigOption = "simulated",
     out: OutOption = None,
@@ -118,18 +115,18 @@ def start(
     with one_line_errors():
         directory = _directory(config, out)
         if not queue.queued(directory).entries:
-            _say(f"{directory}: nothing is queued there")
+            say(f"{directory}: nothing is queued there")
             return
         if clear:
             queue.clear(directory)
 
         async def run_one(entry: Entry, notes: Notes) -> Path:
             session = await run_entry(directory, entry, notes, virtual_time=virtual_time)
-            await asyncio.to_thread(conclude, entry, session, _say, report=report)
+            await asyncio.to_thread(conclude, entry, session, say, report=report)
             return session
 
         try:
-            asyncio.run(work(directory, run_one, WallClock(), _say))
+            asyncio.run(work(directory, run_one, WallClock(), say))
         except Interrupted as error:
             raise typer.Exit(INTERRUPTED) from error  # its end has been reported
 
@@ -158,7 +155,3 @@ def _cells(entry: Entry, turn: int | None) -> tuple[str, ...]:
 
 def _directory(config: str, out: Path | None) -> Path:
     return out or load_config(packaged("", config)).recording.directory
-
-
-def _say(line: str) -> None:
-    typer.echo(one_line(line), err=True)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from foundation.command_app import with_parameters
 from foundation.errors import ConfigError, SessionError
+from foundation.exit_codes import one_line_errors
 from stand.serving.client import Server, running_sessions, server_at, server_of
 
 DirectoryArgument = Annotated[
@@ -18,11 +22,40 @@ DirectoryOption = Annotated[
     Path | None, typer.Option("--dir", help="The daemon's folder of sessions; else recording.directory of --config.")
 ]
 ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
 UrlOption = Annotated[
     str, typer.Option("--url", help="A stand's address, http://HOST:PORT, instead of its socket here.")
 ]
 TokenOption = Annotated[Path | None, typer.Option("--token-file", help="The file with the token for --url.")]
+
+
+Command = Callable[..., None]
+
+_OPTIONS: dict[str, tuple[Any, object]] = {
+    "config": (ConfigOption, "simulated"),
+    "url": (UrlOption, ""),
+    "token_file": (TokenOption, None),
+}
+
+
+def on_stand(
+    *, anywhere: bool = False, by_option: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A command whose first parameter is the Server it is for: what finds that is taken from the command line instead.
+    anywhere: as `reached` has it. by_option: the folder is an option, since the command has arguments of its own.
+    Errors become sentences."""
+
+    def take(function: Command) -> Command:
+        @functools.wraps(function)
+        def command(
+            *arguments: Any, directory: Path | None, config: str, url: str, token_file: Path | None, **options: Any
+        ) -> None:
+            with one_line_errors():
+                function(reached(directory, config, url, token_file, anywhere=anywhere), *arguments, **options)
+
+        added = {"directory": (DirectoryOption if by_option else DirectoryArgument, None), **_OPTIONS}
+        return with_parameters(command, function, added, without="server")
+
+    return take
 
 
 def reached(

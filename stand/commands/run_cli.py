@@ -14,8 +14,10 @@ from typing import Annotated
 
 import typer
 
+from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import INTERRUPTED, NOT_REPORTED, one_line_errors
+from foundation.output import output, say, show
 from foundation.usage import one_line, tell
 from recording.repair.salvage import salvage_line
 from stand.commands.submitted import daemon_of, follow, submit
@@ -28,10 +30,10 @@ from stand.running.resume import interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.stop import Interrupted
 from stand.serving.client import Server
-from stand.session_report import NotReported, check_reportable, report_session
+from stand.session_report import REPORT_NAME, NotReported, check_reportable, report_session
 from stand.watching.live import followed
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 ReportOption = Annotated[
     bool, typer.Option("--report", help="Then fit the drift: model.json and report.html, in the session's folder.")
@@ -59,8 +61,7 @@ def demo(
         night = price_night(tuple(order.recipe.plan()), order.config, directory)
         with followed(order, night, directory, is_virtual=True) as watch:
             session = asyncio.run(run_virtual(order, directory, None, watch))
-        typer.echo(f"session  {session}")
-        _report(session, directory)
+        _show_session(session, directory, f"session  {session}", report=True)
 
 
 @app.command()
@@ -104,7 +105,7 @@ def run(
         _check_writable(directory)
         night = price_night(tuple(order.recipe.plan()), order.config, directory)
         if lack := small_disk(shutil.disk_usage(existing(directory)).free, night.steps, order.config):
-            typer.echo(one_line(f"warning: {directory}: {lack}"), err=True)
+            say(f"warning: {directory}: {lack}")
         with followed(order, night, directory, is_virtual=virtual_time) as watch:
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
             session = asyncio.run(work)
@@ -150,12 +151,10 @@ def _run_there(server: Server, order: Order, out: Path | None, *, detach: bool, 
     """By the daemon that has the stand."""
     submitted = submit(server, order, out)
     if detach:
-        typer.echo(f"run {submitted.id} is queued; `stand status` follows it")
+        show({"id": submitted.id}, [f"run {submitted.id} is queued; `stand status` follows it"])
         return
     session = follow(server, submitted)
-    typer.echo(session)
-    if report:
-        _report(session, session)
+    _show_session(session, session, str(session), report=report)
 
 
 def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
@@ -163,18 +162,21 @@ def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
     try:
         learn(session.parent, config)
     except (SessionError, OSError) as error:  # what cannot be kept is no reason for a run to fail
-        typer.echo(f"warning: {one_line(error)}", err=True)
-    typer.echo(session)
-    if report:
-        _report(session, session)
+        say(f"warning: {error}")
+    _show_session(session, session, str(session), report=report)
 
 
-def _report(session: Path, folder: Path) -> None:
-    """Show the report's lines; status NOT_REPORTED when there is none: the run itself has gone well."""
+def _show_session(session: Path, folder: Path, line: str, *, report: bool) -> None:
+    """The session, and when asked for its report's lines; status NOT_REPORTED when there is none: the run itself has
+    gone well."""
+    if not output().as_json:
+        typer.echo(line)  # before the report, which takes a minute
     try:
-        for line in report_session(session, folder):
-            typer.echo(line)
+        lines = report_session(session, folder) if report else []
+        show({"session": session, "report": folder / REPORT_NAME if report else None}, lines)
     except NotReported as error:
+        if output().as_json:
+            show({"session": session, "report": None}, ())
         tell(error)
         raise typer.Exit(NOT_REPORTED) from error
 

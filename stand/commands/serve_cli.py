@@ -12,10 +12,12 @@ from typing import Annotated, Any
 import typer
 
 from foundation.clock import WallClock
+from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.exit_codes import one_line_errors
 from foundation.hub import Hub
 from foundation.items import Event, Item
+from foundation.output import Output, output, say
 from foundation.usage import one_line
 from stand.aside import aside
 from stand.config.interface import load_tokens
@@ -28,10 +30,10 @@ from stand.serving.api.server import serve as serve_clients
 from stand.serving.secop.door import door_at
 from stand.serving.viewing import Viewing
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 
-@app.command()
+@app.command(has_json=False)
 def serve(
     config: Annotated[str, typer.Argument(help="A configuration file, or the name of an installed one.")] = "simulated",
     out: Annotated[Path | None, typer.Option(help="Where the sessions go; else recording.directory.")] = None,
@@ -63,13 +65,13 @@ def serve(
             async with serve_clients(desk, hub, clock, directory, stand.name, served):
                 where = f"; http://{host}:{port}/" if port is not None else ""
                 where += f"; SECoP at {secop_port}" if secop_port is not None else ""
-                typer.echo(f"{stand.name} is open; sessions go to {directory}{where}", err=True)
+                say(f"{stand.name} is open; sessions go to {directory}{where}")
                 with aside() as later:
-                    say = later(_say)
+                    wanted, tell = output(), later(_tell)
 
                     def follow(item: Item) -> None:
-                        if isinstance(item, Event) and (item.level != "info" or item.kind in ("queue", "command")):
-                            say(item.text)
+                        if isinstance(item, Event) and _is_told(item, wanted):
+                            tell(item.text)
 
                     hub.subscribe(follow)
                     try:
@@ -89,5 +91,11 @@ def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
     return room
 
 
-def _say(line: str) -> None:
+def _tell(line: str) -> None:
     typer.echo(one_line(line), err=True)
+
+
+def _is_told(event: Event, wanted: Output) -> bool:
+    if wanted.quiet:
+        return event.level == "error"
+    return wanted.verbose or event.level != "info" or event.kind in ("queue", "command")

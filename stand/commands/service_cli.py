@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import write_whole
+from foundation.output import say, show
 from stand.config.stand_config import StandConfig, load_config, packaged
 
-app = typer.Typer(add_completion=False)
+app = App()
 
 UNITS, RULES = Path("etc/systemd/system"), Path("etc/udev/rules.d/60-thermostand.rules")
 _STOP_S, _WATCHDOG_S = 60, 60  # it asks for more time while the stand is being made safe
@@ -48,19 +51,22 @@ def install(
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}", name):
             raise ConfigError(f"--user {name}: expected the name of a user")
         files = {root / UNITS / f"{unit_name(stand)}.service": unit(path, stand, name, port), root / RULES: rules(name)}
-        for file, text in files.items():
-            typer.echo(f"# {file}\n{text}")
+        show({"files": {str(file): text for file, text in files.items()}, "written": yes}, _shown(files))
         if not yes:
-            typer.echo("nothing was written; --yes writes these files", err=True)
+            say("nothing was written; --yes writes these files")
             return
         for file, text in files.items():
             file.parent.mkdir(parents=True, exist_ok=True)
             write_whole(file, text)
-        typer.echo(
+        say(
             f"written; now: systemctl daemon-reload && systemctl enable --now {unit_name(stand)}; "
-            "udevadm control --reload && udevadm trigger",
-            err=True,
+            "udevadm control --reload && udevadm trigger"
         )
+
+
+def _shown(files: Mapping[Path, str]) -> Iterator[str]:
+    for file, text in files.items():
+        yield f"# {file}\n{text}"
 
 
 def unit_name(stand: StandConfig) -> str:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from foundation.clock import WallClock
+from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import FAILED, one_line_errors
+from foundation.output import output, say, show
 from foundation.progress import late_progress
-from foundation.usage import OneLineUsage, one_line
+from foundation.usage import one_line, tell
 from recording.exporting.archive import Rule, archive, delete, unfit
 from recording.format.inventory import inventory
 from recording.reading.catalogue import Entry, catalogue, look_at
@@ -23,7 +26,7 @@ from stand.commands.session_list_cli import user_name
 from stand.commands.session_table import size
 from stand.config.stand_config import load_config, packaged
 
-app = typer.Typer(cls=OneLineUsage, no_args_is_help=True, add_completion=False)
+app = App(no_args_is_help=True)
 _NICENESS = 15  # whatever a stand does on this computer goes first
 
 
@@ -61,10 +64,12 @@ def archive_sessions(
             raise ConfigError(f"{out}: lies inside of {place}; the copies belong on another disk")
         with suppress(OSError):
             os.nice(_NICENESS)
-        failed = _copy(_entries(place), out)
+        done = _Done()
+        _copy(_entries(place), out, done)
         if delete_after is not None:
-            failed += _delete(_entries(place), Rule(delete_after), yes=yes)
-        if failed:
+            _delete(_entries(place), Rule(delete_after), done, yes=yes)
+        show(done.data(), ())
+        if done.failed:
             raise typer.Exit(FAILED)
 
 
@@ -72,15 +77,36 @@ def _entries(place: Path) -> list[Entry]:
     return [look_at(place)] if inventory(place) else catalogue(place)
 
 
-def _copy(entries: Sequence[Entry], out: Path) -> int:
-    """How many could not be copied; those that must wait are told."""
+@dataclass
+class _Done:
+    """What became of the sessions, by name. due: those that the rule would delete."""
+
+    copied: dict[str, Path] = field(default_factory=dict[str, Path])
+    waiting: dict[str, str] = field(default_factory=dict[str, str])
+    failed: list[str] = field(default_factory=list[str])
+    due: list[str] = field(default_factory=list[str])
+    deleted: list[str] = field(default_factory=list[str])
+
+    def data(self) -> dict[str, object]:
+        return asdict(self)
+
+
+def _line(text: str) -> None:
+    """For people, as it happens."""
+    if not output().as_json:
+        typer.echo(one_line(text))
+
+
+def _copy(entries: Sequence[Entry], out: Path, found: _Done) -> None:
+    """Those that must wait are told."""
     waiting = [(entry, reason) for entry in entries if not entry.archived and (reason := unfit(entry))]
     for entry, reason in waiting:
-        typer.echo(one_line(f"{entry.name}: not yet: {reason}"), err=True)
+        found.waiting[entry.name] = reason
+        say(f"{entry.name}: not yet: {reason}")
     due = [entry for entry in entries if not entry.archived and not unfit(entry)]
     if out.exists() and any(entry.path.stat().st_dev == out.stat().st_dev for entry in due):
-        typer.echo(one_line(f"warning: {out}: is on the disk that the sessions are on"), err=True)
-    failed = done = 0
+        say(f"warning: {out}: is on the disk that the sessions are on")
+    done = 0
     with late_progress("archive", 2 * sum(entry.size_bytes for entry in due)) as report:
         for entry in due:
 
@@ -91,30 +117,30 @@ def _copy(entries: Sequence[Entry], out: Path) -> int:
 
             try:
                 copy = archive(entry, out, user_name(), WallClock().now_ns(), count)
-                typer.echo(one_line(f"{entry.name}: copied to {copy} and read back ({size(entry.size_bytes)})"))
+                found.copied[entry.name] = copy
+                _line(f"{entry.name}: copied to {copy} and read back ({size(entry.size_bytes)})")
             except SessionError as error:
-                typer.echo(one_line(f"error: {error}"), err=True)
-                failed += 1
+                tell(error)
+                found.failed.append(entry.name)
     if not due:
-        typer.echo(f"nothing to copy: {sum(bool(entry.archived) for entry in entries)} of {len(entries)} have a copy")
-    return failed
+        _line(f"nothing to copy: {sum(bool(entry.archived) for entry in entries)} of {len(entries)} have a copy")
 
 
-def _delete(entries: Sequence[Entry], rule: Rule, *, yes: bool) -> int:
-    """The rule and what it applies to; deleted only with `yes`. How many could not be deleted."""
-    typer.echo(f"{rule}:")
+def _delete(entries: Sequence[Entry], rule: Rule, found: _Done, *, yes: bool) -> None:
+    """The rule and what it applies to; deleted only with `yes`."""
+    _line(f"{rule}:")
     due = [entry for entry in entries if rule.applies(entry, WallClock().now_ns())]
-    failed = 0
     for entry in due:
+        found.due.append(entry.name)
         if not yes:
-            typer.echo(one_line(f"  {entry.path} ({size(entry.size_bytes)}), copy in {entry.archived}"))
+            _line(f"  {entry.path} ({size(entry.size_bytes)}), copy in {entry.archived}")
             continue
         try:
             delete(entry)
-            typer.echo(one_line(f"  {entry.path}: deleted ({size(entry.size_bytes)}); its copy is {entry.archived}"))
+            found.deleted.append(entry.name)
+            _line(f"  {entry.path}: deleted ({size(entry.size_bytes)}); its copy is {entry.archived}")
         except SessionError as error:
-            typer.echo(one_line(f"error: {error}"), err=True)
-            failed += 1
+            tell(error)
+            found.failed.append(entry.name)
     total = size(sum(entry.size_bytes for entry in due))
-    typer.echo("  none" if not due else f"{len(due)} sessions, {total}" + ("" if yes else "; --yes deletes them"))
-    return failed
+    _line("  none" if not due else f"{len(due)} sessions, {total}" + ("" if yes else "; --yes deletes them"))

@@ -14,7 +14,6 @@ from recording.format.inventory import inventory
 SessionArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a recorded session.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to make; it must not exist.")]
 IncompleteOption = Annotated[bool, typer.Option("--incomplete", help="Use a session although part of it is missing.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable.")]
 
 
 def check_folder(directory: Path) -> Path:

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import re
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from foundation.clock import NS_PER_S, VirtualClock
+from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import FAILED, one_line_errors
 from foundation.hub import Hub
 from foundation.instants import parse_instant
 from foundation.items import Event, Item, StepMark
+from foundation.output import output, say, show
 from foundation.progress import Report, late_progress, progress
-from foundation.usage import OneLineUsage, one_line
+from foundation.usage import one_line
 from recording.exporting.export import export
 from recording.exporting.one_file import export_mcap
 from recording.exporting.replay import ReplayClock, replay, replay_and_record
@@ -34,7 +36,6 @@ from recording.repair.salvage import Salvaged, salvage_line, salvage_session
 from recording.repair.verify import verify
 from stand.commands.session_args import (
     IncompleteOption,
-    JsonOption,
     OutOption,
     SessionArgument,
     check_folder,
@@ -42,28 +43,25 @@ from stand.commands.session_args import (
 )
 from stand.commands.session_text import info_json, info_lines, verify_json, verify_lines
 
-app = typer.Typer(
-    cls=OneLineUsage,
+app = App(
     no_args_is_help=True,
-    add_completion=False,
     help="Recorded sessions: list, look at, verify, salvage, replay, export, trim.\n\n"
     "Example: stand session info sessions/20260101T180000Z-thermal-cycle",
 )
 
 
 @app.command()
-def info(directory: SessionArgument, as_json: JsonOption = False) -> None:
+def info(directory: SessionArgument) -> None:
     """What a session holds: when, steps, frames, gaps, temperatures, events, versions.
 
     Example: stand session info sessions/20260101T180000Z-thermal-cycle
     """
     with one_line_errors():
         found = overview(check_session(directory))
-        if as_json:
-            typer.echo(json.dumps(info_json(found), indent=2))
-            return
-        for line in info_lines(found):
-            typer.echo(line)
+        if output().as_json:
+            show(info_json(found), ())
+        else:
+            show(None, info_lines(found))
 
 
 def _sessions_in(directory: Path) -> list[Path]:
@@ -93,11 +91,11 @@ def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
 
 
 def _warn(text: str) -> None:
-    typer.echo(one_line(f"warning: {text}"), err=True)
+    say(f"warning: {text}")
 
 
 @app.command("verify")
-def verify_session(directory: SessionArgument, as_json: JsonOption = False) -> None:
+def verify_session(directory: SessionArgument) -> None:
     """Read every byte of a session and say what is damaged or missing; status 1 when anything is,
     however the run ended.
 
@@ -108,11 +106,7 @@ def verify_session(directory: SessionArgument, as_json: JsonOption = False) -> N
         total_bytes = sum(file.size_bytes for file in files if file.state is State.FINISHED)
         with late_progress("verify", total_bytes) as report:
             found = verify(directory, report)
-        if as_json:
-            typer.echo(json.dumps(verify_json(found), indent=2))
-        else:
-            for line in verify_lines(found):
-                typer.echo(line)
+        show(verify_json(found), verify_lines(found))
         if not found.is_sound:
             raise typer.Exit(FAILED)
 
@@ -138,11 +132,10 @@ def salvage(
         with late_progress("salvage", sum(sizes.values())) as report:
             for path, size_bytes in sizes.items():
                 for salvaged in salvage_session(path, _part_of(report, done_bytes, size_bytes)):
-                    typer.echo(one_line(salvage_line(salvaged)))
                     done.append(salvaged)
                 done_bytes += size_bytes
-        if not done:
-            typer.echo("nothing to salvage")
+        data = [{**asdict(each), "text": salvage_line(each)} for each in done]
+        show(data, [one_line(salvage_line(each)) for each in done] or ["nothing to salvage"])
         if any(salvaged.kept for salvaged in done):
             raise typer.Exit(FAILED)
 
@@ -167,7 +160,8 @@ def replay_session(
             if record is None:
                 asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
             else:
-                typer.echo(asyncio.run(replay_and_record(session, record, times, watch)))
+                recorded = asyncio.run(replay_and_record(session, record, times, watch))
+                show({"session": recorded}, [recorded])
 
 
 def _speed(text: str) -> float | None:
@@ -196,6 +190,8 @@ def _replay_progress(seen: Glance, session: Session) -> Generator[Callable[[Hub]
         def follow(item: Item) -> None:
             at = utc.date_time(item.time_ns)
             report((item.time_ns - begin_ns) / NS_PER_S, at)
+            if output().quiet or output().as_json:
+                return
             if isinstance(item, StepMark):
                 typer.echo(f"{at}  step {item.index + 1} {one_line(item.kind)} {item.state}")
             elif isinstance(item, Event):
@@ -239,11 +235,11 @@ def export_session(
         with _session_to_use(directory, incomplete) as session, late_progress("export", 1.0) as report:
             if table_format == "mcap":
                 export_mcap(session, out, frames=frames, telemetry=telemetry, report=report)
-                typer.echo(out)
+                show({"out": out}, [out])
                 return
             tables = table_format if telemetry else None
             export(session, out, frames=frames, telemetry=tables, report=report)
-        typer.echo(out)
+        show({"out": out}, [out])
 
 
 @app.command("trim")
@@ -264,7 +260,8 @@ def trim_session(
         _check_new(out, directory)
         seen = glance(check_session(directory))
         with _session_to_use(directory, incomplete) as session:
-            typer.echo(trim(session, out, *_range(begin, end, session, seen)))
+            part = trim(session, out, *_range(begin, end, session, seen))
+            show({"session": part}, [part])
 
 
 def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple[int, int]:

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pwd
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
-from foundation.usage import OneLineUsage, one_line
+from foundation.output import output, say, show
+from foundation.usage import one_line
 from recording.format.inventory import inventory
 from recording.reading.catalogue import Entry, Report, catalogue, look_at
 from recording.reading.notes import add_note, add_tags, check_tag, read_notes
-from stand.commands.session_args import JsonOption, SessionArgument, check_folder, check_session
+from stand.commands.session_args import SessionArgument, check_folder, check_session
 from stand.commands.session_table import ON_THE_RIGHT, entry_json, lines, rows
 
-app = typer.Typer(cls=OneLineUsage, no_args_is_help=True, add_completion=False)
+app = App(no_args_is_help=True)
 _USUAL = {"run": ("complete", "running"), "files": ("sound",)}  # anything else is shown in another colour
 
 
@@ -33,7 +35,6 @@ def list_sessions(
         list[str] | None, typer.Option("--tag", help="Only those with this tag; with each, when repeated.")
     ] = None,
     not_archived: Annotated[bool, typer.Option("--not-archived", help="Only those without a copy elsewhere.")] = False,
-    as_json: JsonOption = False,
 ) -> None:
     """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, how the
     run ended, whether the files are sound, and what people said of them.
@@ -44,13 +45,13 @@ def list_sessions(
         wanted = set(map(check_tag, tag or ()))
         seen = [entry for entry in _entries(check_folder(directory)) if wanted <= set(entry.tags)]
         seen = [entry for entry in seen if not (not_archived and entry.archived)]
-        if as_json:
-            typer.echo(json.dumps([entry_json(entry) for entry in seen], indent=2))
+        if output().as_json:
+            show([entry_json(entry) for entry in seen], ())
         elif not seen:
             with_tag = f" with the tag {', '.join(sorted(wanted))}" if wanted else ""
-            typer.echo(f"{directory}: no sessions{with_tag} there", err=True)
+            say(f"{directory}: no sessions{with_tag} there")
         elif sys.stdout.isatty():
-            _show(seen)
+            _show_table(seen)
         else:
             typer.echo("\n".join(lines(*rows(seen))))
 
@@ -70,7 +71,7 @@ def _entries(directory: Path) -> list[Entry]:
         return catalogue(directory, progress)
 
 
-def _show(seen: list[Entry]) -> None:
+def _show_table(seen: list[Entry]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -96,7 +97,7 @@ def note(
 
     Example: stand session note sessions/20260101T180000Z-thermal-cycle "door opened at 19:10"
     """
-    _say(directory, partial(add_note, text=" ".join(text)))
+    _keep(directory, partial(add_note, text=" ".join(text)))
 
 
 @app.command()
@@ -109,17 +110,18 @@ def tag(
 
     Example: stand session tag sessions/20260101T180000Z-thermal-cycle paper lens-B
     """
-    _say(directory, partial(add_tags, tags=tags, remove=remove))
+    _keep(directory, partial(add_tags, tags=tags, remove=remove))
 
 
-def _say(directory: Path, add: Callable[..., None]) -> None:
+def _keep(directory: Path, add: Callable[..., None]) -> None:
     from foundation.clock import WallClock
 
     with one_line_errors():
         add(check_session(directory), by=user_name(), time_ns=WallClock().now_ns())
         said = read_notes(directory)
         told = f"{len(said.notes)} note{'' if len(said.notes) == 1 else 's'}"
-        typer.echo(one_line(f"{directory}: {told}, tags: {', '.join(said.tags) or 'none'}"))
+        line = one_line(f"{directory}: {told}, tags: {', '.join(said.tags) or 'none'}")
+        show({"notes": [asdict(each) for each in said.notes], "tags": list(said.tags)}, [line])
 
 
 def user_name() -> str:

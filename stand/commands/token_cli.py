@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import secrets
 from pathlib import Path
 from typing import Annotated, cast
 
 import typer
 
+from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
-from foundation.usage import OneLineUsage
-from stand.commands.reached import DirectoryArgument, JsonOption, reached
+from foundation.output import output, show
+from stand.commands.reached import DirectoryArgument, reached
 from stand.serving.client import API, Answer
 
-app = typer.Typer(
-    cls=OneLineUsage,
+app = App(
     no_args_is_help=True,
-    add_completion=False,
     help="Tokens for the network: add, list, remove, login.\n\nExample: stand token add rose --config my-stand.yaml",
 )
 
@@ -46,11 +44,11 @@ def add(name: NameArgument, config: ConfigOption = "simulated") -> None:
         except ValueError:
             raise ConfigError(f"{name!r}: a name has up to 64 letters, digits and . _ @ -") from None
         write_tokens(path, {**tokens, name: token})
-        typer.echo(token)
+        show({"name": name, "token": token}, [token])
 
 
 @app.command("list")
-def list_names(config: ConfigOption = "simulated", as_json: JsonOption = False) -> None:
+def list_names(config: ConfigOption = "simulated") -> None:
     """Who has a token.
 
     Example: stand token list --config my-stand.yaml
@@ -59,11 +57,7 @@ def list_names(config: ConfigOption = "simulated", as_json: JsonOption = False) 
 
     with one_line_errors():
         names = sorted(load_tokens(_file(config)))
-        if as_json:
-            typer.echo(json.dumps(names))
-            return
-        for name in names:
-            typer.echo(name)
+        show(names, names)
 
 
 @app.command()
@@ -80,10 +74,11 @@ def remove(name: NameArgument, config: ConfigOption = "simulated") -> None:
         if name not in tokens:
             raise ConfigError(f"{path}: {name} has no token; `stand token list` shows who has")
         write_tokens(path, {other: token for other, token in tokens.items() if other != name})
+        show({"removed": name}, ())
 
 
 @app.command()
-def login(directory: DirectoryArgument = None, config: ConfigOption = "simulated", as_json: JsonOption = False) -> None:
+def login(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
     """An address that opens the page in a browser elsewhere, once, within ten minutes. Asked of the running daemon.
 
     Example: stand token login
@@ -91,12 +86,9 @@ def login(directory: DirectoryArgument = None, config: ConfigOption = "simulated
     with one_line_errors():
         server = reached(directory, config, anywhere=True)
         answer = cast("Answer", server.request("POST", f"{API}/login"))
-        if as_json:
-            typer.echo(json.dumps(answer))
-            return
-        if not answer["url"]:
+        if not answer["url"] and not output().as_json:
             raise ConfigError(f"{server.name}: its daemon does not listen to the network; start it with --port")
-        typer.echo(str(answer["url"]))
+        show(answer, [str(answer["url"])])
 
 
 def _file(config: str) -> Path:

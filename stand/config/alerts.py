@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field
 
@@ -23,18 +23,6 @@ Cause = Literal[
     "queue_empty",
     "eta_slipped",
 ]
-_ALL: tuple[Cause, ...] = (
-    "trip",
-    "hold",
-    "device_lost",
-    "disk",
-    "prompt",
-    "run_started",
-    "run_finished",
-    "run_aborted",
-    "queue_empty",
-    "eta_slipped",
-)
 
 
 class AlertsConfig(Document):
@@ -45,7 +33,7 @@ class AlertsConfig(Document):
     """
 
     secrets: Path | None = None
-    causes: tuple[Cause, ...] = _ALL
+    causes: tuple[Cause, ...] = get_args(Cause)
     grace_s: float = Field(default=60.0, ge=0, le=3600)
     most_per_h: int = Field(default=20, ge=1, le=1000)
     alive_every_s: float = Field(default=300.0, ge=1, le=86400)

@@ -27,6 +27,7 @@ class Follow:
 
     `show(moment)`: gets how the run stands, from its first step on, without what the hub does not tell (drift, disk).
     `tell(line)`: gets warnings and errors as they come, with what to type then. `done`, `earned_s`: as Eta has them.
+    `tell_all`: events of no importance, too.
     """
 
     def __init__(
@@ -37,10 +38,12 @@ class Follow:
         tell: Callable[[str], None],
         done: Collection[str] = (),
         earned_s: Mapping[str, float] = MappingProxyType({}),
+        *,
+        tell_all: bool = False,
     ) -> None:
         self.eta = Eta(night.steps, done, earned_s, night.after_s)
         self._least_ns = seconds_ns(max(_LEAST_S, _SHARE * night.duration_s))
-        self._show, self._tell = show, tell
+        self._show, self._tell, self._tells_all = show, tell, tell_all
         frames = sum(step.frames for step in night.steps if step.planned.step_id in done)
         self._moment = Moment(0, title, frames=frames, frames_planned=self.eta.frames)
         self._reasons: set[str] = set()
@@ -84,6 +87,8 @@ class Follow:
         if event.level != "info":
             line = f"{event.level}: {self._utc.local_text(event.time_ns)[11:]} {event.text}"
             self._tell(f"{line}; {next_command(event.kind, event.data)}")
+        elif self._tells_all:
+            self._tell(f"{self._utc.local_text(event.time_ns)[11:]} {event.text}")
 
     def _readings(self, batch: Batch) -> None:
         shown = {

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from foundation.clock import NS_PER_S, Now, WallClock
 from foundation.hub import Hub
+from foundation.output import output
 from foundation.usage import one_line
 from stand.aside import aside
 from stand.estimating.night import Night
@@ -47,11 +48,13 @@ class View(Protocol):
 @contextmanager
 def view(*, is_virtual: bool = False) -> Generator[View]:
     """On standard error, while inside. Of a run in virtual time a line comes at each tenth instead of each minute."""
-    if not sys.stderr.isatty():
+    if output().quiet:
+        yield Silent()
+    elif not sys.stderr.isatty():
         yield Lines(WallClock(), is_virtual=is_virtual)
-        return
-    with _foot(WallClock()) as foot:
-        yield foot
+    else:
+        with _foot(WallClock()) as foot:
+            yield foot
 
 
 @contextmanager
@@ -68,7 +71,8 @@ def followed(
             shown.show(replace(moment, disk_free_bytes=free_bytes(directory), drift_px=drift.mean_px))
 
         done, earned_s = ((), {}) if before is None else (before.kept.done, before.kept.earned_s)
-        follow = Follow(title, night, later(show), later(shown.tell), done, earned_s)
+        tell_all = output().verbose
+        follow = Follow(title, night, later(show), later(shown.tell), done, earned_s, tell_all=tell_all)
 
         def watch(hub: Hub) -> None:
             hub.subscribe(follow)
@@ -76,6 +80,18 @@ def followed(
                 drift.subscribe(hub)
 
         yield watch
+
+
+class Silent:
+    """Errors only."""
+
+    def show(self, moment: Moment) -> None:
+        """Nothing."""
+
+    def tell(self, line: str) -> None:
+        """An error at once."""
+        if line.startswith("error"):
+            typer.echo(one_line(line), err=True)
 
 
 class Lines:

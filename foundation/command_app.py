@@ -1,0 +1,79 @@
+"""The commands of a module, each with the options that all of them have."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar, cast
+
+import typer
+
+from foundation.output import Output, outputting
+from foundation.usage import OneLineUsage, VersionOption
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+_COMMON: dict[str, Any] = {
+    "common_quiet": Annotated[bool, typer.Option("--quiet", "-q", help="Nothing but the result and errors.")],
+    "common_verbose": Annotated[
+        bool, typer.Option("--verbose", "-v", help="Events of no importance too, and where an error came from.")
+    ],
+    "common_json": Annotated[bool, typer.Option("--json", help="The result as JSON.")],
+    "common_version": VersionOption,
+}
+
+
+class App(typer.Typer):
+    """Every command has -q, -v, --version and --json, which `foundation.output` knows of; `has_json=False` for one that
+    has nothing to say to a program."""
+
+    def __init__(self, help: str | None = None, *, no_args_is_help: bool = False) -> None:  # noqa: A002 - as in typer
+        super().__init__(cls=OneLineUsage, add_completion=False, help=help, no_args_is_help=no_args_is_help)
+
+    def command(
+        self, name: str | None = None, *, has_json: bool = True, **settings: Any
+    ) -> Callable[[Function], Function]:
+        """As typer has it."""
+        register = super().command(name, **settings)
+
+        def take(function: Function) -> Function:
+            register(_with_common(function, has_json=has_json))
+            return function
+
+        return take
+
+
+def _with_common(function: Callable[..., Any], *, has_json: bool) -> Callable[..., Any]:
+    """`function` with the common options behind its own."""
+
+    @functools.wraps(function)
+    def command(*args: Any, **options: Any) -> Any:
+        asked = {name: bool(options.pop(name, False)) for name in _COMMON}
+        wanted = Output(asked["common_quiet"], asked["common_verbose"], asked["common_json"])
+        with outputting(wanted):
+            return function(*args, **options)
+
+    added = {name: (kind, False) for name, kind in _COMMON.items() if has_json or name != "common_json"}
+    return with_parameters(command, function, added)
+
+
+def with_parameters(
+    command: Callable[..., Any],
+    function: Callable[..., Any],
+    added: Mapping[str, tuple[Any, object]],
+    without: str = "",
+) -> Callable[..., Any]:
+    """`command`, which typer then sees with the parameters of `function` but for `without`, and behind them those that
+    are added: an annotation and a default by name."""
+    own = inspect.signature(function, eval_str=True)
+    kept = [parameter for name, parameter in own.parameters.items() if name != without]
+    behind = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in added.items()
+    ]
+    cast("Any", command).__signature__ = own.replace(parameters=[*kept, *behind])
+    kinds = {parameter.name: parameter.annotation for parameter in (*kept, *behind)}
+    command.__annotations__ = {**kinds, "return": own.return_annotation}
+    return command

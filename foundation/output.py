@@ -1,0 +1,71 @@
+"""What a command says: its result on standard output, for people or as JSON, all else on standard error."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import typer
+
+from foundation.usage import one_line
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """quiet: nothing but the result and errors. verbose: events of no importance too, and where an error came from.
+    as_json: the result is one JSON document."""
+
+    quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
+
+
+_OUTPUT: ContextVar[Output] = ContextVar("output", default=Output())  # noqa: B039 - it is immutable
+
+
+def output() -> Output:
+    """What the command under way was asked for. In a thread of one's own: the defaults."""
+    return _OUTPUT.get()
+
+
+@contextmanager
+def outputting(wanted: Output) -> Generator[None]:
+    """`output()` gives this inside."""
+    before = _OUTPUT.set(wanted)
+    try:
+        yield
+    finally:
+        _OUTPUT.reset(before)
+
+
+def show(data: object, lines: Iterable[object]) -> None:
+    """The result of a command: `data` (values of JSON, dataclasses, arrays; what else there is as text; NaN and
+    infinities as null), or the lines."""
+    if output().as_json:
+        typer.echo(json.dumps(_plain(data), indent=2, default=str))
+        return
+    for line in lines:
+        typer.echo(line)
+
+
+def say(line: object) -> None:
+    """What goes on, in one line on standard error; nothing when quiet."""
+    if not output().quiet:
+        typer.echo(one_line(line), err=True)
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,103 @@
+"""The options that every command of both programs has, and that completion finds commands without importing them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from compensation.cli import app as compensate
+from foundation.command_app import App
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.output import output, say, show
+from stand.commands.commands import app as stand
+
+NOTHING_TO_SAY = {"stand serve", "stand queue start"}  # to a program, that is
+PROGRAMS = {"stand": stand, "compensate": compensate}
+
+
+def commands_of(name: str, group: Any) -> Iterator[tuple[str, Any]]:
+    """Every command below a group, by what is typed."""
+    context = group.make_context(name, [], resilient_parsing=True)
+    for word in group.list_commands(context):
+        _, found, _ = group.resolve_command(context, [word])
+        if hasattr(found, "list_commands"):
+            yield from commands_of(f"{name} {word}", found)
+        else:
+            yield f"{name} {word}", found
+
+
+EACH = [each for name, app in PROGRAMS.items() for each in commands_of(name, get_command(app))]
+
+
+@pytest.mark.parametrize(("typed", "command"), EACH, ids=[typed for typed, _ in EACH])
+def test_each_command_has_the_common_options(typed: str, command: Any):
+    words = {word for parameter in command.params for word in parameter.opts}
+    assert {"-q", "--quiet", "-v", "--verbose", "--version"} <= words
+    assert ("--json" in words) == (typed not in NOTHING_TO_SAY)
+
+
+def test_the_list_of_commands_is_whole():
+    typed = {typed for typed, _ in EACH}
+    assert len(typed) > 40
+    assert typed >= {"stand run", "stand session list", "stand queue add", "compensate fit", *NOTHING_TO_SAY}
+
+
+app = App()
+
+
+@app.command()
+def go(fail: bool = False) -> None:
+    """Example: go."""
+    with one_line_errors():
+        say("on the way")
+        if fail:
+            raise ConfigError("it is wrong")
+        show({"value": float("nan"), "verbose": output().verbose}, ["as people read it"])
+
+
+def test_the_result_goes_to_standard_output_and_all_else_elsewhere():
+    plain = CliRunner().invoke(app, [])
+    assert (plain.stdout, plain.stderr) == ("as people read it\n", "on the way\n")
+    asked = CliRunner().invoke(app, ["-q", "-v", "--json"])
+    assert (json.loads(asked.stdout), asked.stderr) == ({"value": None, "verbose": True}, "")
+    assert "thermostand" in CliRunner().invoke(app, ["--version"]).stdout
+
+
+def test_an_error_is_a_line_and_with_v_says_where_it_came_from():
+    quiet = CliRunner().invoke(app, ["--fail", "-q"])
+    assert (quiet.exit_code, quiet.stderr) == (2, "error: it is wrong\n")
+    verbose = CliRunner().invoke(app, ["--fail", "-v"])
+    assert "Traceback" in verbose.stderr
+    assert verbose.stderr.endswith("error: it is wrong\n")
+
+
+@pytest.mark.parametrize(
+    ("program", "words", "found"),
+    [
+        ("stand", "stand ses", "session"),
+        ("stand", "stand session li", "list"),
+        ("stand", "stand run --virt", "--virtual-time"),
+        ("compensate", "compensate dat", "datasheet"),
+    ],
+)
+def test_the_shell_completes_commands_and_options(program: str, words: str, found: str):
+    module = {"stand": "stand.cli", "compensate": "compensation.cli"}[program]
+    code = f"import sys; sys.argv[0] = {program!r}; from {module} import app; app()"
+    environment = {
+        **os.environ,
+        f"_{program.upper()}_COMPLETE": "complete_bash",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split()) - 1),
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == [found], done.stderr
