@@ -53,7 +53,8 @@ class SensorsConfig(Document):
     """Regulator and air thermometer, and values that do not change. A difference above warn_K for warn_after_s is a
     warning, one above trip_K for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A
     thermometer that is exactly constant for stuck_after_s is a warning; the regulator's value constant for
-    pv_stuck_after_s while the air goes air_moves_K is a fault.
+    pv_stuck_after_s while the air goes air_moves_K is a fault. A thermometer that goes more than jump_K within
+    jump_within_s from one reading to the next is a warning: a contact, a cable, not a temperature.
     """
 
     warn_K: float = Field(default=3.0, gt=0, le=20)
@@ -63,6 +64,8 @@ class SensorsConfig(Document):
     stuck_after_s: float = Field(default=900.0, ge=60, le=36000)
     pv_stuck_after_s: float = Field(default=60.0, ge=10, le=3600)
     air_moves_K: float = Field(default=1.0, gt=0, le=20)
+    jump_K: float = Field(default=2.0, gt=0, le=50)
+    jump_within_s: float = Field(default=15.0, gt=0, le=600)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

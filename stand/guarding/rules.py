@@ -34,6 +34,7 @@ from stand.guarding.interlocks import (
     stopped_while_permitted,
     trustworthy,
 )
+from stand.guarding.jumps import jumped
 from stand.guarding.needed_output import output_not_as_needed
 from stand.guarding.plausibility import (
     cooling_in_vain,
@@ -133,6 +134,10 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
         Watch(disagreement(PV, AIR, limits.trip_K), limits.trip_after_s),
         Watch(stuck_while_other_moves(PV, AIR, limits.air_moves_K, limits.pv_stuck_after_s), action="hold"),
         *(Watch(stuck(f"thermometers.{name}", limits.stuck_after_s), action="warn") for name in config.thermometers),
+        *(
+            Watch(jumped(f"thermometers.{name}", limits.jump_K, limits.jump_within_s), action="warn")
+            for name in config.thermometers
+        ),
     )
 
 
