@@ -40,6 +40,11 @@ def in_words(found: ViewCalibration, distance_mm: float) -> str:
     pixels = np.array([((width - 1) / 2, (height - 1) / 2), *corners], np.float64)
     middle, *others = COVERAGE * projection_sigma_um(found, pixels, distance_mm)
     return (
-        f"at {distance_mm:.0f} mm a point is known to {middle:.2g} um (k = {COVERAGE:g}) in the middle of the picture, "
-        f"to {max(others):.2g} um at its worst corner, beside the noise of its own picture"
+        f"at {distance_mm:.0f} mm a point is known to {_two_digits(middle)} um (k = {COVERAGE:g}) in the middle of the picture, "
+        f"to {_two_digits(max(others))} um at its worst corner, beside the noise of its own picture"
     )
+
+
+def _two_digits(value_um: float) -> str:
+    """3.1, 47, 960: never with an exponent."""
+    return f"{float(f'{value_um:.2g}'):g}"
