@@ -41,7 +41,8 @@ def in_words(found: ViewCalibration, distance_mm: float) -> str:
     middle, *others = COVERAGE * projection_sigma_um(found, pixels, distance_mm)
     return (
         f"at {distance_mm:.0f} mm a point is known to {_two_digits(middle)} um (k = {COVERAGE:g}) "
-        f"in the middle of the picture, to {_two_digits(max(others))} um at its worst corner, beside the noise of its own picture"
+        f"in the middle of the picture, to {_two_digits(max(others))} um at its worst corner, "
+        "beside the noise of its own picture"
     )
 
 
