@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Annotated, cast
 from urllib.parse import quote
 
@@ -15,12 +14,13 @@ from foundation.errors import ConfigError
 from foundation.output import show
 from foundation.usage import one_line
 from stand.commands.reached import on_stand
+from stand.commands.submitted import submit_recipe
 from stand.serving.client import API, Answer, Server
-from stand.serving.desk import DeviceState, QueuedRun
+from stand.serving.desk import DeviceState
 
 app = App()
 
-_LIMIT_S = 60.0  # the wires of the stand are asked when a run is queued, and a device may move for so long
+_LIMIT_S = 60.0  # a device may move for so long
 
 
 @app.command()
@@ -35,13 +35,7 @@ def submit(
 
     Example: stand submit night.yaml --key monday
     """
-    body: dict[str, object] = {"attended": attended, "key": key}
-    path = Path(recipe)
-    if path.is_file():
-        body["recipe_text"] = _text(path)
-    else:
-        body["recipe"] = recipe
-    run = QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, _LIMIT_S))
+    run = submit_recipe(server, recipe, attended=attended, key=key)
     show(run.model_dump(mode="json"), [run.id])
 
 
@@ -103,10 +97,3 @@ def _argument(text: str) -> tuple[str, object]:
     except ValueError:
         return name, value
     return name, found if isinstance(found, bool | int | float) else value
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text("utf-8")
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from error

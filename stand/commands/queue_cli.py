@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,88 +15,84 @@ from foundation.exit_codes import INTERRUPTED, one_line_errors
 from foundation.instants import date_time, duration
 from foundation.output import say, show
 from foundation.usage import one_line
-from stand.config.stand_config import load_config, packaged
+from stand.commands.queue_door import DaemonDoor, Door, OutOption, at_door, directory_of
+from stand.commands.reached import ConfigOption
 from stand.queueing import queue
-from stand.queueing.queue_file import Entry, Queue
+from stand.queueing.queue_file import Entry
 from stand.queueing.queue_run import conclude, run_entry
 from stand.queueing.queue_work import Notes, work
-from stand.running.order import load_order
 from stand.running.stop import Interrupted
+from stand.serving.desk import QueuedRun
 
 app = App(
     no_args_is_help=True,
     help="A queue of runs: add, list, move, remove, start.\n\nExample: stand queue add thermal-cycle",
 )
 
-ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
-OutOption = Annotated[
-    Path | None, typer.Option("--out", help="Where the queue is and its sessions go; else recording.directory.")
-]
 RunArgument = Annotated[int, typer.Argument(metavar="ID", help="The run's number in `stand queue list`.")]
 
+_OPEN = ("waiting", "interrupted")
 _COLUMNS = ("id", "next", "recipe", "state", "added (local)", "took", "session", "reason")
 
 
 @app.command()
+@at_door
 def add(
+    door: Door,
     recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
-    config: ConfigOption = "simulated",
-    out: OutOption = None,
 ) -> None:
     """Check a recipe and queue it as it is now: later edits of the files do not change it. Prints its number.
 
+    The daemon of the stand, when there is one, checks its wires and who answers there, too.
+
     Example: stand queue add thermal-cycle --config laboratory.yaml --out /data/sessions
     """
-    with one_line_errors():
-        order = load_order(recipe, config)
-        directory = out or order.config.recording.directory
-        number = queue.add(directory, order, config, WallClock().now_ns()).id
-        show({"id": number}, [number])
+    number = door.add(recipe)
+    show({"id": number}, [number])
 
 
 @app.command("list")
-def list_runs(config: ConfigOption = "simulated", out: OutOption = None) -> None:
+@at_door
+def list_runs(door: Door) -> None:
     """The runs in the queue: what has ended, what is running, what comes next.
 
     Example: stand queue list --out /data/sessions
     """
-    with one_line_errors():
-        directory = _directory(config, out)
-        found = queue.queued(directory)
-        texts = {"config_text", "recipe_text", "target_text"}
-        entries = [entry.model_dump(mode="json", exclude=texts) for entry in found.entries]
-        show({"halted": found.halted, "runs": entries}, queue_lines(found) if found.entries else ())
-        if not found.entries:
-            say(f"{directory}: nothing is queued there")
-        if found.halted:
-            say(f"halted by {found.halted}; remove the cause, then `stand queue start --clear`")
+    halted, runs = door.runs()
+    texts = {"config_text", "recipe_text", "target_text"}
+    entries = [run.model_dump(mode="json", exclude=texts) for run in runs]
+    show({"halted": halted, "runs": entries}, queue_lines(runs) if runs else ())
+    if not runs:
+        say(f"{door.name}: nothing is queued there")
+    if halted:
+        clear = "`stand clear`" if isinstance(door, DaemonDoor) else "`stand queue start --clear`"
+        say(f"halted by {halted}; remove the cause, then {clear}")
 
 
 @app.command()
+@at_door
 def move(
+    door: Door,
     number: RunArgument,
     position: Annotated[int, typer.Argument(help="1 is the next to be run.")],
-    config: ConfigOption = "simulated",
-    out: OutOption = None,
 ) -> None:
     """Change when a run that is still to be done has its turn.
 
     Example: stand queue move 5 1
     """
-    with one_line_errors():
-        queue.move(_directory(config, out), number, position)
-        show({"id": number, "position": position}, ())
+    door.move(number, position)
+    show({"id": number, "position": position}, ())
 
 
 @app.command()
-def remove(number: RunArgument, config: ConfigOption = "simulated", out: OutOption = None) -> None:
+@at_door
+def remove(door: Door, number: RunArgument) -> None:
     """Take a run out of the queue; what it has recorded stays.
 
     Example: stand queue remove 5
     """
-    with one_line_errors():
-        queue.remove(_directory(config, out), number)
-        show({"id": number}, ())
+    door.remove(number)
+    show({"id": number}, ())
 
 
 @app.command(has_json=False)
@@ -113,7 +110,7 @@ def start(
     Example: stand queue start --out /data/sessions
     """
     with one_line_errors():
-        directory = _directory(config, out)
+        directory = directory_of(config, out)
         if not queue.queued(directory).entries:
             say(f"{directory}: nothing is queued there")
             return
@@ -131,15 +128,15 @@ def start(
             raise typer.Exit(INTERRUPTED) from error  # its end has been reported
 
 
-def queue_lines(found: Queue) -> list[str]:
+def queue_lines(runs: Sequence[Entry | QueuedRun]) -> list[str]:
     """`stand queue list`: a line for each run, under their headings."""
-    turns = {entry.id: turn for turn, entry in enumerate((e for e in found.entries if e.is_open), 1)}
-    rows = [_COLUMNS, *(_cells(entry, turns.get(entry.id)) for entry in found.entries)]
+    turns = {run.id: turn for turn, run in enumerate((each for each in runs if each.state in _OPEN), 1)}
+    rows = [_COLUMNS, *(_cells(run, turns.get(run.id)) for run in runs)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def _cells(entry: Entry, turn: int | None) -> tuple[str, ...]:
+def _cells(entry: Entry | QueuedRun, turn: int | None) -> tuple[str, ...]:
     took = "" if entry.began_ns is None or entry.ended_ns is None else duration(entry.ended_ns - entry.began_ns)
     return (
         str(entry.id),
@@ -151,7 +148,3 @@ def _cells(entry: Entry, turn: int | None) -> tuple[str, ...]:
         one_line(entry.session),
         one_line(entry.reason),
     )
-
-
-def _directory(config: str, out: Path | None) -> Path:
-    return out or load_config(packaged("", config)).recording.directory

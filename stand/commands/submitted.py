@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 import uuid
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
 
+from foundation.documents import read_document
 from foundation.errors import ConfigError, SessionError, StandError
 from stand.config.stand_config import StandConfig
 from stand.running.claim import daemon_pid
@@ -22,6 +24,7 @@ from stand.watching.moment import Moment
 from stand.watching.there import There, event_line
 
 _LOOK_S = 0.5
+_QUEUE_LIMIT_S = 60.0  # the wires of the stand are asked when a run is queued
 _LOST_LIMIT_S = 60.0  # a daemon that does not answer for so long is not followed any more
 _LEVELS = ("warning", "error")
 
@@ -33,13 +36,28 @@ def daemon_of(config: StandConfig) -> Server | None:
     return None if found is None else Server(found.entry.session, found.socket)
 
 
+def submit_recipe(server: Server, recipe: str, *, attended: bool = False, key: str = "") -> QueuedRun:
+    """A file's recipe as it is now, or an installed one, checked and queued there; SessionError when the stand refuses
+    it."""
+    body: dict[str, object] = {"attended": attended, "key": key}
+    path = Path(recipe)
+    if path.is_file():
+        body["recipe_text"] = read_document(path)
+    else:
+        body["recipe"] = recipe
+    return _queued(server, body)
+
+
 def submit(server: Server, order: Order, out: Path | None) -> QueuedRun:
     """Checked and queued there; SessionError when the stand refuses it."""
     if out is not None and out.absolute() != Path(server.name):
         raise ConfigError(f"--out {out}: `stand serve` has this stand, and records to {server.name}")
-    body = {"recipe_text": order.recipe_text, "attended": order.attended, "key": uuid.uuid4().hex}
+    return _queued(server, {"recipe_text": order.recipe_text, "attended": order.attended, "key": uuid.uuid4().hex})
+
+
+def _queued(server: Server, body: Mapping[str, object]) -> QueuedRun:
     try:
-        return QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, 30.0))
+        return QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, _QUEUE_LIMIT_S))
     except ValidationError as error:
         raise SessionError(f"{server.name}: its daemon sent an unknown reply; is its version different?") from error
 

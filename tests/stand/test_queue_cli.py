@@ -1,7 +1,9 @@
 """The `stand queue` commands on real files; no run is begun."""
 
+import asyncio
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -9,6 +11,7 @@ from typer.testing import CliRunner, Result
 from stand.commands.queue_cli import app
 from stand.queueing import queue
 from stand.queueing.queue_file import QUEUE_NAME, State, working
+from tests.stand.a_desk import ADesk, served
 
 runner = CliRunner()
 
@@ -104,3 +107,34 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path):
     refused = invoke(tmp_path / "nowhere", "move", 1, 1)
     assert refused.exit_code == 1
     assert refused.stderr == f"error: {tmp_path / 'nowhere'}: no such folder; `stand queue add` makes it\n"
+
+
+async def test_a_queue_that_a_daemon_has_is_reached_through_it(tmp_path: Path):
+    async with served(ADesk(), tmp_path) as desk:
+
+        async def through(*arguments: object) -> Result:
+            return await asyncio.to_thread(invoke, tmp_path, *arguments)
+
+        assert (await through("add", "demo")).stdout == "1\n"
+        assert (await through("add", "warm-up")).stdout == "2\n"
+        lines = (await through("list")).stdout.splitlines()
+        assert [line.split()[:4] for line in lines[1:]] == [
+            ["1", "1", "demo", "waiting"],
+            ["2", "2", "warm-up", "waiting"],
+        ]
+        assert (await through("move", 2, 1)).exit_code == 0
+        assert (await through("remove", 1)).exit_code == 0
+        missing = await through("remove", 7)
+    assert [(verb, arguments) for _, verb, arguments in desk.orders][2:] == [
+        ("move", {"run": 2, "to": 1}),
+        ("cancel", {"run": 1}),
+    ]
+    assert (missing.exit_code, "no run 7" in missing.stderr) == (1, True)
+    assert not (tmp_path / QUEUE_NAME).exists()
+
+
+def test_a_night_that_the_disk_has_no_room_for_is_not_queued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("stand.commands.queue_door.shutil.disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    refused = invoke(tmp_path, "add", "demo")
+    assert (refused.exit_code, "GB are free" in refused.stderr) == (1, True)
+    assert not (tmp_path / QUEUE_NAME).exists()

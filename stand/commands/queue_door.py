@@ -1,0 +1,145 @@
+"""Where a queue is: with the daemon that works on it, else in the files of its folder."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import typer
+
+from foundation.clock import WallClock
+from foundation.command_app import with_parameters
+from foundation.errors import ConfigError, SessionError
+from foundation.exit_codes import one_line_errors
+from foundation.output import say
+from stand.commands.reached import ConfigOption, TokenOption, UrlOption
+from stand.commands.submitted import submit_recipe
+from stand.config.stand_config import load_config, packaged
+from stand.estimating.night import price_night
+from stand.estimating.room import existing, small_disk
+from stand.queueing import queue
+from stand.queueing.queue_file import Entry
+from stand.running.order import load_order
+from stand.serving.client import API, Server, server_at
+from stand.serving.desk import QueuedRun
+from stand.serving.presence import living
+
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help="Where the queue is and its sessions go; else recording.directory.")
+]
+
+
+class Door(Protocol):
+    """What can be done with a queue; ConfigError and SessionError say what is wrong."""
+
+    name: str
+
+    def add(self, recipe: str) -> int:
+        """Its number; checked before as far as can be."""
+        ...
+
+    def runs(self) -> tuple[str, list[Entry | QueuedRun]]:
+        """Why it is halted, "" when it is not, and the runs."""
+        ...
+
+    def move(self, number: int, position: int) -> None:
+        """1 is the next to be run."""
+        ...
+
+    def remove(self, number: int) -> None:
+        """What it has recorded stays."""
+        ...
+
+
+class DaemonDoor:
+    """The daemon checks wires, identities, the disk and its limits when it is given a run."""
+
+    def __init__(self, server: Server) -> None:
+        self.name = server.name
+        self._server = server
+
+    def add(self, recipe: str) -> int:
+        """As Door."""
+        return submit_recipe(self._server, recipe).id
+
+    def runs(self) -> tuple[str, list[Entry | QueuedRun]]:
+        """As Door."""
+        state = self._server.state()
+        return state.queue_halted, list(state.queue)
+
+    def move(self, number: int, position: int) -> None:
+        """As Door."""
+        self._server.request("POST", f"{API}/queue/{number}/move", {"to": position})
+
+    def remove(self, number: int) -> None:
+        """As Door."""
+        self._server.request("DELETE", f"{API}/queue/{number}")
+
+
+class FileDoor:
+    """The queue of a folder that no daemon has; nobody has opened its stand, so limits and the disk are checked."""
+
+    def __init__(self, directory: Path, config: str) -> None:
+        self.name = str(directory)
+        self._directory, self._config = directory, config
+
+    def add(self, recipe: str) -> int:
+        """As Door."""
+        order = load_order(recipe, self._config)
+        night = price_night(tuple(order.recipe.plan()), order.config, self._directory)
+        if lack := small_disk(shutil.disk_usage(existing(self._directory)).free, night.steps, order.config):
+            raise SessionError(f"{self._directory}: {lack}")
+        number = queue.add(self._directory, order, self._config, WallClock().now_ns()).id
+        if order.config.simulation is None:
+            say("no `stand serve` has this stand: its wires are asked when the run begins")
+        return number
+
+    def runs(self) -> tuple[str, list[Entry | QueuedRun]]:
+        """As Door."""
+        found = queue.queued(self._directory)
+        return found.halted, list(found.entries)
+
+    def move(self, number: int, position: int) -> None:
+        """As Door."""
+        queue.move(self._directory, number, position)
+
+    def remove(self, number: int) -> None:
+        """As Door."""
+        queue.remove(self._directory, number)
+
+
+def door(config: str, out: Path | None, url: str, token_file: Path | None) -> Door:
+    """The daemon at `url`; else the one of this machine that works on the queue of that folder; else its files."""
+    if url:
+        if out is not None:
+            raise ConfigError(f"--out {out}: the stand at {url} has its own folder")
+        return DaemonDoor(server_at(url, token_file))
+    directory = directory_of(config, out)
+    known = {str(directory.absolute()), str(directory.resolve())}
+    found = next((each for each in living() if known & {each.entry.session, each.entry.real_path}), None)
+    return FileDoor(directory, config) if found is None else DaemonDoor(Server(found.entry.session, found.socket))
+
+
+def directory_of(config: str, out: Path | None) -> Path:
+    """Where a queue and its sessions are."""
+    return out or load_config(packaged("", config)).recording.directory
+
+
+def at_door(function: Callable[..., None]) -> Callable[..., None]:
+    """A command whose first parameter is the Door it goes through: what finds that is taken from the command line.
+    Errors become sentences."""
+
+    def command(*arguments: Any, config: str, out: Path | None, url: str, token_file: Path | None, **more: Any) -> None:
+        with one_line_errors():
+            function(door(config, out, url, token_file), *arguments, **more)
+
+    command.__name__, command.__doc__ = function.__name__, function.__doc__
+    found_by: dict[str, tuple[Any, object]] = {
+        "config": (ConfigOption, "simulated"),
+        "out": (OutOption, None),
+        "url": (UrlOption, ""),
+        "token_file": (TokenOption, None),
+    }
+    return with_parameters(command, function, found_by, without="door")
