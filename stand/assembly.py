@@ -28,6 +28,7 @@ from foundation.hub import Hub
 from stand.chamber.chamber import ChamberLimits
 from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import StandConfig, packaged
+from stand.estimating.camera_lines import sharing
 from stand.fault import Fault
 from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
@@ -125,7 +126,9 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         thermometers=thermometers,
         axes={name: Axis(name, axis, clock) for name, axis in config.axes.items()},
         flap=_flap(config, clock),
-        cameras={name: make_camera(name, camera, clock) for name, camera in config.cameras.items()},
+        cameras={
+            name: make_camera(name, sharing(config, name) or camera, clock) for name, camera in config.cameras.items()
+        },
         inputs=inputs_of(config, bus, clock),
     )
     state_file = config.compressor.state_file

@@ -11,6 +11,7 @@ from drivers.wires import camera_dialects as words
 from drivers.wires.aravis import FLOAT_KINDS, GigeDevice
 from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_errors import is_silence
+from drivers.wires.camera_line import packet_delay_ns
 from drivers.wires.camera_settings import EffectiveSettings, GigeCameraSettings
 from foundation.clock import NS_PER_S
 from foundation.errors import Refused
@@ -54,7 +55,7 @@ def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) 
     exposure_s = set_exposure(name, device, settings, settings.exposure_s)
     gain, gain_dB = _set_gain(name, device, settings.gain_dB)
     source, rate, frame_rate_hz = _set_trigger(name, device, settings)
-    packet_size, packet_delay_ns = _set_packets(name, device, settings)
+    packet_size, delay_ns = _set_packets(name, device, settings)
     payload_bytes = round(device.get_number("PayloadSize"))  # last: it follows from region, format and chunks
     raw_step = f" x {step_s:g} s" if exposure == words.EXPOSURE_RAW else ""
     return EffectiveSettings(
@@ -65,7 +66,7 @@ def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) 
         gain_dB=gain_dB,
         frame_rate_hz=frame_rate_hz,
         packet_size=packet_size,
-        packet_delay_ns=packet_delay_ns,
+        packet_delay_ns=delay_ns,
         heartbeat_s=heartbeat_s,
         payload_bytes=payload_bytes,
         receive_buffer_bytes=_receive_buffer_bytes(payload_bytes),
@@ -289,9 +290,12 @@ def _set_packets(name: str, device: GigeDevice, settings: GigeCameraSettings) ->
             text = f"packets of {settings.packet_size} bytes were asked for, the camera takes {device.packet_size()}"
             raise Refused(name, text)
     frequency_Hz = device.read_register(TICK_FREQUENCY_HIGH) << 32 | device.read_register(TICK_FREQUENCY_LOW)
-    if settings.packet_delay_ns and not frequency_Hz:
-        raise Refused(name, "packet_delay_ns was asked for, the camera states no tick frequency")
-    ticks = -(-settings.packet_delay_ns * frequency_Hz // NS_PER_S)
+    delay_ns = settings.packet_delay_ns
+    if delay_ns is None:
+        delay_ns = packet_delay_ns(device.packet_size(), settings.line_Mbps, settings.line_shared_by or 1)
+    if delay_ns and not frequency_Hz:
+        raise Refused(name, f"{delay_ns} ns between packets were asked for, the camera states no tick frequency")
+    ticks = -(-delay_ns * frequency_Hz // NS_PER_S)
     if device.read_register(PACKET_DELAY_TICKS) != ticks:
         device.write_register(PACKET_DELAY_TICKS, ticks)
     taken = device.read_register(PACKET_DELAY_TICKS)

@@ -51,11 +51,13 @@ class GigeCameraSettings(CameraSettings):
     """A GigE Vision camera; all of it is written at each open.
 
     address: IP. packet_size: bytes of an IP packet; none lets Aravis find it. packet_delay_ns: pause between two
-    packets, for a host or switch that loses some. heartbeat_s: the camera frees itself after so long without us
-    (Aravis asks once a second). temperature: none looks for the usual features. resend: lost packets are asked for
-    again. buffers: frames that the host keeps in reserve. offset_x_px, offset_y_px: the first pixel of the region,
-    from which the image's pixels count. binning: so many by so many pixels become one, and all sizes count those.
-    exposure_step_s: of one step of ExposureTimeRaw, from its manual, for a camera that tells its exposure no other way.
+    packets; none leaves room for the cameras that the line is shared by. line_Mbps: rate of the line on which its
+    packets reach the host. line_shared_by: so many cameras, itself included; none: all of the stand. heartbeat_s: the
+    camera frees itself after so long without us (Aravis asks once a second). temperature: none looks for the usual
+    features. resend: lost packets are asked for again. buffers: frames that the host keeps in reserve. offset_x_px,
+    offset_y_px: the first pixel of the region, from which the image's pixels count. binning: so many by so many pixels
+    become one, and all sizes count those. exposure_step_s: of one step of ExposureTimeRaw, from its manual, for a
+    camera that tells its exposure no other way.
     """
 
     protocol: Literal["gige"] = "gige"
@@ -66,7 +68,9 @@ class GigeCameraSettings(CameraSettings):
     binning: int = Field(default=1, ge=1, le=16)
     exposure_step_s: float | None = Field(default=None, gt=0, le=1)
     packet_size: int | None = Field(default=None, ge=220, le=16112)
-    packet_delay_ns: int = Field(default=0, ge=0, le=1_000_000_000)
+    packet_delay_ns: int | None = Field(default=None, ge=0, le=1_000_000_000)
+    line_Mbps: float = Field(default=1000.0, gt=0, le=100_000)
+    line_shared_by: int | None = Field(default=None, ge=1, le=64)
     heartbeat_s: float = Field(default=3.0, ge=1.5, le=60)
     temperature: TemperatureFeature | None = None
     resend: bool = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from typing import Annotated
 
@@ -16,6 +17,7 @@ from foundation.ending import Ending
 from foundation.exit_codes import one_line_errors
 from foundation.output import say, show
 from stand.config.stand_config import load_config, packaged
+from stand.estimating.camera_lines import camera_lines
 from stand.estimating.estimate import PricedStep
 from stand.estimating.learned import load_learned
 from stand.estimating.night import price_night
@@ -57,8 +59,10 @@ def plan(
             f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
             f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
         )
-        data = {"steps": [step.as_json() for step in steps], **totals}
-        show(data, [*map(_line, steps), *back, total, str(learned)])
+        lines = camera_lines(order.config)
+        data = {"steps": [step.as_json() for step in steps], **totals, "cameras": [asdict(line) for line in lines]}
+        shared = [str(line) for line in lines if line.shared_by > 1]
+        show(data, [*map(_line, steps), *back, total, str(learned), *shared])
 
 
 @app.command()

@@ -27,6 +27,7 @@ from experiments.steps import (
 )
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
+from stand.estimating.camera_lines import overloaded
 from stand.estimating.durations import COOL_DOWN_AS_FOUND, LABORATORY_degC, Situation, axis_of, expect
 from stand.estimating.learned import Learned
 from stand.estimating.thermal_model import ChamberModel
@@ -246,6 +247,8 @@ def _check(planned: PlannedStep, config: StandConfig) -> None:
         raise ConfigError(
             f"{where}: needs a camera, and this stand has none; name it under cameras in the stand's file"
         )
+    if isinstance(step, Capture) and step.frames > 1 and (reason := overloaded(config, step.interval_s)):
+        raise ConfigError(f"{where}: {reason}")
     for name, camera in config.cameras.items():
         if isinstance(step, Capture) and step.frames > 1 and step.interval_s < 1 / camera.frame_rate_hz - 1e-9:
             raise ConfigError(

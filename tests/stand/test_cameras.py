@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from foundation.clock import VirtualClock
+from foundation.clock import VirtualClock, WallClock, seconds_ns
 from foundation.errors import ConfigError, Unreachable
 from foundation.readings import Frame
 from stand.imaging.cameras import Cameras
@@ -53,6 +53,21 @@ async def test_each_gives_a_frame_at_an_instant_of_its_own_and_the_first_is_due(
         ("camera.image", 500, 0.2),
         ("side.image", 1_000_000, 0.2),
     ]
+
+
+async def test_in_real_time_they_expose_together_a_millisecond_apart():
+    meeting = asyncio.Barrier(2)
+
+    class Together(Camera):
+        async def grab(self, exposure_s: float | None = None, due_ns: int = 0) -> Frame:
+            await asyncio.wait_for(meeting.wait(), 5)  # each waits for the other: one after the other would never end
+            return Frame(f"{self.name}.image", np.zeros((2, 3), np.uint8), due_ns, 0.1, 0.0, 40.0, 1, 0)
+
+    clock = WallClock()
+    cameras = {name: Together(name, cast("Any", clock)) for name in ("camera", "side")}
+    due_ns = clock.now_ns() + seconds_ns(1.0)
+    frames = await Cameras(cast("Any", cameras), clock).grab(0.1, due_ns)
+    assert [frame.time_ns - due_ns for frame in frames] == [0, 1_000_000]
 
 
 async def test_when_one_is_lost_there_is_a_frame_of_none_until_all_are_open_again(

@@ -1,0 +1,80 @@
+"""What the cameras of a stand need of the line they share, before any of them is opened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.devices.camera_gige import Settings as GigeSettings
+from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
+from drivers.wires.camera_pixels import frame_bytes
+from stand.config.stand_config import StandConfig
+
+_SENSOR_PX = (2448, 2048)  # of a camera whose size nobody states, as in the plan's estimate of the disk
+_PACKET_SIZE = 1500  # of a camera that finds its own: what every network carries
+
+
+@dataclass(frozen=True, slots=True)
+class CameraLine:
+    """One camera's part. delay_ns: between two of its packets. frame_s: from the first to the last of a frame.
+    share: of the line's time at the camera's frame_rate_hz, 0..1."""
+
+    name: str
+    shared_by: int
+    line_Mbps: float
+    packet_size: int
+    delay_ns: int
+    frame_s: float
+    share: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name}: {self.shared_by} on a line of {self.line_Mbps:g} Mbit/s, {self.delay_ns / 1e3:.1f} us "
+            f"between packets of {self.packet_size} bytes, a frame takes {self.frame_s:.2f} s, "
+            f"{self.share:.0%} of the line's time"
+        )
+
+
+def sharing(config: StandConfig, name: str) -> GigeSettings | None:
+    """A GigE camera's settings, with the number of cameras on its line when they are several; None for a camera of
+    another kind."""
+    settings = config.cameras[name]
+    if not isinstance(settings, GigeSettings):
+        return None
+    all_of_them = sum(isinstance(each, GigeSettings) for each in config.cameras.values())
+    if all_of_them == 1 or settings.line_shared_by is not None:
+        return settings
+    return settings.model_copy(update={"line_shared_by": all_of_them})
+
+
+def camera_lines(config: StandConfig) -> tuple[CameraLine, ...]:
+    """Of each GigE camera, in the order of the stand's file."""
+    lines: list[CameraLine] = []
+    for name in config.cameras:
+        settings = sharing(config, name)
+        if settings is None:
+            continue
+        shared_by, packet_size = settings.line_shared_by or 1, settings.packet_size or _PACKET_SIZE
+        delay_ns = settings.packet_delay_ns
+        if delay_ns is None:
+            delay_ns = packet_delay_ns(packet_size, settings.line_Mbps, shared_by)
+        pixels = (settings.width_px or _SENSOR_PX[0]) * (settings.height_px or _SENSOR_PX[1])
+        size = frame_bytes(settings.pixel_format, pixels)
+        alone_s = frame_wire_s(size, packet_size, settings.line_Mbps)
+        frame_s = frame_wire_s(size, packet_size, settings.line_Mbps, delay_ns)
+        lines.append(
+            CameraLine(
+                name, shared_by, settings.line_Mbps, packet_size, delay_ns, frame_s, alone_s * settings.frame_rate_hz
+            )
+        )
+    return tuple(lines)
+
+
+def overloaded(config: StandConfig, interval_s: float) -> str:
+    """Why the line does not carry a frame of each camera every `interval_s`, "" when it does."""
+    for line in camera_lines(config):
+        if line.frame_s > interval_s:
+            return (
+                f"a frame every {interval_s} s is faster than the line of {line.line_Mbps:g} Mbit/s that "
+                f"{line.shared_by} cameras share: a frame of cameras.{line.name} takes {line.frame_s:.2f} s"
+            )
+    return ""

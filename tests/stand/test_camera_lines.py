@@ -1,0 +1,68 @@
+"""Cameras on one line: the pause between their packets, and what the line carries."""
+
+import pytest
+import yaml
+
+from drivers.devices.camera_gige import Camera
+from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
+from foundation.clock import WallClock
+from foundation.documents import parse_document
+from foundation.errors import ConfigError
+from foundation.hub import Hub
+from stand.assembly import assemble
+from stand.config.recipe import Recipe
+from stand.config.stand_config import StandConfig, packaged
+from stand.estimating.camera_lines import camera_lines
+from stand.estimating.estimate import price
+
+RECIPE = """
+name: captures
+experiments:
+  - calibration: {equilibrium_s: 60, linear_mm: [0], rotary_deg: [0], frames_per_position: 2}
+"""
+
+
+def of(cameras: int, **changes: object) -> StandConfig:
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    own = {"boot_s": 4.0, "packet_size": 8000, **changes}
+    names = ["camera", "left", "right", *(f"other{number}" for number in range(cameras))][:cameras]
+    data["cameras"] = {name: {"address": f"127.0.1.{number + 1}", **own} for number, name in enumerate(names)}
+    return parse_document(yaml.safe_dump(data), StandConfig, "stand")
+
+
+def test_between_two_packets_of_one_camera_there_is_room_for_one_of_each_other():
+    on_wire_ns = 8038 * 8  # a byte takes 8 ns at 1 Gbit/s, and Ethernet adds 38 to a packet
+    assert packet_delay_ns(8000, 1000.0, 1) == 0
+    assert packet_delay_ns(8000, 1000.0, 3) == pytest.approx(2 * on_wire_ns, rel=0.11)
+    assert packet_delay_ns(8000, 1000.0, 3) >= 2 * on_wire_ns
+    assert packet_delay_ns(8000, 10_000.0, 3) == pytest.approx(packet_delay_ns(8000, 1000.0, 3) / 10, abs=1)
+
+
+def test_a_frame_takes_as_long_as_its_packets_and_their_pauses():
+    packets = 5_013_504 // 7964 + 1 + 2  # payloads, leader and trailer
+    assert frame_wire_s(5_013_504, 8000, 1000.0) == pytest.approx(packets * 64.304e-6)
+    assert frame_wire_s(5_013_504, 8000, 1000.0, 100_000) == pytest.approx(packets * 164.304e-6)
+
+
+def test_three_cameras_of_5_MP_at_2_frames_a_second_fit_on_one_line():
+    lines = camera_lines(of(3))
+    assert [line.shared_by for line in lines] == [3, 3, 3]
+    assert sum(line.share for line in lines) == pytest.approx(0.244, abs=0.002)
+    assert all(line.frame_s < 0.5 for line in lines)
+    assert str(lines[0]).startswith("camera: 3 on a line of 1000 Mbit/s, 141.5 us between packets of 8000 bytes")
+
+
+def test_what_the_line_does_not_carry_is_refused_before_the_night():
+    with pytest.raises(ConfigError, match=r"faster than the line of 1000 Mbit/s that 16 cameras share"):
+        price(parse_document(RECIPE, Recipe, "recipe").plan(), of(16))
+    with pytest.raises(ConfigError, match=r"faster than the line of 100 Mbit/s that 3 cameras share"):
+        price(parse_document(RECIPE, Recipe, "recipe").plan(), of(3, line_Mbps=100))
+    assert price(parse_document(RECIPE, Recipe, "recipe").plan(), of(3))
+
+
+def test_each_camera_is_told_how_many_share_its_line():
+    cameras = assemble(of(3), Hub(), WallClock()).devices.cameras.values()
+    assert [camera.settings.line_shared_by for camera in cameras if isinstance(camera, Camera)] == [3, 3, 3]
+    own = assemble(of(2, line_shared_by=1), Hub(), WallClock()).devices.cameras["camera"]
+    assert isinstance(own, Camera)
+    assert own.settings.line_shared_by == 1
