@@ -6,7 +6,7 @@ Pixels as in markers/detection.py: x = column = I to the right, y = row = J down
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from itertools import islice
@@ -21,8 +21,8 @@ from compensation.history.history import History, recorded_history
 from compensation.one_camera import others_ns
 from compensation.one_equilibrium import check_sessions
 from experiments.steps import Role
-from foundation.documents import parse_document
-from foundation.errors import SessionError
+from foundation.documents import parse_document, yaml_data
+from foundation.errors import ConfigError, SessionError
 from foundation.progress import Report, unwatched
 from foundation.readings import Frame
 from markers.noise import Noise, estimate_noise
@@ -44,7 +44,8 @@ _PREVIEW_WIDTH_PX = 816
 @dataclass(frozen=True, slots=True)
 class SessionFacts:
     """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
-    segments that a killed recorder left behind and that were not read. utc: from its instants to UTC."""
+    segments that a killed recorder left behind and that were not read. utc: from its instants to UTC. spots: what a
+    thermal imager saw of the camera, name -> (time_ns, degC)."""
 
     session_id: str
     recipe: str
@@ -54,6 +55,9 @@ class SessionFacts:
     simulated: bool | None
     incomplete: int
     utc: UtcOffsets = field(default_factory=UtcOffsets)
+    spots: Mapping[str, tuple[NDArray[np.int64], Float]] = field(
+        default_factory=dict[str, tuple[NDArray[np.int64], Float]], compare=False
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,7 +265,21 @@ def _facts(session: Session) -> SessionFacts:
     fields = ("session_id", "recipe", "camera_serial", "operator", "software_version")
     texts = {name: session.metadata.get(name, "") for name in fields}
     simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
-    return SessionFacts(**texts, simulated=simulated, incomplete=len(session.incomplete), utc=session.utc)
+    return SessionFacts(
+        **texts, simulated=simulated, incomplete=len(session.incomplete), utc=session.utc, spots=_spots(session)
+    )
+
+
+def _spots(session: Session) -> dict[str, tuple[NDArray[np.int64], Float]]:
+    """The thermal imager's; nothing is read where the stand had none."""
+    try:
+        config = yaml_data(session.attachment("config.yaml") or "", "config.yaml")
+    except ConfigError:
+        return {}
+    if not isinstance(config, dict) or "imager" not in config:
+        return {}
+    names = [name for name in session.channels() if name.startswith("imager.") and name != "imager.clock_offset"]
+    return {name.removeprefix("imager."): session.readings(name) for name in names}
 
 
 def _preview(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:

@@ -53,4 +53,14 @@ class Batch:
     readings: tuple[Reading, ...]
 
 
-Item = Batch | Frame | Event | StepMark
+@dataclass(frozen=True, slots=True)
+class Original:
+    """A picture file as a device gave it, unchanged: `data` is the whole of it, `name` without a folder."""
+
+    time_ns: int
+    device: str
+    name: str
+    data: bytes
+
+
+Item = Batch | Frame | Event | StepMark | Original

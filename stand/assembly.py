@@ -18,6 +18,7 @@ from drivers.devices.protocols import Controller, Sensor, Switches
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays, RelaysSettings
 from drivers.devices.stage import Axis
+from drivers.devices.thermal_imager import ThermalImager
 from drivers.devices.thermometers import Thermometers
 from drivers.settings import EquilibriumSettings, OnBus
 from drivers.wires.bus import Bus
@@ -69,6 +70,11 @@ class Assembly:
             *((devices.cameras[name], camera.poll_s) for name, camera in config.cameras.items()),
             (devices.flap, config.flap.poll_s),
             *((devices.axes[name], axis.poll_s) for name, axis in config.axes.items()),
+            *(
+                ((devices.imager, config.imager.poll_s),)
+                if devices.imager is not None and config.imager is not None
+                else ()
+            ),
         ]
         pollers = tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
         for poller in pollers:
@@ -130,6 +136,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
             name: make_camera(name, sharing(config, name) or camera, clock) for name, camera in config.cameras.items()
         },
         inputs=inputs_of(config, bus, clock),
+        imager=config.imager and ThermalImager("imager", config.imager, clock, hub.publish),
     )
     state_file = config.compressor.state_file
     if state_file is None and not isinstance(clock, VirtualClock):  # what is simulated leaves no traces

@@ -23,8 +23,9 @@ class Poller:
     """Polls `sensor` every `period_s` (absolute deadlines) until cancelled; 1 s after a poll that failed on the wire.
 
     `first()` must succeed before `run()`: what it returns defines which channels to declare BAD when a later read
-    fails. mark: what is published of the readings of a poll at an instant (ns); it may mark some as STALE. A device
-    whose read takes longer than the period is an event, and one more when it is within half a period again.
+    fails; a device that has nothing new gives none, and none are published. mark: what is published of the readings of
+    a poll at an instant (ns); it may mark some as STALE. A device whose read takes longer than the period is an event,
+    and one more when it is within half a period again.
     """
 
     sensor: Sensor
@@ -85,6 +86,8 @@ class Poller:
             self.hub.publish(Event(self.clock.now_ns(), "info", "device_fast", text, data))
 
     def _publish(self, readings: tuple[Reading, ...]) -> None:
+        if not readings:
+            return
         readings = self._known = self.mark(readings, self.clock.now_ns())
         self.hub.publish(Batch(self.sensor.name, self.clock.now_ns(), readings))
 

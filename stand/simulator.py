@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from pathlib import Path
 
 from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
@@ -67,6 +68,7 @@ def laboratory_of(
             }
             for name, camera in config.cameras.items()
         },
+        "imager": _imager_of(config, is_anywhere=is_anywhere),
         "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
     }
 
@@ -84,6 +86,14 @@ def _inputs_of(config: StandConfig) -> dict[str, object]:
         "input_channels": {name: each.channel for name, each in contacts.items()},
         "inputs_closed": [each.channel for each in contacts.values() if each.fault_when == "open"],
     }
+
+
+def _imager_of(config: StandConfig, *, is_anywhere: bool) -> dict[str, object] | None:
+    """The fake imager, which sees each spot where the stand looks for it."""
+    if config.imager is None:
+        return None
+    spots = {name: [spot.x_px, spot.y_px] for name, spot in config.imager.spots.items()}
+    return {"folder": None if is_anywhere else str(config.imager.folder), "spots": spots}
 
 
 def _chamber_of(config: StandConfig, address_of: Callable[[str | None], str | None]) -> dict[str, object] | None:
@@ -113,6 +123,7 @@ def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
             and config.climate_chamber.model_copy(update={"address": addresses["regulator"]}),
             "flap": config.flap.model_copy(update={"backend_address": addresses["flap"]}),
             "cameras": cameras,
+            "imager": config.imager and config.imager.model_copy(update={"folder": Path(addresses["imager"])}),
             "simulation": simulation and simulation.model_copy(update={"control": addresses["control"]}),
         }
     )

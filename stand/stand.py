@@ -9,6 +9,7 @@ from drivers.devices.flap import Flap
 from drivers.devices.inputs import Inputs
 from drivers.devices.protocols import Actuator, Camera, Controller, Switches
 from drivers.devices.stage import Axis
+from drivers.devices.thermal_imager import ThermalImager
 from drivers.devices.thermometers import Thermometers
 from foundation.clock import Clock
 from foundation.hub import Hub
@@ -37,6 +38,7 @@ class Devices:
     flap: Flap
     cameras: Mapping[str, Camera]
     inputs: Inputs | None = None
+    imager: ThermalImager | None = None
 
 
 class Stand:

@@ -16,6 +16,7 @@ from compensation.reporting.figures import (
     COORDINATES,
     FULL_WIDTH_IN,
     GREY,
+    SPOT_COLOURS,
     WARM_UP_COLOUR,
     legend_above,
     new_figure,
@@ -59,30 +60,52 @@ def _curve(axes: Axes, x: Float, y: Float, colour: str, label: str | None) -> No
 
 
 def against_time(observations: Observations) -> Figure:
-    """Mean drift along I and J, and below it the temperatures, against the hours since the first frame.
+    """Mean drift along I and J, and below it the temperatures, against the hours since the first frame; at the foot
+    those that a thermal imager saw, where there was one.
 
     Time between sessions is left out; a session begins at a dashed line. Frames of a target that was moved on purpose
     are not drift: they are a grey band.
     """
     hours, starts = _recorded_hours(observations)
     mean = mean_over_markers(moved_px(observations))
+    has_spots = any(session.spots for session in observations.sessions)
     with style():
-        figure, (above, below) = new_figure(FULL_WIDTH_IN, 4.6, 2, 1)
+        figure, (above, below, *foot) = new_figure(FULL_WIDTH_IN, 6.4 if has_spots else 4.6, 3 if has_spots else 2, 1)
         runs = _runs(observations)
         for (name, colour), values in zip(COORDINATES, mean.T, strict=True):
             _broken_curve(above, hours, values, runs, colour, f"mean drift, {name}")
         _broken_curve(below, hours, observations.camera_degC, runs, CAMERA_COLOUR, "camera")
         _broken_curve(below, hours, observations.air_degC, runs, GREY, "air near the camera")
-        for axes in (above, below):
+        for axes in foot:
+            _spots(axes, observations, starts)
+        for axes in (above, below, *foot):
             _bands(axes, hours, observations, (str(Role.WARM_UP),), WARM_UP_COLOUR, "warm-up")
             _bands(axes, hours, observations, MOVED_ON_PURPOSE, "#bbbbbb", "target moved")
             for start in starts[1:]:
                 axes.axvline(start, color=GREY, linewidth=0.8, linestyle="--")
         above.set_ylabel("drift (px)")
-        below.set(ylabel="temperature (°C)", xlabel="time since the first frame (h)")
-        legend_above(above, columns=4)
-        legend_above(below, columns=4)
+        below.set_ylabel("temperature (°C)")
+        (foot or [below])[-1].set_xlabel("time since the first frame (h)")
+        for axes in (above, below, *foot):
+            legend_above(axes, columns=4)
     return figure
+
+
+def _spots(axes: Axes, observations: Observations, starts: Sequence[float]) -> None:
+    """What the thermal imager saw, from the first to the last frame of each session."""
+    names = list(dict.fromkeys(name for session in observations.sessions for name in session.spots))
+    for index, (session, start) in enumerate(zip(observations.sessions, starts, strict=True)):
+        own = observations.time_ns[observations.session == index]
+        for number, name in enumerate(names):
+            if name not in session.spots:
+                continue
+            times_ns, degC = session.spots[name]
+            within = (times_ns >= own[0]) & (times_ns <= own[-1])
+            hours = start + (times_ns[within] - own[0]) / _NS_PER_H
+            drawn = thinned(len(hours), CURVE_POINTS)
+            colour = SPOT_COLOURS[number % len(SPOT_COLOURS)]
+            axes.plot(hours[drawn], degC[within][drawn], color=colour, linewidth=0.9, label=None if index else name)
+    axes.set_ylabel("thermal imager (°C)")
 
 
 def _recorded_hours(observations: Observations) -> tuple[Float, list[float]]:

@@ -34,6 +34,8 @@ def drift_section(observations: Observations, numbers: Numbers) -> Iterator[Part
 
 def _time_caption(observations: Observations) -> str:
     text = "Mean drift of the markers, and the temperatures, at each frame."
+    if any(session.spots for session in observations.sessions):
+        text += " At the foot what a thermal imager saw of the camera: it is right to 2 K, and shows how parts warm."
     if len(observations.sessions) > 1:
         text += " A session begins at each dashed line; the time between them is left out."
     if (observations.role == str(Role.WARM_UP)).any():

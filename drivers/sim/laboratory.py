@@ -24,6 +24,7 @@ from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.regulator import FakeRegulator
 from drivers.sim.relays import FakeRelays
 from drivers.sim.scene import Scene, SceneSpec
+from drivers.sim.thermal_imager import FakeThermalImager
 from drivers.sim.thermometers import FakeThermometers
 from drivers.sim.usb import UsbServer
 from drivers.sim.wire import Engine, PtyWire, TcpWire
@@ -74,6 +75,13 @@ class ChamberUnitSpec(Document):
     limits_degC: tuple[float, float] | None = None
 
 
+class ImagerSpec(Document):
+    """A thermal imager: where its pictures go, None for a folder of its own, and where it sees what (x, y in px)."""
+
+    folder: Path | None
+    spots: dict[str, tuple[int, int]]
+
+
 class LaboratorySpec(Document):
     """What the simulator process reads on its standard input.
 
@@ -100,6 +108,7 @@ class LaboratorySpec(Document):
     axes: dict[Literal["linear", "rotary"], AxisSpec]
     flap: EndpointSpec
     cameras: dict[str, CameraSpec]
+    imager: ImagerSpec | None = None
     camera_boot_s: float = Field(default=3.0, ge=0)
     faults: tuple[str, ...] = ()
 
@@ -139,6 +148,7 @@ class Laboratory:
         self._regulator: FakeRegulator | None = None
         self._relays: FakeRelays | None = None
         self._chamber: FakeClimateChamber | None = None
+        self._imager: FakeThermalImager | None = None
         self.ssr_welded_share = 0.0
         self.camera_sensor_degC: float | None = None
         self._closers: list[Callable[[], None]] = []
@@ -177,6 +187,11 @@ class Laboratory:
     def chamber(self) -> FakeClimateChamber:
         """The climate chamber with a controller of its own; ValueError when there is none."""
         return _there(self._chamber, "climate chamber of its own")
+
+    @property
+    def imager(self) -> FakeThermalImager:
+        """The thermal imager; ValueError when there is none."""
+        return _there(self._imager, "thermal imager")
 
     @property
     def now_ns(self) -> int:
@@ -264,6 +279,10 @@ class Laboratory:
         usb = UsbServer(*tcp_place(spec.flap.address or "", may_be_free=True), [self.flap])
         self._closers.append(usb.close)
         self.addresses["flap"] = usb.address
+        if spec.imager is not None:
+            self._imager = FakeThermalImager(plant, spec.imager.folder, spec.imager.spots, spec.seed)
+            self._closers.append(self._imager.close)
+            self.addresses["imager"] = str(self._imager.folder)
         for name, settings in spec.cameras.items():
             is_first = not self.cameras
             camera = self._camera(settings, Scene(SceneSpec(), spec.seed if is_first else spec.seed + _noise_of(name)))

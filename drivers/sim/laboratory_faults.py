@@ -18,6 +18,7 @@ from drivers.sim.flap import (
 )
 from drivers.sim.laboratory import Laboratory
 from drivers.sim.link_faults import LINK_FAULTS, set_link_fault
+from drivers.sim.thermal_imager import SERIAL_NUMBER
 from drivers.sim.ximc import FakeAxis
 from drivers.sim.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
 from foundation.clock import seconds_ns
@@ -337,6 +338,17 @@ FAULTS: dict[str, Fault] = {
     "flap.timeout": Fault(_to(lambda lab: lab.flap, "timeout"), True, False, "its transfers time out"),
     "flap.short_read": Fault(_to(lambda lab: lab.flap, "short_read"), True, False, "half of each reply"),
     "flap.restart": Fault(_once(_restart_flap), True, False, "its controller restarts"),
+    # The thermal imager.
+    "imager.stopped": Fault(_to(lambda lab: lab.imager, "stopped"), True, False, "stores no more pictures"),
+    "imager.cut": Fault(_to(lambda lab: lab.imager, "cut"), True, False, "its files end too early; mended, they go on"),
+    "imager.plain": Fault(_to(lambda lab: lab.imager, "plain"), True, False, "pictures without temperatures"),
+    "imager.damaged": Fault(_to(lambda lab: lab.imager, "damaged"), True, False, "the counts lack their end"),
+    "imager.clock_s": Fault(_to(lambda lab: lab.imager, "clock_s", _number), 3600.0, 0.0, "its clock is ahead by this"),
+    "imager.serial_number": Fault(
+        _to(lambda lab: lab.imager, "serial_number", str), "49009999", SERIAL_NUMBER, "pictures of another imager"
+    ),
+    "imager.again": Fault(_to(lambda lab: lab.imager, "again"), True, False, "the last picture under new names"),
+    "imager.unplugged": Fault(_to(lambda lab: lab.imager, "unplugged"), True, False, "its folder is gone"),
     # The camera that is named so, or the first.
     "camera.loss": Fault(
         _to(lambda lab: lab.camera.faults, "loss", _number), 0.05, 0.0, "share of stream packets lost"

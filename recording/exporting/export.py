@@ -72,6 +72,7 @@ steps.csv, events.csv     what was done, and what happened
 notes.csv                 what people said of it, if anybody did
 frames.csv (or .parquet)  every frame: its file, when, what for, set-point, temperatures, stages (columns below)
 telemetry/                one table for each topic; camera_meta describes every frame
+originals/                the pictures of the thermal imager, if there is one, as it stored them
 frames/000001.png, .txt   each frame in order of time, and the temperatures at its time; index.csv has all of these
 
 Times    time_ns is the stand's clock, in ns since 1970: it never steps, so take differences of it. time_utc is UTC as
@@ -116,6 +117,7 @@ def export(
             _write_frames(session, folder / "frames", work)
         if session.frame_count:
             _write_frames_table(session, folder, frames, telemetry or "csv")
+        _write_originals(session, folder / "originals")
 
 
 class _Work:
@@ -289,6 +291,13 @@ def _write_frames_table(session: Session, folder: Path, has_images: bool, table_
     with closing(TABLES[table_format](folder / f"frames.{table_format}", columns)) as table:
         for row in rows:
             table.add(row)
+
+
+def _write_originals(session: Session, folder: Path) -> None:
+    for number, original in enumerate(session.originals(), 1):
+        folder.mkdir(exist_ok=True)
+        plain = "".join(each if each.isalnum() or each in "._-" else "_" for each in original.name)
+        (folder / f"{number:04d}-{plain[-100:]}").write_bytes(original.data)
 
 
 def _png(image: RecordedImage) -> bytes:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Channel
 
-from foundation.items import Batch, Event, StepMark
+from foundation.items import Batch, Event, Original, StepMark
 from foundation.readings import Frame
 from recording.format import messages
 from recording.format.damage import naming
@@ -106,10 +106,16 @@ def description_of(message: Message) -> tuple[int, messages.FrameMeta]:
 
 def stands_for_item(channel: Channel) -> bool:
     """Whether each message of a channel is an item; not so the log and the table's pose, which the recorder derives."""
-    return channel.topic in {*messages.KIND_OF_TOPIC, messages.STEP, messages.EVENT, messages.CAMERA_META}
+    return channel.topic in {
+        *messages.KIND_OF_TOPIC,
+        messages.STEP,
+        messages.EVENT,
+        messages.CAMERA_META,
+        messages.ORIGINAL,
+    }
 
 
-def item_of(message: Message) -> Batch | StepMark | Event | None:
+def item_of(message: Message) -> Batch | StepMark | Event | Original | None:
     """The item that a message stands for; None when that is a frame."""
     match message.topic:
         case messages.STEP:
@@ -118,6 +124,8 @@ def item_of(message: Message) -> Batch | StepMark | Event | None:
             return event_of(message)
         case messages.CAMERA_META:
             return None
+        case messages.ORIGINAL:
+            return messages.decode_original(message.data, message.time_ns)
         case topic:
             return messages.decode_batch(topic, message.data, message.time_ns)
 

@@ -6,7 +6,8 @@ beside it; a quantity the device did not give is NaN and ABSENT, so that no view
 in full each reading the fixed fields cannot carry: it has a reason, an instant of its own, or no field. Images are in
 recording/format/images.py.
 
-Field numbers follow the order of the tables below. They are the file format: append, never reorder.
+Field numbers follow the order of the tables here and of recording/format/kinds.py. They are the file format: append,
+never reorder.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -29,8 +31,9 @@ from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from foundation.errors import SessionError
-from foundation.items import Batch, Event, StepMark, StepState
+from foundation.items import Batch, Event, Original, StepMark, StepState
 from foundation.readings import Cause, Frame, Quality, Reading
+from recording.format.kinds import KIND_OF_TOPIC, KINDS, Kind
 from recording.format.old_sentences import data_of_sentence
 
 CAMERA_META = "/camera/meta"
@@ -38,6 +41,7 @@ TABLE_POSE = "/table/pose"
 STEP = "/experiment/step"
 EVENT = "/experiment/event"
 LOG = "/log"
+ORIGINAL = "/imager/original"
 
 DOUBLE = FieldDescriptorProto.TYPE_DOUBLE
 STRING = FieldDescriptorProto.TYPE_STRING
@@ -52,71 +56,6 @@ QUALITY_OF_NUMBER = {number: quality for quality, number in QUALITY_NUMBER.items
 ABSENT = 0
 
 _pool = descriptor_pool.Default()
-
-
-@dataclass(frozen=True, slots=True)
-class Quantity:
-    """One quantity of a device ("device.name" in `unit`) and the field that carries it."""
-
-    name: str
-    unit: str
-    field: str
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """What a kind of device measures, and where that is recorded."""
-
-    topic: str
-    schema: str
-    quantities: tuple[Quantity, ...]
-
-
-THERMOMETERS = ("granite_inside", "granite_outside", "artifact", "air", "laboratory")
-KINDS: Mapping[str, Kind] = {
-    "thermometers": Kind(
-        "/sensors/temperature",
-        "Temperatures",
-        (
-            *(Quantity(place, "degC", f"{place}_degC") for place in THERMOMETERS),
-            *(Quantity(f"{place}_raw", "1", f"{place}_raw") for place in THERMOMETERS),
-        ),
-    ),
-    "regulator": Kind(
-        "/chamber/state",
-        "ChamberState",
-        (
-            Quantity("pv", "degC", "actual_degC"),
-            Quantity("sp", "degC", "set_point_degC"),
-            Quantity("mv_heat", "%", "heating_percent"),
-            Quantity("mv_cool", "%", "cooling_percent"),
-            Quantity("running", "1", "running"),
-            Quantity("fault", "1", "fault"),
-        ),
-    ),
-    "relays": Kind(
-        "/relays/state",
-        "RelayState",
-        tuple(Quantity(relay, "1", relay) for relay in ("heater_enable", "compressor", "camera_power")),
-    ),
-    "camera": Kind("/camera/temperature", "Temperature", (Quantity("temperature", "degC", "temperature_degC"),)),
-    "axis": Kind(
-        "/table/state",
-        "TableState",
-        (
-            Quantity("position", "mm", "position_mm"),
-            Quantity("position", "deg", "position_deg"),
-            Quantity("moving", "1", "moving"),
-            Quantity("homed", "1", "homed"),
-        ),
-    ),
-    "flap": Kind(
-        "/flap/state",
-        "FlapState",
-        (Quantity("position", "1", "position"), Quantity("current", "mA", "current_mA")),
-    ),
-}
-KIND_OF_TOPIC = {kind.topic: kind for kind in KINDS.values()}
 
 
 def _field(
@@ -196,6 +135,7 @@ CLASSES: Mapping[str, type[Message]] = {
     STEP: _Step,
     EVENT: _Event,
     LOG: Log,
+    ORIGINAL: CompressedImage,
 }
 
 CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "alarm"}
@@ -369,6 +309,19 @@ def encode_log(event: Event) -> bytes:
     """The event as foxglove.Log, for the viewers' log panels."""
     level = LOG_LEVEL.get(event.level, Log.UNKNOWN)
     return Log(timestamp=timestamp(event.time_ns), level=level, name=event.kind, message=event.text).SerializeToString()
+
+
+def encode_original(original: Original) -> bytes:
+    """A picture as its file was, as foxglove.CompressedImage whose frame is `device/name`."""
+    stamp, frame = timestamp(original.time_ns), f"{original.device}/{original.name}"
+    return CompressedImage(timestamp=stamp, frame_id=frame, data=original.data, format="jpeg").SerializeToString()
+
+
+def decode_original(data: bytes, time_ns: int) -> Original:
+    """The inverse of encode_original; SessionError when it is not one."""
+    message = _parse(ORIGINAL, data)
+    device, _, name = str(_get(message, "frame_id")).partition("/")
+    return Original(time_ns, device, name, _get(message, "data"))
 
 
 def encode_table_pose(time_ns: int, linear_mm: float, rotary_deg: float) -> bytes:

@@ -21,7 +21,7 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from foundation.errors import SessionError
-from foundation.items import Event, Item, StepMark
+from foundation.items import Event, Item, Original, StepMark
 from foundation.readings import Frame
 from recording.format import messages
 from recording.format.chain import Link, misplaced
@@ -178,6 +178,13 @@ class Session:
         """Every event, in order of time."""
         found = self._decoded(lambda channel: channel.topic == messages.EVENT, event_of)
         return sorted(found, key=attrgetter("time_ns"))
+
+    def originals(self) -> Iterator[Original]:
+        """The thermal imager's pictures as their files were, in the order of the recording, each read when asked."""
+        return self._decoded(
+            lambda channel: channel.topic == messages.ORIGINAL,
+            lambda message: messages.decode_original(message.data, message.time_ns),
+        )
 
     @cached_property
     def utc(self) -> UtcOffsets:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 from typing import Protocol
 
-from foundation.items import Batch, Event, Item, StepMark
+from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality
 from recording.format import messages
 from recording.format.images import CAMERA_IMAGE
@@ -102,6 +102,8 @@ class TelemetryEncoder:
         names = [kind.topic for name, kind in messages.KINDS.items() if name in self._devices.values()]
         if "axis" in self._devices.values():
             names.append(messages.TABLE_POSE)
+        if "imager" in self._devices.values():
+            names.append(messages.ORIGINAL)
         names += [messages.CAMERA_META, messages.STEP, messages.EVENT, messages.LOG]
         return tuple(Topic(name, messages.CLASSES[name], self._devices_on(name)) for name in names)
 
@@ -129,6 +131,8 @@ class TelemetryEncoder:
                 yield Record(
                     messages.CAMERA_META, item.time_ns, messages.encode_frame_meta(item), item.block_id & SEQUENCE_MASK
                 )
+            case Original():
+                yield Record(messages.ORIGINAL, item.time_ns, messages.encode_original(item))
             case StepMark():
                 yield Record(messages.STEP, item.time_ns, messages.encode_step(item))
             case Event():

@@ -19,6 +19,7 @@ from drivers.devices.flap import FlapSettings
 from drivers.devices.inputs import InputsSettings
 from drivers.devices.relays import RelaysSettings
 from drivers.devices.stage import AxisSettings
+from drivers.devices.thermal_imager import ThermalImagerSettings
 from drivers.devices.thermometers import ThermometerSettings
 from drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
 from drivers.wires.bus import BusSettings
@@ -51,7 +52,17 @@ Folder = Literal["", "registers", "recipes", "targets"]
 MAPPED = ("regulator", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
 _GUARDED = {"air", "granite_inside"}  # thermometers without which nothing is heated
-_DEVICES = ("bus", "regulator", "relays", "thermometers", "flap", "stand", "control", "inputs")  # names that are taken
+_DEVICES = (
+    "bus",
+    "regulator",
+    "relays",
+    "thermometers",
+    "flap",
+    "stand",
+    "control",
+    "inputs",
+    "imager",
+)  # names that are taken
 
 
 class LimitsConfig(Document):
@@ -137,6 +148,7 @@ class StandConfig(Document):
     axes: dict[DeviceName, AxisSettings] = Field(default_factory=dict)
     flap: FlapSettings
     inputs: InputsSettings | None = None
+    imager: ThermalImagerSettings | None = None
     cameras: dict[DeviceName, AnyCameraSettings] = Field(default_factory=dict)
     chamber: ChamberConfig = ChamberConfig()
     limits: LimitsConfig = LimitsConfig()

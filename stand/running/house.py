@@ -285,12 +285,15 @@ async def _open(assembly: Assembly) -> None:
     for axis in devices.axes.values():
         await axis.open()
         stand.opened(axis)
+    if devices.imager is not None:
+        await devices.imager.open()
     await stand.chamber.test_dead_man()
 
 
 async def _close(assembly: Assembly) -> None:
     devices = assembly.devices
-    for device in (*devices.cameras.values(), *devices.axes.values(), devices.flap, devices.regulator):
+    imagers = (devices.imager,) if devices.imager is not None else ()
+    for device in (*devices.cameras.values(), *devices.axes.values(), *imagers, devices.flap, devices.regulator):
         with suppress(StandError):  # closing never decides a run, and one device must not keep the next from it
             await device.close()
     await assembly.bus.close()

@@ -109,4 +109,5 @@ def _kinds(config: StandConfig) -> dict[str, str]:
     kinds = {name: name for name in ("regulator", "relays", "thermometers")}
     kinds |= dict.fromkeys(config.cameras, "camera")
     kinds |= {} if config.inputs is None else {"inputs": "relays"}  # contacts, as those of the relays
+    kinds |= {} if config.imager is None else {"imager": "imager"}
     return {**kinds, "flap": "flap", **dict.fromkeys(config.axes, "axis")}

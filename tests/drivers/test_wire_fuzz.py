@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from tests.drivers.canned_camera import gvcp_commands, gvsp_packets
 from tests.drivers.canned_chambers import ascii2, cts, espec
 from tests.drivers.canned_devices import jrk, modbus, ximc
+from tests.drivers.canned_imager import radiometric
 from tests.drivers.canned_line import Parser, mutated
 
 PARSERS: dict[str, Parser] = {
@@ -22,6 +23,7 @@ PARSERS: dict[str, Parser] = {
     "Jrk variables": jrk(),
     "GVCP": gvcp_commands(),
     "GVSP": gvsp_packets(),
+    "FFF": radiometric(),
 }
 
 _QUICK, _LONG = 1_000, 1_000_000
@@ -48,7 +50,7 @@ def test_damaged_frames_are_refused_or_read_for_what_they_say(name: str, inputs:
         try:
             feed(number, wire)
         except Exception as error:
-            raise AssertionError(f"frame {number} as {wire.hex(' ')}") from error
+            raise AssertionError(f"frame {number} as {wire[:400].hex(' ')}") from error
 
 
 @parsers

@@ -20,7 +20,7 @@ from typing import TypeVar
 
 from foundation.clock import Clock, WallClock, utc_offset_ns
 from foundation.hub import Hub
-from foundation.items import Event, Item, StepMark
+from foundation.items import Event, Item, Original, StepMark
 from foundation.readings import Frame
 from foundation.tasks import failure_text
 from stand.serving.desk import COMMAND, Desk, Done, PlanStep, StandState, Who
@@ -90,7 +90,7 @@ class Bridge:
             self._next.cancel()
 
     def _follow(self, item: Item) -> None:
-        if not self._is_open or isinstance(item, Frame):
+        if not self._is_open or isinstance(item, Frame | Original):
             return
         self._seq += 1
         self._items.append((self._seq, utc_offset_ns(self._clock), item))

@@ -17,7 +17,7 @@ from typing import Literal
 
 from pydantic_core import to_json
 
-from foundation.items import Batch, Event, Item, StepMark
+from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality, Reading
 from stand.serving.api.bridge import Bridge, Snapshot
 from stand.serving.desk import StandState
@@ -67,8 +67,8 @@ def message_of(seq: int, utc_offset_ns: int, item: Item) -> Message:
         case Batch(device, _, readings):
             values = {reading.channel: reading_of(reading) for reading in readings}
             return Message(seq, "reading", {**stamp, "device": device, "readings": values})
-        case Frame():
-            raise ValueError("frames are no items of the stream")
+        case Frame() | Original():
+            raise ValueError("images are no items of the stream")
 
 
 def reading_of(reading: Reading) -> dict[str, object]:

@@ -1,0 +1,306 @@
+"""A thermal imager that stores radiometric JPEGs into a folder: what its pictures say of a few named spots.
+
+It takes pictures by itself, or by hand; the folder is looked into once a poll (memory cards and network folders tell
+nobody of new files). It measures to 2 K: for how a housing warms, not for how warm it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import stat
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from drivers.devices.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
+from drivers.devices.radiometry import temperatures_degC
+from drivers.settings import DeviceName, Identity, Polled
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.documents import Document
+from foundation.errors import Unreachable
+from foundation.items import Event, Item, Original
+from foundation.lane import Lane
+from foundation.readings import Quality, Reading, bad_reading
+
+_SUFFIXES = (".jpg", ".jpeg")
+_LARGEST_BYTES = 20_000_000
+_MOST_AT_ONCE = 20  # files of one poll: after a pause, hundreds may wait
+_KNOWN_HASHES = 10_000
+_NONE_YET = "no picture yet"
+
+
+def _absolute(path: Path) -> Path:
+    if not str(path).isprintable():
+        raise ValueError("expected a path of printable characters")
+    return path.absolute()
+
+
+class SpotSettings(Document):
+    """Where one spot is: the middle of 3 x 3 px, counted from 0 at the top left, or the imager's own measurement spot
+    that is labelled `label`, where the picture has it. emissivity: of what is seen there."""
+
+    x_px: int = Field(ge=0, le=4095)
+    y_px: int = Field(ge=0, le=4095)
+    label: str = Field(default="", max_length=32)
+    emissivity: float = Field(default=0.95, gt=0.05, le=1)
+
+
+class ThermalImagerSettings(Polled):
+    """folder: where its pictures arrive. serial_number: of the imager; pictures of another one are not read, none takes
+    any. settled_s: for so long a file must not have changed. incomplete_s: a file without its end is given up after
+    that. stale_after_s: without a new picture for so long its readings are STALE."""
+
+    folder: Annotated[Path, AfterValidator(_absolute)]
+    serial_number: str | None = Field(default=None, pattern=r"^[ -~]{1,16}$")
+    spots: dict[DeviceName, SpotSettings] = Field(min_length=1, max_length=16)
+    poll_s: float = Field(default=2.0, gt=0, le=3600)
+    settled_s: float = Field(default=2.0, ge=0, le=600)
+    incomplete_s: float = Field(default=60.0, ge=1, le=86400)
+    stale_after_s: float = Field(default=900.0, gt=0, le=86400)
+
+
+@dataclass(frozen=True, slots=True)
+class _Stamp:
+    """A file as the folder shows it; another size or time of change is another file."""
+
+    size: int
+    changed_ns: int
+
+
+@dataclass(slots=True)
+class _Seen:
+    """A file since it looks like `stamp`. settled: nothing more is to be done with it."""
+
+    stamp: _Stamp
+    first_ns: int
+    since_ns: int
+    settled: bool = False
+
+
+class ThermalImager:
+    """Readings `<spot>` in degC, and `clock_offset`, s by which the imager's clock is behind the stand's.
+
+    Its own time stays as it is: the instant of a reading is that time plus the offset, the least by which any picture
+    came later than its own clock says. publish: takes each picture as it came, and events.
+    """
+
+    def __init__(
+        self, name: str, settings: ThermalImagerSettings, clock: Clock, publish: Callable[[Item], None]
+    ) -> None:
+        self.name = name
+        self.identity: Identity | None = None  # of the imager whose picture was read last
+        self._settings = settings
+        self._clock = clock
+        self._publish = publish
+        self._lane: Lane | None = None
+        self._files: dict[str, _Seen] | None = None  # before the folder was there for the first time
+        self._lost = ""
+        self._hashes: dict[str, str] = {}  # of the pictures that were taken, in order -> their names
+        self._offset_s = math.inf
+        self._latest: tuple[Reading, ...] = ()
+        self._latest_ns = 0
+        self._is_stale = False
+        self._told: tuple[Reading, ...] = ()
+
+    async def open(self) -> None:
+        """Look into the folder, which may come later; the pictures that are there first are none of this stand's."""
+        if self._lane is None:
+            self._lane = Lane(self.name, self._clock)
+        self._latest_ns = self._clock.now_ns()
+        listed = await self._lane.call(self._listed)
+        if not isinstance(listed, str):
+            self._begin(listed)
+
+    async def close(self) -> None:
+        """Nothing to let go of but a thread; may be called twice."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            lane.close()
+
+    async def read(self) -> tuple[Reading, ...]:
+        """What the last picture says, once; STALE when it is older than stale_after_s, BAD before the first, and while
+        the folder is gone (a card pulled out, a share not mounted)."""
+        if self._lane is None:
+            raise Unreachable(self.name, "not open")
+        listed = await self._lane.call(self._listed)
+        now_ns = self._clock.now_ns()
+        self._tell_folder(listed if isinstance(listed, str) else "", now_ns)
+        if isinstance(listed, str):
+            before, self._told = self._told, self._bad(listed, now_ns)
+            return () if [each.reason for each in before] == [each.reason for each in self._told] else self._told
+        if self._files is None:
+            self._begin(listed)
+        for name in self._due(listed, now_ns):
+            for item in await self._lane.call(self._taken, name, now_ns):
+                self._publish(item)
+        self._tell_age(now_ns)
+        before, self._told = self._told, self._present(now_ns)
+        return () if before == self._told else self._told
+
+    def _present(self, now_ns: int) -> tuple[Reading, ...]:
+        if not self._latest:
+            if self._told and all(reading.reason == _NONE_YET for reading in self._told):
+                return self._told
+            return self._bad(_NONE_YET, now_ns)
+        if not self._is_stale:
+            return self._latest
+        reason = f"no picture for {self._settings.stale_after_s / 60:g} min"
+        return tuple(
+            reading
+            if reading.quality is Quality.BAD
+            else Reading(reading.channel, reading.value, reading.unit, reading.time_ns, Quality.STALE, reason)
+            for reading in self._latest
+        )
+
+    def _bad(self, reason: str, now_ns: int) -> tuple[Reading, ...]:
+        channels = [(spot, "degC") for spot in self._settings.spots] + [("clock_offset", "s")]
+        return tuple(bad_reading(f"{self.name}.{each}", unit, now_ns, reason) for each, unit in channels)
+
+    def _begin(self, listed: dict[str, _Stamp]) -> None:
+        self._files = {name: _Seen(stamp, 0, 0, settled=True) for name, stamp in listed.items()}
+
+    def _tell_folder(self, lost: str, now_ns: int) -> None:
+        """An event when the folder is lost, or is there again."""
+        if lost and not self._lost:
+            self._publish(self._event("warning", "pictures_lost", lost, {"reason": lost}, now_ns))
+        elif self._lost and not lost:
+            self._publish(self._event("info", "pictures_back", "its folder is there again", {}, now_ns))
+        self._lost = lost
+
+    def _due(self, listed: dict[str, _Stamp], now_ns: int) -> list[str]:
+        """The files that have not changed for settled_s, in order of their names."""
+        self._files = {name: seen for name, seen in (self._files or {}).items() if name in listed}
+        for name, stamp in listed.items():
+            seen = self._files.get(name)
+            if seen is None:
+                self._files[name] = _Seen(stamp, now_ns, now_ns)
+            elif seen.stamp != stamp:
+                self._files[name] = _Seen(stamp, seen.first_ns if not seen.settled else now_ns, now_ns)
+        settled_ns = seconds_ns(self._settings.settled_s)
+        due = [name for name, seen in self._files.items() if not seen.settled and now_ns - seen.since_ns >= settled_ns]
+        return sorted(due)[:_MOST_AT_ONCE]
+
+    def _tell_age(self, now_ns: int) -> None:
+        is_stale = now_ns - self._latest_ns > seconds_ns(self._settings.stale_after_s)
+        if is_stale and not self._is_stale:
+            minutes = self._settings.stale_after_s / 60
+            self._publish(self._event("warning", "no_picture", f"no picture for {minutes:g} min", {"minutes": minutes}))
+        self._is_stale = is_stale
+
+    # Below: in the lane's thread.
+
+    def _listed(self) -> dict[str, _Stamp] | str:
+        """The pictures in the folder by name; why there are none."""
+        listed: dict[str, _Stamp] = {}
+        try:
+            with os.scandir(self._settings.folder) as entries:
+                for entry in entries:
+                    if not entry.name.lower().endswith(_SUFFIXES) or not entry.name.isprintable():
+                        continue
+                    try:
+                        found = entry.stat()
+                    except OSError:
+                        continue  # gone since
+                    if stat.S_ISREG(found.st_mode):
+                        listed[entry.name] = _Stamp(found.st_size, found.st_mtime_ns)
+        except OSError as error:
+            return f"{self._settings.folder} cannot be listed ({error.strerror}); is it mounted?"
+        return listed
+
+    def _taken(self, name: str, now_ns: int) -> list[Item]:
+        """What a settled file gives: a picture and what was found, or why not; nothing while it may still grow."""
+        seen = (self._files or {})[name]
+        try:
+            data = self._content(name)
+            if not is_whole(data):
+                if now_ns - seen.since_ns < seconds_ns(self._settings.incomplete_s):
+                    return []
+                raise NotRadiometric(f"its end is missing, and nothing was added for {self._settings.incomplete_s:g} s")
+            seen.settled = True
+            digest = hashlib.sha256(data).hexdigest()
+            if digest in self._hashes:
+                return []
+            image = parse(data)
+            wanted = self._settings.serial_number
+            if wanted is not None and image.serial_number != wanted:
+                raise NotRadiometric(f"it is of imager {image.serial_number or 'without number'}, not of {wanted}")
+        except OSError:
+            return []  # not readable now; it is asked again
+        except NotRadiometric as error:
+            seen.settled = True  # until it changes
+            text = f"{name} is left out: {error}"
+            return [self._event("warning", "picture_left_out", text, {"file": name, "reason": str(error)}, now_ns)]
+        self._hashes[digest] = name
+        while len(self._hashes) > _KNOWN_HASHES:
+            del self._hashes[next(iter(self._hashes))]
+        taken = self._credit(name, digest, image, seen.first_ns, now_ns)
+        return [Original(now_ns, self.name, name, data), taken]
+
+    def _content(self, name: str) -> bytes:
+        with (self._settings.folder / name).open("rb") as file:
+            data = file.read(_LARGEST_BYTES + 1)
+        if len(data) > _LARGEST_BYTES:
+            raise NotRadiometric(f"it has more than {_LARGEST_BYTES} bytes")
+        return data
+
+    def _credit(self, name: str, digest: str, image: RadiometricImage, first_ns: int, now_ns: int) -> Event:
+        """Keep its readings, and say what they were made of."""
+        vendor, _, model = image.model.partition(" ")
+        self.identity = Identity(vendor, model, image.serial_number, "")
+        time_ns = first_ns
+        if image.camera_s > 0:
+            self._offset_s = min(self._offset_s, first_ns / NS_PER_S - image.camera_s)
+            time_ns = min(now_ns, seconds_ns(image.camera_s + self._offset_s))
+        readings = [*self._spots(image, time_ns), self._offset(time_ns)]
+        if time_ns >= self._latest_ns or not self._latest:
+            self._latest, self._latest_ns, self._is_stale = tuple(readings), max(time_ns, self._latest_ns), False
+        around = image.around
+        plain = temperatures_degC(image.counts, image.planck, around, image.emissivity)
+        data: dict[str, object] = {
+            "file": name,
+            "sha256": digest,
+            "model": image.model,
+            "serial_number": image.serial_number,
+            "camera_s": image.camera_s,
+            "found_ns": first_ns,
+            "emissivity_of_imager": image.emissivity,
+            "emissivity": {spot: settings.emissivity for spot, settings in self._settings.spots.items()},
+            "distance_m": around.air.distance_m,
+            "reflected_K": around.reflected_K,
+            "atmosphere_K": around.air.temperature_K,
+            "humidity": around.air.humidity,
+        }
+        if np.isfinite(plain).any():
+            data |= {"lowest_degC": float(np.nanmin(plain)), "highest_degC": float(np.nanmax(plain))}
+        return self._event("info", "picture_taken", f"{name} of {image.model} {image.serial_number}", data, now_ns)
+
+    def _spots(self, image: RadiometricImage, time_ns: int) -> Iterator[Reading]:
+        height, width = image.counts.shape
+        for spot, settings in self._settings.spots.items():
+            channel = f"{self.name}.{spot}"
+            x, y = image.spots.get(settings.label, (settings.x_px, settings.y_px))
+            if not (1 <= x < width - 1 and 1 <= y < height - 1):
+                yield bad_reading(channel, "degC", time_ns, f"({x}, {y}) is not within the {width} x {height} px")
+                continue
+            around = image.counts[y - 1 : y + 2, x - 1 : x + 2]
+            mean_degC = float(temperatures_degC(around, image.planck, image.around, settings.emissivity).mean())
+            if math.isfinite(mean_degC):
+                yield Reading(channel, mean_degC, "degC", time_ns)
+            else:
+                yield bad_reading(channel, "degC", time_ns, "the counts there are of no temperature")
+
+    def _offset(self, time_ns: int) -> Reading:
+        channel = f"{self.name}.clock_offset"
+        if math.isinf(self._offset_s):
+            return bad_reading(channel, "s", time_ns, "its pictures have no time")
+        return Reading(channel, self._offset_s, "s", time_ns)
+
+    def _event(self, level: str, kind: str, text: str, data: dict[str, object], now_ns: int | None = None) -> Event:
+        time_ns = self._clock.now_ns() if now_ns is None else now_ns
+        return Event(time_ns, level, kind, f"{self.name}: {text}", {"device": self.name, **data})
