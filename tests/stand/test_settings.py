@@ -63,6 +63,7 @@ REGISTER_MAP = {
     "Write",
     "Command",
     "Probe",
+    "Told",
 }
 
 
