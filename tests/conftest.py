@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 
 from recording.writing import notices
+from stand import simulator
+from tests.forked import Laboratories
 from tests.stock_camera import run_stock_camera
 
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
@@ -53,6 +55,16 @@ def _roomy_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(notices, "disk_space", roomy)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _forked_laboratories() -> Iterator[None]:
+    """A simulator that a test's own process starts begins at once."""
+    laboratories = Laboratories()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulator, "subprocess", laboratories)
+        yield
+    laboratories.close()
 
 
 @pytest.fixture(scope="session")
