@@ -104,8 +104,13 @@ class PageRoom:
         self._running: asyncio.Task[None] | None = None
 
     def __call__(self, bridge: Bridge) -> APIRouter:
-        """The routes; `bridge` is not needed, what they give is no part of the state."""
-        self._running = asyncio.get_running_loop().create_task(self._viewing.run())
+        """The routes. The bridge tells which session is under way; what the routes give is no part of its state."""
+
+        def session() -> str:
+            run = bridge.snapshot.state.run
+            return "" if run is None else run.session
+
+        self._running = asyncio.get_running_loop().create_task(self._viewing.run(session))
         router = APIRouter()
         self._add_curves(router)
         self._add_frame(router)

@@ -15,7 +15,7 @@ from foundation.helper_process import serve
 if TYPE_CHECKING:
     from stand.serving.history import Columns, History
     from stand.serving.preview import Previewer
-    from stand.serving.recorded_drift import SessionDrift
+    from stand.serving.recorded_drift import Recalled, SessionDrift
 
 MODULE = "stand.serving.preview_process"
 _LEFT_NAME = "stand-look-left"  # of a process whose daemon has gone
@@ -48,6 +48,13 @@ def session_drift(path: str, target_text: str) -> SessionDrift:
 
     cv2.setNumThreads(1)
     return session_drift(path, target_text)
+
+
+def run_references(path: str) -> tuple[Recalled, ...]:
+    """What the drift of an interrupted run counts from; SessionError when its session cannot be read."""
+    from stand.serving.recorded_drift import run_references
+
+    return run_references(path)
 
 
 def recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]:

@@ -14,7 +14,7 @@ from foundation.documents import parse_document
 from markers.target import Target
 from recording.reading.session import Session
 from stand.serving.preview import Previewer
-from stand.serving.shot import DRIFT_ROLES, Shot
+from stand.serving.shot import DRIFT_ROLES, Shot, is_reference
 
 MOST_FRAMES = 120
 
@@ -35,6 +35,33 @@ class SessionDrift:
     camera: str
     points: tuple[DriftPoint, ...]
     trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Recalled:
+    """Of one camera of an interrupted run: the frame that drift counts from, and the role of its last frame."""
+
+    shot: Shot
+    last_role: str
+
+
+def run_references(path: Path | str) -> tuple[Recalled, ...]:
+    """What drift was told against when the run of this session was interrupted, for each camera whose frames are
+    recorded; found by the rule that held when they came. SessionError when the session cannot be read."""
+    session = Session.open(path)
+    table = session.frames_table()
+    found: list[Recalled] = []
+    for camera in dict.fromkeys(table.camera.tolist()):
+        reference, before = None, ""
+        for index in np.flatnonzero((table.camera == camera) & ~table.superseded).tolist():
+            role = str(table.role[index])
+            reference = index if is_reference(role, before, is_first=reference is None) else reference
+            before = role
+        if reference is not None:
+            frame = session.frame(reference)
+            shot = Shot(camera, frame.time_ns, frame.image, str(table.role[reference]), as_reference=True)
+            found.append(Recalled(shot, before))
+    return tuple(found)
 
 
 def session_drift(path: Path | str, target_text: str) -> SessionDrift:

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foundation.clock import Clock
+from foundation.errors import StandError
 from foundation.helper import Helper, Line
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame
 from stand.serving.history import History
-from stand.serving.preview_process import MODULE, previewer, recorded_week
+from stand.serving.preview_process import MODULE, previewer, recorded_week, run_references
 from stand.serving.shot import Shot, is_reference
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ _SOONEST_S = 0.4  # between two frames that are looked at
 _AGAIN_S = 30.0  # before a process that has ended is started again
 _LOOK, _READ, _SEARCH = "look", "read", "search"  # what is asked for on one line never waits for another's
 _ENDED = "the process that looks at frames for the page has ended"
-_RUN_START = "run.start"
+_RUN_START, _RUN_RESUME = "run.start", "run.resume"
 
 
 class Viewing:
@@ -57,6 +58,9 @@ class Viewing:
         self._fresh: set[str] = set()  # roles whose next frame is a reference, by camera
         self._helper: Helper | None = None
         self._knows_target = False
+        self._has_to_recall = False  # what drift counts from is in the session of the run, and not known here
+        self._session: Callable[[], str] = str
+        self._roles_seen: dict[str, str] = {}  # of the frame before, by camera
         hub.subscribe(self._follow)
 
     def _follow(self, item: Item) -> None:
@@ -67,6 +71,8 @@ class Viewing:
                 self.skipped += 1
             self._newest[camera] = (item, self._roles.get(item.step_id, ""))
             return
+        if isinstance(item, Event) and item.kind == _RUN_RESUME:
+            self._has_to_recall = True
         if isinstance(item, StepMark) and item.state is StepState.STARTED:
             role = item.parameters.get("role")
             self._roles = {item.step_id: role} if isinstance(role, str) else {}
@@ -74,8 +80,9 @@ class Viewing:
 
     # From here on: in the thread that serves clients.
 
-    async def run(self) -> None:
-        """Until cancelled: keep the history, look at frames."""
+    async def run(self, session: Callable[[], str]) -> None:
+        """Until cancelled: keep the history, look at frames. session: the folder of the run under way, "" for none."""
+        self._session = session
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._keep())
@@ -129,9 +136,11 @@ class Viewing:
             await asyncio.sleep(max(0.05, began_s + _SOONEST_S - loop.time()) if self._newest else 0.1)
 
     async def _look(self, camera: str, frame: Frame, role: str) -> None:
-        as_reference = is_reference(role, self._role_of(camera), is_first=camera in self._fresh)
         try:
             line = await self._previewer()
+            if self._has_to_recall:
+                await self._recall(line)
+            as_reference = is_reference(role, self._roles_seen.get(camera, ""), is_first=camera in self._fresh)
             shot = Shot(camera, frame.time_ns, frame.image, role, as_reference)
             preview: Preview = await asyncio.to_thread(line.call, "previewer", "look", shot)
         except OSError as error:
@@ -140,13 +149,23 @@ class Viewing:
             self._warn(f"a frame of {camera} could not be looked at: {error}")
         else:
             self._fresh.discard(camera)
-            self.previews[camera] = preview
+            self.previews[camera], self._roles_seen[camera] = preview, role
             self.trouble = ""
             self._plot(camera, preview)
 
-    def _role_of(self, camera: str) -> str:
-        before = self.previews.get(camera)
-        return "" if before is None else before.role
+    async def _recall(self, line: Line) -> None:
+        """Take the run's own references for drift from its session: this process or the one that looks is a new one,
+        or another run came in between."""
+        self._has_to_recall = False
+        if not (session := self._session()):
+            return
+        try:
+            for recalled in await self.ask(run_references, session):
+                await asyncio.to_thread(line.call, "previewer", "look", recalled.shot)
+                self._roles_seen[recalled.shot.camera] = recalled.last_role
+                self._fresh.discard(recalled.shot.camera)
+        except StandError as error:
+            self._warn(f"drift is told against the first frame from now on, the run's own is not found: {error}")
 
     def _plot(self, camera: str, preview: Preview) -> None:
         if preview.mean_px is not None and preview.worst_px is not None:
@@ -163,7 +182,7 @@ class Viewing:
         line = self._started().line(_LOOK)
         if not self._knows_target:
             await asyncio.to_thread(line.make, "previewer", previewer, self.target_text)
-            self._knows_target = True
+            self._knows_target = self._has_to_recall = True
         return line
 
     async def _has_ended(self, why: str) -> None:
