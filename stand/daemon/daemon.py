@@ -66,7 +66,7 @@ class Daemon:
         self._hands: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
         self._others: set[asyncio.Task[None]] = set()
         self._extending: list[asyncio.Task[None]] = []
-        self._recorded_ns = 0  # when a record was last begun, or could not be
+        self._recorded_ns = self._turned_ns = 0  # when a record was last begun, or that of a new day, or could not be
         hub.subscribe(self._follow)
 
     @property
@@ -279,6 +279,8 @@ class Daemon:
                 with suppress(SessionError):
                     await self.orders.read()  # `stand queue add` writes it, too
                 self.wake()
+            if not self.has_guest and self._is_midnight():
+                await self._turn_day()
             if not self.has_guest and self._needs_record():
                 self.house.unrecorded()
                 await self._end_record()
@@ -288,13 +290,33 @@ class Daemon:
                 self.note()
 
     def _needs_record(self) -> bool:
-        """A new one: at midnight, and when the last one has ended by itself and nobody has to look at that first; what
-        the disk has refused is tried again after a while."""
+        """A new one: when the last one has ended by itself and nobody has to look at that first; what the disk has
+        refused is tried again after a while."""
         recorder = self.record.recorder
         if recorder is None:
             return self._clock.now_ns() - self._recorded_ns >= _KEEP_EVERY_S * NS_PER_S
-        has_ended = bool(recorder.writer_ended) and self.house.latched is None
-        return has_ended or not self.record.is_of_today()
+        return bool(recorder.writer_ended) and self.house.latched is None
+
+    def _is_midnight(self) -> bool:
+        """Whether the record is of yesterday; what the disk has refused is tried again after a while."""
+        recorder, waited_ns = self.record.recorder, self._clock.now_ns() - self._turned_ns
+        is_of_yesterday = recorder is not None and not recorder.writer_ended and not self.record.is_of_today()
+        return is_of_yesterday and waited_ns >= _KEEP_EVERY_S * NS_PER_S
+
+    async def _turn_day(self) -> None:
+        """Today's record takes over from yesterday's in one moment: heat by hand is recorded throughout."""
+        self._turned_ns = self._clock.now_ns()
+        try:
+            recorder = await self.record.begin()
+        except (SessionError, OSError) as error:
+            self._tell("warning", "house_not_recorded", f"today's record is not begun, yesterday's goes on: {error}")
+            return
+        if self.house.guest is None:
+            self.house.recorder = recorder
+        try:
+            await self.record.complete(FINISH_WITHIN_S)
+        except (SessionError, OSError) as error:
+            self._tell("warning", "house_not_recorded", str(error))
 
     async def _adopt_camera(self) -> None:
         """A camera that is found powered is opened; one that is off stays off until somebody wants it."""

@@ -12,6 +12,7 @@ import itertools
 import os
 import platform
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -32,53 +33,85 @@ from stand.running.session_files import recorder_in
 HOUSE = "house"  # in place of a recipe's name
 
 
+@dataclass(frozen=True, slots=True)
+class _Recording:
+    """One session, its recorder at work."""
+
+    recorder: Recorder
+    tap: _Tap
+    disk: Disk
+    task: asyncio.Task[None]
+
+    async def complete(self, within_s: float) -> None:
+        """SessionError when the disk does not take the rest in time."""
+        try:
+            await cancelled([self.task])
+            await self.recorder.finish(within_s)
+        finally:
+            self.disk.close()
+
+
 class HouseRecord:
     """Records what passes the hub from `begin` to `end`, as often as wanted; of one day all is in one session."""
 
     def __init__(self, assembly: Assembly, config_text: str, out: Path, clock: WallClock) -> None:
-        self.recorder: Recorder | None = None
         self._assembly = assembly
         self._config_text = config_text
         self._out = out
         self._clock = clock
-        self._hub = _Tap(assembly.hub)
-        self._disk: Disk | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._now: _Recording | None = None
+        self._cut_off: list[_Recording] = []  # they take nothing any more, and are not complete yet
         self._day = ""
         self._turn = asyncio.Lock()
+
+    @property
+    def recorder(self) -> Recorder | None:
+        """Of the record under way."""
+        return None if self._now is None else self._now.recorder
 
     def is_of_today(self) -> bool:
         """Whether midnight has not passed since it was begun."""
         return self._day == self._today()
 
     async def begin(self) -> Recorder:
-        """SessionError when the disk refuses it."""
+        """The record of today. That of the day before is cut off in the same moment, so that each item is in one of
+        both, and `complete` completes it. SessionError when the disk refuses; that of the day before then goes on."""
         async with self._turn:
-            self._day = self._today()
-            info = self._info(await asyncio.to_thread(self._place, self._day))
-            directory, texts, disk = self._out / info.session_id, {"config.yaml": self._config_text}, Disk()
-            recorder = recorder_in(directory, info, texts, self._assembly.config, self._hub, self._clock, disk)
+            day = self._today()
+            info = self._info(await asyncio.to_thread(self._place, day))
+            directory, texts = self._out / info.session_id, {"config.yaml": self._config_text}
+            tap, disk = _Tap(self._assembly.hub), Disk()
+            recorder = recorder_in(directory, info, texts, self._assembly.config, tap, self._clock, disk)
             try:
                 await recorder.begin(tuple)
             except BaseException:
                 disk.close()
                 raise
-            self._disk, self._task, self.recorder = disk, asyncio.create_task(recorder.run()), recorder
+            self._cut()
+            self._day = day
+            self._now = _Recording(recorder, tap, disk, asyncio.create_task(recorder.run()))
             return recorder
 
-    async def end(self, within_s: float = COMPLETE_WITHIN_S) -> None:
-        """Complete its segments; SessionError when the disk does not take them in time. Nothing without `begin`."""
+    async def complete(self, within_s: float = COMPLETE_WITHIN_S) -> None:
+        """Complete the segments of what was cut off; SessionError when the disk does not take them in time."""
         async with self._turn:
-            recorder, self.recorder = self.recorder, None
-            if recorder is None or self._task is None or self._disk is None:
-                return
-            ended = Event(self._clock.now_ns(), "info", RUN_END, "the house's record ends", {"status": Run.COMPLETE})
-            self._hub.give(ended)
-            try:
-                await cancelled([self._task])
-                await recorder.finish(within_s)
-            finally:
-                self._disk.close()
+            while self._cut_off:
+                await self._cut_off.pop(0).complete(within_s)
+
+    async def end(self, within_s: float = COMPLETE_WITHIN_S) -> None:
+        """The same after cutting off what is recorded now. Nothing without `begin`."""
+        async with self._turn:
+            self._cut()
+        await self.complete(within_s)
+
+    def _cut(self) -> None:
+        if self._now is None:
+            return
+        recording, self._now = self._now, None
+        ended = Event(self._clock.now_ns(), "info", RUN_END, "the house's record ends", {"status": Run.COMPLETE})
+        recording.tap.give(ended)
+        recording.tap.close()
+        self._cut_off.append(recording)
 
     def _today(self) -> str:
         now_s = (self._clock.now_ns() + self._clock.utc_offset_ns()) / NS_PER_S
@@ -118,7 +151,7 @@ class HouseRecord:
 
 
 class _Tap(Hub):
-    """The house's hub as its recorder sees it: `give` reaches the recorder alone."""
+    """The house's hub as one recorder sees it, until it is closed: `give` reaches that recorder alone."""
 
     def __init__(self, hub: Hub) -> None:
         super().__init__()
@@ -135,6 +168,11 @@ class _Tap(Hub):
 
     def publish(self, item: Item) -> None:
         self._house.publish(item)
+
+    def close(self) -> None:
+        """Nothing passes any more."""
+        for recorder in self._recorders:
+            self._house.unsubscribe(recorder)
 
     def give(self, item: Item) -> None:
         """To those who record, and nobody else."""

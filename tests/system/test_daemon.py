@@ -18,10 +18,13 @@ import yaml
 from foundation.clock import WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub
+from foundation.items import Event
 from recording.reading.session import Session
 from stand.assembly import assemble
 from stand.config.stand_config import load_config, packaged
+from stand.daemon.daemon import Daemon
 from stand.daemon.desk import DaemonDesk
+from stand.daemon.house_record import HouseRecord
 from stand.daemon.serve import serve as serve_stand
 from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
@@ -346,3 +349,48 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
 
     await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
     assert len(set(subscribers)) == 1
+
+
+async def test_midnight_changes_the_record_beneath_heat_by_hand(
+    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
+    texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    day = ["20261122"]
+    monkeypatch.setattr(HouseRecord, "_today", lambda _: day[0])
+    told: list[Event] = []
+
+    @asynccontextmanager
+    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+        daemon: Daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
+
+        async def until(wanted: Callable[[], bool]) -> None:
+            async with asyncio.timeout(LIMIT_S):
+                while not wanted():
+                    await asyncio.sleep(0.02)
+
+        async def work() -> None:
+            hub.subscribe(lambda item: told.append(item) if isinstance(item, Event) else None)
+            await desk.device(who, "regulator", "set", {"setpoint_degC": 40.0})
+            await until(lambda: desk.state().heater_permitted)
+            day[0] = "20261123"
+            await until(lambda: daemon.record.is_of_today())
+            turned_ns = clock.now_ns()
+            await until(lambda: clock.now_ns() > turned_ns + 3_000_000_000)  # the guard looks each second
+            assert desk.state().heater_permitted
+            assert desk.state().fault is None
+            assert daemon.house.recorder is daemon.record.recorder
+
+        working = asyncio.create_task(work())
+        working.add_done_callback(lambda _: daemon.leave())
+        yield
+        await working
+
+    await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
+    assert [event.kind for event in told if event.level != "info"] == []
+    first, second = (
+        Session.open(out / f"{name}-house").readings("regulator.pv")[0] for name in ("20261122", "20261123")
+    )
+    assert len(first) > 0
+    assert len(second) > 0
+    assert 0 < (second[0] - first[-1]) / 1e9 < 2.0  # of a poll each half second none is missing

@@ -1,0 +1,108 @@
+"""The daemon's own record: a session a day, and nothing lost or recorded twice when the day ends."""
+
+import asyncio
+from collections.abc import AsyncGenerator
+from datetime import datetime, timedelta
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from foundation.clock import NS_PER_S, WallClock
+from foundation.errors import SessionError
+from foundation.hub import Hub
+from foundation.items import Batch
+from foundation.readings import Reading
+from recording.reading.contents import RUN_END
+from recording.reading.session import Session
+from recording.repair.verify import verify
+from stand.assembly import Assembly
+from stand.config.stand_config import load_config, packaged
+from stand.daemon.house_record import HouseRecord
+
+CONFIG = packaged("", "simulated")
+
+
+class Calendar(WallClock):
+    """The host's clock, `ahead_ns` ahead."""
+
+    ahead_ns = 0
+
+    def now_ns(self) -> int:
+        return super().now_ns() + self.ahead_ns
+
+    def go_to_midnight(self, before_s: float) -> None:
+        """So long before the next midnight of this place."""
+        now = datetime.fromtimestamp((self.now_ns() + self.utc_offset_ns()) / NS_PER_S).astimezone()
+        midnight = (now + timedelta(days=1)).replace(hour=0, minute=0, second=0, microsecond=0)
+        self.ahead_ns += round(((midnight - now).total_seconds() - before_s) * NS_PER_S)
+
+
+@pytest.fixture
+async def house(tmp_path: Path) -> AsyncGenerator[tuple[HouseRecord, Hub, Calendar]]:
+    hub, clock = Hub(), Calendar()
+    assembly = cast("Assembly", SimpleNamespace(hub=hub, config=load_config(CONFIG)))
+    record = HouseRecord(assembly, CONFIG.read_text("utf-8"), tmp_path, clock)
+    yield record, hub, clock
+    await record.end(20.0)
+
+
+async def publish(hub: Hub, clock: Calendar, published: list[int]) -> None:
+    """A reading each few milliseconds, all that time."""
+    while True:
+        published.append(clock.now_ns())
+        hub.publish(Batch("thermometers", published[-1], (Reading("thermometers.air", 24.0, "degC", published[-1]),)))
+        await asyncio.sleep(0.004)
+
+
+def times_ns(session: Session) -> list[int]:
+    return [int(time_ns) for time_ns in session.readings("thermometers.air")[0]]
+
+
+async def test_at_midnight_each_reading_is_in_one_of_two_sessions(
+    house: tuple[HouseRecord, Hub, Calendar], tmp_path: Path
+):
+    record, hub, clock = house
+    clock.go_to_midnight(0.3)
+    published: list[int] = []
+    publishing = asyncio.create_task(publish(hub, clock, published))
+    yesterday = await record.begin()
+    while record.is_of_today():
+        await asyncio.sleep(0.01)
+    today = await record.begin()
+    assert record.recorder is today
+    assert record.is_of_today()
+    await record.complete(20.0)
+    await asyncio.sleep(0.1)
+    publishing.cancel()
+    await asyncio.gather(publishing, return_exceptions=True)
+    await record.end(20.0)
+    first, second = Session.open(yesterday.directory), Session.open(today.directory)
+    assert first.path.name < second.path.name
+    recorded = times_ns(first) + times_ns(second)
+    assert recorded == [time_ns for time_ns in published if time_ns >= recorded[0]]
+    assert len(times_ns(first)) > 10 < len(times_ns(second))
+    for session in (first, second):
+        assert session.incomplete == ()
+        assert [event.kind for event in session.events()].count(RUN_END) == 1
+        assert verify(session.path).is_sound
+    assert sorted(path.name for path in tmp_path.iterdir()) == [first.path.name, second.path.name]
+
+
+async def test_yesterdays_record_goes_on_when_todays_cannot_be_begun(
+    house: tuple[HouseRecord, Hub, Calendar], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    record, _, clock = house
+    clock.go_to_midnight(-1.0)  # a second after it
+    yesterday = await record.begin()
+    clock.go_to_midnight(-1.0)
+
+    def no_place(self: object, day: str) -> str:
+        raise SessionError("the disk is full")
+
+    monkeypatch.setattr(HouseRecord, "_place", no_place)
+    with pytest.raises(SessionError):
+        await record.begin()
+    assert record.recorder is yesterday
+    assert not record.is_of_today()
