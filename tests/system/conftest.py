@@ -98,3 +98,20 @@ def simulator() -> Iterator[Callable[[StandConfig, bool], Simulator]]:
     yield start
     for process in started:
         process.stop()
+
+
+@pytest.fixture
+def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Callable[..., object]) -> Path:
+    """The configuration of a simulated stand that answers, with a guard that looks often."""
+    require_aravis()
+    data = yaml.safe_load(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}))
+    data["relays"]["self_test_s"] = 1.0
+    data["cameras"]["camera"] |= {"boot_s": 0.5, "poll_s": 1.0}
+    data["flap"]["poll_s"] = 0.5
+    data["guard"] |= {"period_s": 1.0}
+    for axis in data["axes"].values():
+        axis["poll_s"] = 1.0
+    path = tmp_path / "stand.yaml"
+    path.write_text(yaml.safe_dump(data))
+    simulator(load_config(path), False)
+    return path

@@ -13,7 +13,6 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-import yaml
 
 from foundation.clock import WallClock
 from foundation.errors import SessionError
@@ -29,7 +28,6 @@ from stand.daemon.serve import serve as serve_stand
 from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
 from stand.serving.desk import Conflict, RunRequest, StandState, Who
-from tests.system.conftest import require_aravis
 from tests.system.test_real_time import BRIEF
 from tests.system.test_two_runs import Laboratory
 
@@ -78,23 +76,6 @@ class Served:
     def told(self) -> str:
         """What it said, after its end."""
         return self.process.communicate(timeout=LIMIT_S)[0]
-
-
-@pytest.fixture
-def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Callable[..., object]) -> Path:
-    """The configuration of a simulated stand that answers, with a guard that looks often."""
-    require_aravis()
-    data = yaml.safe_load(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}))
-    data["relays"]["self_test_s"] = 1.0
-    data["cameras"]["camera"] |= {"boot_s": 0.5, "poll_s": 1.0}
-    data["flap"]["poll_s"] = 0.5
-    data["guard"] |= {"period_s": 1.0}
-    for axis in data["axes"].values():
-        axis["poll_s"] = 1.0
-    path = tmp_path / "stand.yaml"
-    path.write_text(yaml.safe_dump(data))
-    simulator(load_config(path), False)
-    return path
 
 
 @pytest.fixture

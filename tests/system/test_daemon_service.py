@@ -1,0 +1,98 @@
+"""What a service manager, and a receiver of alerts that hangs, may ask of a daemon: neither delays guard or door."""
+
+import asyncio
+import socket
+import time
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+
+import pytest
+import yaml
+
+from foundation.clock import WallClock
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.config.stand_config import load_config, packaged
+from stand.daemon.daemon import Daemon
+from stand.daemon.desk import DaemonDesk
+from stand.daemon.serve import serve as serve_stand
+from stand.serving.api.interface import Interface
+from stand.serving.api.server import serve as serve_clients
+from stand.serving.client import server_of
+from tests.stand.alert_receiver import Receiver
+
+LIMIT_S = 120.0  # for a busy machine
+WATCHDOG_S = 1.5
+
+
+@pytest.fixture
+def hung() -> Receiver:
+    receiver = Receiver()
+    receiver.let_go.clear()
+    yield receiver
+    receiver.close()
+
+
+def fed(manager: socket.socket) -> int:
+    """How often, since it was asked last."""
+    count = 0
+    with suppress(BlockingIOError):
+        while True:
+            count += manager.recv(1000) == b"WATCHDOG=1"
+    return count
+
+
+async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
+    laboratory: Path, tmp_path: Path, hung: Receiver, monkeypatch: pytest.MonkeyPatch
+):
+    data = yaml.safe_load(laboratory.read_text())
+    data["alerts"] = {"secrets": str(hung.secrets(tmp_path / "secrets.yaml")), "alive_every_s": 1, "grace_s": 0}
+    laboratory.write_text(yaml.safe_dump(data))
+    config, out = load_config(laboratory), tmp_path / "out"
+    texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    manager.bind(str(tmp_path / "notify"))
+    manager.setblocking(False)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", str(round(WATCHDOG_S * 1e6)))
+    late: list[str] = []
+
+    @asynccontextmanager
+    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+        daemon: Daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
+
+        async def until(wanted: Callable[[], bool]) -> None:
+            async with asyncio.timeout(LIMIT_S):
+                while not wanted():
+                    await asyncio.sleep(0.02)
+
+        async def work() -> None:
+            await until(lambda: bool(hung.calls))  # the sign of life hangs
+            for _ in range(20):
+                hub.publish(Event(clock.now_ns(), "error", "device_lost", "a device does not answer", {"device": "x"}))
+            fed(manager)
+            end_s = time.monotonic() + 3 * WATCHDOG_S
+            while time.monotonic() < end_s:
+                began_s = time.monotonic()
+                await asyncio.to_thread(server_of(out).state, 20.0)
+                if (took_s := time.monotonic() - began_s) > 2.0 or not daemon.house.guard.is_on_time:
+                    late.append(f"{took_s:.1f} s")
+                await asyncio.sleep(0.1)
+            assert fed(manager) >= 3
+            monkeypatch.setattr(type(daemon.house.guard), "is_on_time", property(lambda _: False))
+            await asyncio.sleep(0.2)
+            fed(manager)
+            await asyncio.sleep(WATCHDOG_S)
+            assert fed(manager) == 0  # the service manager will end a daemon whose guard does not look
+
+        async with serve_clients(desk, hub, clock, out, config.name, Interface(out)):
+            working = asyncio.create_task(work())
+            working.add_done_callback(lambda _: daemon.leave())
+            yield
+            await working
+
+    with manager:
+        await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
+    assert late == []
+    assert hung.messages == []
