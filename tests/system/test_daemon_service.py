@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import time
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
@@ -27,7 +27,7 @@ WATCHDOG_S = 1.5
 
 
 @pytest.fixture
-def hung() -> Receiver:
+def hung() -> Iterator[Receiver]:
     receiver = Receiver()
     receiver.let_go.clear()
     yield receiver
