@@ -30,7 +30,8 @@ class App(typer.Typer):
     has nothing to say to a program."""
 
     def __init__(self, help: str | None = None, *, no_args_is_help: bool = False) -> None:  # noqa: A002 - as in typer
-        super().__init__(cls=OneLineUsage, add_completion=False, help=help, no_args_is_help=no_args_is_help)
+        own: dict[str, Any] = {} if help is None else {"help": help}  # else it is that of the callback
+        super().__init__(cls=OneLineUsage, add_completion=False, no_args_is_help=no_args_is_help, **own)
 
     def command(
         self, name: str | None = None, *, has_json: bool = True, **settings: Any

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Any, NamedTuple, cast
@@ -11,6 +10,8 @@ from typing import Annotated, Any, NamedTuple, cast
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
+
+from foundation.version import installed_version
 
 _INTERRUPTED = 130  # exit_codes.INTERRUPTED, which imports this module
 
@@ -65,7 +66,7 @@ def lazy_app(help_text: str, commands: Mapping[str, Lazy], *, has_completion: bo
 def show_version(asked: bool) -> None:
     """The callback of --version."""
     if asked:
-        typer.echo(f"thermostand {importlib.metadata.version('thermostand')}")
+        typer.echo(f"thermostand {installed_version()}")
         raise typer.Exit
 
 

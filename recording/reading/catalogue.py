@@ -10,7 +10,6 @@ Nothing is imported here that takes time: a list of known sessions needs neither
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 import os
 import sqlite3
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from foundation.errors import SessionError
+from foundation.version import installed_version
 from recording.format.inventory import is_locked
 from recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
 from recording.reading.journal_lines import JOURNAL_NAME
@@ -196,7 +196,7 @@ class _Index:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / INDEX_NAME
-        self._version = f"{_VERSION} {importlib.metadata.version('thermostand')}"
+        self._version = f"{_VERSION} {installed_version()}"
         self._rows: dict[bytes, tuple[str, str]] = {}
         self._new: dict[bytes, tuple[str, str]] = {}
         self._gone: set[bytes] = set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -18,6 +19,7 @@ from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.output import output, say, show
+from foundation.version import installed_version
 from stand.commands.commands import app as stand
 
 NOTHING_TO_SAY = {"stand serve", "stand queue start"}  # to a program, that is
@@ -49,6 +51,10 @@ def test_the_list_of_commands_is_whole():
     typed = {typed for typed, _ in EACH}
     assert len(typed) > 40
     assert typed >= {"stand run", "stand session list", "stand queue add", "compensate fit", *NOTHING_TO_SAY}
+
+
+def test_the_version_is_that_of_the_installed_distribution():
+    assert installed_version() == importlib.metadata.version("thermostand")
 
 
 app = App()
