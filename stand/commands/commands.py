@@ -28,6 +28,7 @@ app = lazy_app(
         "submit": Lazy("stand.commands.order_cli", "Queue a run of the stand's daemon."),
         "device": Lazy("stand.commands.order_cli", "Tell a device something by hand, between runs."),
         "devices": Lazy("stand.commands.devices_cli", "What is connected to this computer."),
+        "init": Lazy("stand.commands.init_cli", "Write the folder of a new stand, from what is connected."),
         "recipes": Lazy("stand.commands.installed_cli", "The installed recipes."),
         "configs": Lazy("stand.commands.installed_cli", "The installed stands' files."),
         "config": Lazy("stand.commands.config_cli", "Configuration files: JSON Schemas for editors, older versions."),

@@ -1,0 +1,166 @@
+"""`stand init`: a folder for a new stand, with what is connected to this computer."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+
+from drivers.wires.discovery import SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
+from foundation.command_app import App
+from foundation.errors import ConfigError
+from foundation.exit_codes import one_line_errors
+from foundation.output import say, show
+from foundation.usage import one_line
+from stand.config.new_stand import Axis, Connected, new_stand
+from stand.estimating.night import price_night
+from stand.running.order import load_order
+
+app = App()
+
+Found = TypeVar("Found")
+
+_AXES = ("linear", "rotary")
+_WAIT_S = 1.0
+_CONTROLLER = re.compile(r"/dev/ximc/([0-9A-Fa-f]{8})")
+_POLOLU = 0x1FFB
+
+
+@app.command("init")
+def init(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="The folder of the stand; made when it is not there.")
+    ],
+    name: Annotated[str, typer.Option(help="Of the stand; else the folder's.")] = "",
+    simulated: Annotated[bool, typer.Option("--simulated", help="The simulated stand: nothing is asked.")] = False,
+    bus: Annotated[str, typer.Option(metavar="PORT", help="Of regulator, relays and thermometers (RS-485).")] = "",
+    flap: Annotated[str, typer.Option(metavar="SERIAL", help="USB serial number of the flap's controller.")] = "",
+    camera: Annotated[str, typer.Option(metavar="ADDRESS", help="Of the GigE camera; asked who it is.")] = "",
+    axis: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=PORT:SERIAL", help="A stage's controller; linear or rotary.")
+    ] = None,
+    ask: Annotated[bool, typer.Option("--ask/--no-ask", help="Ask for what is not given, at a terminal.")] = True,
+) -> None:
+    """Write a stand's folder: configuration, recipe and target, from what is connected. What is there stays as it is.
+
+    Example: stand init my-stand --bus /dev/serial/by-id/usb-FTDI-port0 --camera 192.168.10.2
+    """
+    with one_line_errors():
+        given = Connected(bus, flap, camera, "", tuple(map(_axis, axis or ())))
+        if simulated and given != Connected():
+            raise ConfigError("--simulated has devices of its own; leave --bus, --flap, --camera and --axis out")
+        is_asked = ask and not simulated and _is_terminal()
+        connected = None if simulated else _identified(_asked(given) if is_asked else given)
+        texts = new_stand(name or directory.absolute().name, connected)
+        _check(texts)
+        written = _write(directory, texts)
+        show({"written": written}, written)
+        for what in _missing(connected):
+            say(f"{directory / 'stand.yaml'}: {what} is still to be written; `stand devices` shows what there is")
+        say(f"now: stand plan {directory / 'recipe.yaml'} --config {directory / 'stand.yaml'}")
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty()
+
+
+def _asked(given: Connected) -> Connected:
+    """What is not given is chosen among what is connected; an empty answer leaves it out."""
+    ports, usb = serial_ports(), usb_devices()
+    controllers = [port for port in ports if _CONTROLLER.fullmatch(port.address)]
+    others = [port for port in ports if port not in controllers]
+    axes = list(given.axes)
+    for name in _AXES:
+        if all(one.name != name for one in axes) and controllers:
+            port = _choose(f"controller of the {name} stage", controllers, _port_text)
+            axes += [_axis(f"{name}={port.address}:{_number(port)}")] if port is not None else []
+    bus = given.bus or _address(_choose("RS-485 adapter of regulator, relays and thermometers", others, _port_text))
+    flaps = [device for device in usb if device.vendor == _POLOLU]
+    chosen = None if given.flap else _choose("controller of the flap", flaps, _usb_text)
+    flap = given.flap or ("" if chosen is None else chosen.serial)
+    camera = given.camera or str(typer.prompt("address of the GigE camera (empty: none)", default="", err=True))
+    return Connected(bus, flap, camera, "", tuple(axes))
+
+
+def _choose(what: str, found: Sequence[Found], text: Callable[[Found], str]) -> Found | None:
+    """Asked by number; None for none."""
+    if not found:
+        return None
+    for number, each in enumerate(found, 1):
+        typer.echo(one_line(f"  {number}  {text(each)}"), err=True)
+    answer = int(typer.prompt(f"{what} (0: none of these)", type=int, default=1 if len(found) == 1 else 0, err=True))
+    return found[answer - 1] if 1 <= answer <= len(found) else None
+
+
+def _port_text(port: SerialPort) -> str:
+    return f"{port.address}  {port.what}"
+
+
+def _usb_text(device: UsbDevice) -> str:
+    return f"{device.what}, serial number {device.serial}"
+
+
+def _address(port: SerialPort | None) -> str:
+    return "" if port is None else port.address
+
+
+def _number(port: SerialPort) -> int:
+    """The controller's serial number is its name in /dev/ximc, in hexadecimal."""
+    found = _CONTROLLER.fullmatch(port.address)
+    return int(found[1], 16) if found else 0
+
+
+def _axis(text: str) -> Axis:
+    name, _, rest = text.partition("=")
+    address, _, serial = rest.rpartition(":")
+    if name not in _AXES or not address or not serial.isdecimal():
+        raise ConfigError(f"--axis {text}: expected linear=PORT:SERIAL or rotary=PORT:SERIAL")
+    return Axis(name, address, int(serial))
+
+
+def _identified(connected: Connected) -> Connected:
+    """With the serial number of the camera that answers; ConfigError when the address cannot be asked."""
+    if not connected.camera:
+        return connected
+    try:
+        found = asyncio.run(cameras_at([connected.camera], _WAIT_S))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--camera {connected.camera}: cannot be asked: {error}") from error
+    if not found:
+        say(f"no camera answers at {connected.camera}; its serial_number is still to be written")
+    serial = next((each.serial for each in found), "")
+    return Connected(connected.bus, connected.flap, connected.camera, serial, connected.axes)
+
+
+def _check(texts: Mapping[str, str]) -> None:
+    """ConfigError when what would be written could not be run."""
+    with tempfile.TemporaryDirectory() as folder:
+        _write(Path(folder), texts)
+        order = load_order(str(Path(folder) / "recipe.yaml"), str(Path(folder) / "stand.yaml"))
+        price_night(tuple(order.recipe.plan()), order.config, Path(folder))
+
+
+def _write(directory: Path, texts: Mapping[str, str]) -> list[Path]:
+    """All of them; ConfigError, and none written, when one is there already."""
+    paths = {directory / name: text for name, text in texts.items()}
+    if there := [path for path in paths if path.exists() or path.is_symlink()]:
+        raise ConfigError(f"{there[0]}: is there already, and stays as it is; choose another folder")
+    directory.mkdir(parents=True, exist_ok=True)
+    for path, text in paths.items():
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    return list(paths)
+
+
+def _missing(connected: Connected | None) -> list[str]:
+    if connected is None:
+        return []
+    stages = {axis.name for axis in connected.axes}
+    values = {"bus.address": connected.bus, "flap.serial_number": connected.flap, "the camera": connected.camera_serial}
+    return [what for what, value in values.items() if not value] + [f"axes.{one}" for one in _AXES if one not in stages]

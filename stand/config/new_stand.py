@@ -1,0 +1,94 @@
+"""The text of a new stand's file: an installed one, with what is connected to this computer written into it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from foundation.errors import ConfigError
+from stand.config.stand_config import packaged
+
+_SCHEMA = re.compile(r"\$schema=\S+/([a-z-]+\.json)")
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A stage: the address of its controller, which is asked for its serial number before anything moves."""
+
+    name: str
+    address: str
+    serial_number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """What a real stand is made of; "" and empty: stays as the installed file has it, to be edited. bus: the serial
+    port of regulator, relays and thermometers. flap: the controller's USB serial number. camera: its address, and the
+    serial number that must answer there."""
+
+    bus: str = ""
+    flap: str = ""
+    camera: str = ""
+    camera_serial: str = ""
+    axes: Sequence[Axis] = ()
+
+
+def new_stand(name: str, connected: Connected | None) -> dict[str, str]:
+    """The files of a stand's folder by name; the simulated stand's without `connected`."""
+    own = {"name": _quoted(name), "target": "target.yaml"}
+    text = _text("", "simulated" if connected is None else "laboratory")
+    for key, value in own.items():
+        text = _set(text, rf"^{key}: *\S+", f"{key}: {_literal(value)}")
+    if connected is not None:
+        text = _with_devices(text, connected)
+    recipe = "demo" if connected is None else "thermal-cycle"
+    return {
+        "stand.yaml": text,
+        "recipe.yaml": _text("recipes", recipe),
+        "target.yaml": _text("targets", "paper-9x6"),
+        "README.md": f"# {name}\n\nA night: `stand run recipe.yaml --config stand.yaml`; what it takes: "
+        "`stand plan recipe.yaml --config stand.yaml`.\n",
+    }
+
+
+def _with_devices(text: str, connected: Connected) -> str:
+    if connected.bus:
+        text = _set(text, r"(?<=^bus:)(.*\n  address: )\S+", rf"\g<1>serial:{_literal(connected.bus)}")
+    if connected.flap:
+        text = _set(text, r"(?<=^flap:)(.*\n  serial_number: )\S+", rf"\g<1>{_literal(_quoted(connected.flap))}")
+    if connected.camera:
+        text = _set(text, r"(?m)(^    address: )\d\S+", rf"\g<1>{_literal(connected.camera)}")
+    if connected.camera_serial:
+        text = _set(text, r"(?m)(^    serial_number: )\S+", rf"\g<1>{_literal(_quoted(connected.camera_serial))}")
+    for axis in connected.axes:
+        wanted = rf'\g<1>{{address: "serial:{_literal(axis.address)}", serial_number: {axis.serial_number},'
+        text = _set(text, rf"(^  {re.escape(axis.name)}: )\{{address: \S+ serial_number: \d+,", wanted)
+    return text
+
+
+def _set(text: str, pattern: str, by: str) -> str:
+    found, count = re.subn(pattern, by, text, count=1, flags=re.MULTILINE)
+    if not count:
+        raise ConfigError(f"the installed stand's file has no place for {by}; give its name as it is there")
+    return found
+
+
+def _text(folder: str, name: str) -> str:
+    """Of an installed file; editors find its schema from anywhere."""
+    path = packaged(folder, name)
+    schemas: Mapping[str, Path] = {each.name: each for each in (packaged("", "simulated").parent / "schema").iterdir()}
+    return _SCHEMA.sub(
+        lambda found: f"$schema={schemas[found[1]]}" if found[1] in schemas else found[0], path.read_text("utf-8")
+    )
+
+
+def _literal(text: str) -> str:
+    """In what a pattern is replaced by."""
+    return text.replace("\\", r"\\")
+
+
+def _quoted(text: str) -> str:
+    """A number in quotes stays a text."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
