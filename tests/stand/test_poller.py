@@ -1,5 +1,8 @@
 """A poller says when its device is too slow for the period, and when it no longer is."""
 
+from typing import cast
+
+from drivers.devices.protocols import Sensor
 from foundation.clock import VirtualClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Event
@@ -38,7 +41,7 @@ async def test_a_device_that_is_slower_than_its_period_is_an_event_once_and_when
     clock, hub, events = Hands(), Hub(), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     device = Slow(clock)
-    poller = Poller(device, 1.0, hub, clock)
+    poller = Poller(cast(Sensor, device), 1.0, hub, clock)
     await poller.first()
     for takes_s in (0.9, 1.2, 1.5, 0.8, 0.4, 0.4):
         device.takes_s = takes_s

@@ -195,6 +195,8 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
         if isinstance(what, str):
             await fault(ordered, what, value)
         else:
+            assert isinstance(what, int)
+            assert isinstance(value, int)
             await asyncio.to_thread(write_by_another_master, ordered, 1, 6, what, value)
 
     async def operate() -> None:
