@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
 from compensation.history.history import History, recorded_history
-from compensation.one_camera import others_ns
+from compensation.one_camera import others_ns, serial_of, take
 from compensation.one_equilibrium import check_sessions
 from experiments.steps import Role
 from foundation.documents import parse_document, yaml_data
@@ -182,14 +182,18 @@ def observe(
     *,
     across_gap: bool = False,
     incomplete: Say | None = None,
+    camera: str | None = None,
 ) -> Observations:
-    """All frames of all sessions, found once. target: instead of the ones attached to the sessions. progress: such as
-    foundation.progress.progress. finder: how the markers are found, else one frame after the other.
+    """All frames of all sessions, found once. camera: by its name, of those that have several; none the leading one.
+    target: instead of the ones attached to the sessions. progress: such as foundation.progress.progress. finder: how
+    the markers are found, else one frame after the other.
 
     SessionError when a session has frames of two equilibria of the camera, unless `across_gap`, or when something of it
     is missing, unless `incomplete` takes the sentence that says what.
     """
     sessions = [open_whole(path, incomplete) for path in ([paths] if isinstance(paths, Path | str) else paths)]
+    for session in sessions:
+        take(session, camera)
     check_sessions(sessions, across_gap=across_gap)
     targets = [target or session_target(session) for session in sessions]
     parts: list[Observations] = []
@@ -262,8 +266,8 @@ def _purpose(role: str, chamber_degC: float) -> tuple[str, float]:
 
 
 def _facts(session: Session) -> SessionFacts:
-    fields = ("session_id", "recipe", "camera_serial", "operator", "software_version")
-    texts = {name: session.metadata.get(name, "") for name in fields}
+    fields = ("session_id", "recipe", "operator", "software_version")
+    texts = {name: session.metadata.get(name, "") for name in fields} | {"camera_serial": serial_of(session)}
     simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
     return SessionFacts(
         **texts, simulated=simulated, incomplete=len(session.incomplete), utc=session.utc, spots=_spots(session)

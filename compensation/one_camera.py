@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+from foundation.errors import SessionError
 from recording.reading.session import Session
 
-_LEADING = "camera.image"  # of the camera whose temperature the stand goes by
+
+def take(session: Session, name: str | None) -> None:
+    """The session's frames are those of the camera of that name from now on; SessionError when it has none. None: of
+    the leading one."""
+    if name is None:
+        return
+    if name not in (names := _names(session)):
+        raise SessionError(
+            f"{session.path}: no frames of a camera {name}; it has those of {', '.join(names) or 'none'}"
+        )
+    session.camera = name
 
 
 def others_ns(session: Session) -> frozenset[int]:
     """When the other cameras' frames were exposed; no two frames of a session have one instant."""
-    metas = session.frame_metas
-    channels = dict.fromkeys(meta.channel for _, meta in metas)
-    if len(channels) < 2:
+    names = _names(session)
+    if len(names) < 2:
         return frozenset()
-    own = _LEADING if _LEADING in channels else next(iter(channels))
-    return frozenset(time_ns for time_ns, meta in metas if meta.channel != own)
+    own = f"{session.camera if session.camera in names else names[0]}.image"
+    return frozenset(time_ns for time_ns, meta in session.frame_metas if meta.channel != own)
+
+
+def serial_of(session: Session) -> str:
+    """The camera's serial number: of several they are recorded in the order in which they expose."""
+    text = session.metadata.get("camera_serial", "")
+    serials, names = text.split(", "), _names(session)
+    return serials[names.index(session.camera)] if session.camera in names and len(names) == len(serials) else text
+
+
+def _names(session: Session) -> tuple[str, ...]:
+    channels = dict.fromkeys(meta.channel for _, meta in session.frame_metas)
+    return tuple(channel.removesuffix(".image") for channel in channels)

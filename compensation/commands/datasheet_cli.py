@@ -11,6 +11,7 @@ from compensation.commands.observed import observed
 from compensation.commands.options import (
     AcrossGap,
     Cache,
+    CameraName,
     Cluster,
     DetailsOption,
     Incomplete,
@@ -48,6 +49,7 @@ def write_datasheet(
     cache: Cache = True,
     across_gap: AcrossGap = False,
     incomplete: Incomplete = False,
+    camera: CameraName = None,
 ) -> None:
     """Write a camera's thermal datasheet: px/K and ppm/K, settling, hysteresis, what each form of compensation leaves,
     each with its expanded uncertainty and the budget it comes from.
@@ -61,7 +63,14 @@ def write_datasheet(
         stated = load_details(details)
         given = None if model is None else load_model(model)
         observations = observed(
-            sessions, target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
+            sessions,
+            target,
+            workers,
+            cluster,
+            cache=cache,
+            across_gap=across_gap,
+            incomplete=incomplete,
+            camera=camera,
         )
         sheet = datasheet(observations, given or fit(observations), stated)
         equipment = equipment_of(Session.open(sessions[0]))

@@ -13,6 +13,7 @@ from compensation.commands.observed import observed
 from compensation.commands.options import (
     AcrossGap,
     Cache,
+    CameraName,
     Cluster,
     DetailsOption,
     Incomplete,
@@ -75,6 +76,7 @@ def fit(
     cache: Cache = True,
     across_gap: AcrossGap = False,
     incomplete: Incomplete = False,
+    camera: CameraName = None,
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
@@ -90,7 +92,14 @@ def fit(
             observations = _of_table(sessions)
         else:
             observations = observed(
-                sessions, target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
+                sessions,
+                target,
+                workers,
+                cluster,
+                cache=cache,
+                across_gap=across_gap,
+                incomplete=incomplete,
+                camera=camera,
             )
         model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
@@ -146,6 +155,7 @@ def report(
     cache: Cache = True,
     across_gap: AcrossGap = False,
     incomplete: Incomplete = False,
+    camera: CameraName = None,
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
@@ -165,7 +175,14 @@ def report(
             details=stated,
         )
         observations = observed(
-            sessions, target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
+            sessions,
+            target,
+            workers,
+            cluster,
+            cache=cache,
+            across_gap=across_gap,
+            incomplete=incomplete,
+            camera=camera,
         )
         if given is None:
             used, evaluation, refusal = fitted(observations)

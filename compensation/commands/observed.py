@@ -20,7 +20,9 @@ def observed(
     cache: bool,
     across_gap: bool,
     incomplete: bool,
+    camera: str | None = None,
 ) -> Observations:
     """Raises as `observe`, and ConfigError for a target that is neither a file nor installed."""
     wanted, found_by = named_target(target), finder(workers, cluster, use_cache=cache)
-    return observe(sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said_if(incomplete))
+    said = said_if(incomplete)
+    return observe(sessions, progress, wanted, found_by, across_gap=across_gap, incomplete=said, camera=camera)

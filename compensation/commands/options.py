@@ -16,6 +16,9 @@ from markers.target import Target, load_target
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
 ]
+CameraName = Annotated[
+    str | None, typer.Option("--camera", help="Of sessions of several cameras, by its name in the stand's file.")
+]
 DetailsOption = Annotated[
     Path | None,
     typer.Option(help="A file that states what no recording knows: lens, certificates, places of sensors, u_air_K."),

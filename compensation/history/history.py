@@ -31,7 +31,7 @@ _FEWEST_READINGS = 200
 _CHANGE_NS = 30 * NS_PER_S
 """Two readings further apart do not show when the display changed."""
 
-_AMBIENT, _POWER, _CAMERA = "thermometers.air", "relays.camera_power", "camera.temperature"
+_AMBIENT, _POWER = "thermometers.air", "relays.camera_power"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +59,7 @@ class History:
 def recorded_history(session: Session) -> History:
     """What the session's telemetry has of it; a channel that was not recorded is empty."""
     ambient_ns, ambient_degC = _good(session, _AMBIENT)
-    camera_ns, camera_degC = _good(session, _CAMERA)
+    camera_ns, camera_degC = _good(session, f"{session.camera}.temperature")
     powered_ns, powered = _powered(session)
     return refined(History(ambient_ns, ambient_degC, powered_ns, powered, camera_ns, camera_degC))
 

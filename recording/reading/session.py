@@ -68,7 +68,10 @@ _NUMBER_DIGITS = 18
 
 class Session:
     """A session directory. Of its segments those in `incomplete` were not finished, those in `damaged` were replaced
-    by what could be salvaged from them; both are not read."""
+    by what could be salvaged from them; both are not read. `camera`: whose frames are meant where those of one camera
+    are, by its name; the leading one's unless it is set."""
+
+    camera = "camera"
 
     def __init__(self, path: Path, telemetry: list[Path], frames: list[Path]) -> None:
         self.path = path
