@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from experiments.steps import Capture, PlannedStep
@@ -42,4 +43,12 @@ def report_session(session: Path, folder: Path) -> list[str]:
         remedy = f"`compensate report {session} -o report.html` tries again"
         raise NotReported(f"{session} is recorded, but not reported: {error}; {remedy}") from error
     fitted = [] if evaluation is None else [table(evaluation), f"model    {model}"]
-    return [*fitted, f"report   {report}"]
+    return [*_moved(report.with_suffix(".json")), *fitted, f"report   {report}"]
+
+
+def _moved(numbers: Path) -> Iterator[str]:
+    """What no temperature explains, a line for each: steps of the image, slips, fixings that settle anew."""
+    found = json.loads(numbers.read_text())
+    for bump in found["bumps"]:
+        yield f"warning: between {bump['after']} and {bump['before']} {bump['text']}; no temperature explains it"
+    yield from (f"warning: {one['text']}" for one in found["unrepeated"] if one["cause"] != "nothing")

@@ -26,16 +26,18 @@ warm-up has thousands) do not outweigh one frame at each of many."""
 @dataclass(frozen=True, slots=True, eq=False)
 class Instants:
     """I instants. normal (I, 8, 8), moment (I, 8): weighted normal equations of the motions. features (I, H): means
-    over the frames, minus those of the reference. chamber_degC (I,): set-point, NaN in a warm-up."""
+    over the frames, minus those of the reference. chamber_degC (I,): set-point, NaN in a warm-up. session (I,)."""
 
     normal: Float
     moment: Float
     features: Float
     chamber_degC: Float
+    session: NDArray[np.int64]
 
     def where(self, mask: Mask) -> Instants:
         """The instants of a mask (I,)."""
-        return Instants(self.normal[mask], self.moment[mask], self.features[mask], self.chamber_degC[mask])
+        kept = self.normal[mask], self.moment[mask], self.features[mask]
+        return Instants(*kept, self.chamber_degC[mask], self.session[mask])
 
     @property
     def square(self) -> float:
@@ -64,7 +66,8 @@ def condense_instants(
     first[label[::-1]] = rows.frame[::-1]
     chamber_degC = np.where(set_point[first], observations.chamber_degC[first], np.nan)
     good = np.linalg.cond(normal) < 1e8
-    found = Instants(normal * weight_of[:, None, None], moment * weight_of[:, None], mean, chamber_degC)
+    weighted = normal * weight_of[:, None, None], moment * weight_of[:, None]
+    found = Instants(*weighted, mean, chamber_degC, observations.session[first])
     return found.where(good & np.isfinite(mean).all(axis=1))
 
 

@@ -89,6 +89,7 @@ class ThermalFile(_File):
     rate_range_K_per_h: Pair
     least_on_s: float | None
     leverage_px2: float | None = None
+    usual_leverage_px2: float | None = None
     history_s: float | None = None
     other: PaperFile | None = None
 
@@ -182,6 +183,7 @@ def _thermal_fields(model: ThermalModel) -> dict[str, object]:
         "rate_range_K_per_h": model.valid.rate_K_per_h,
         "least_on_s": _finite(model.valid.least_on_s),
         "leverage_px2": _finite(model.valid.leverage),
+        "usual_leverage_px2": model.valid.usual_leverage,
         "history_s": model.valid.history_s,
     }
 
@@ -230,6 +232,7 @@ def _thermal(file: ThermalFile) -> ThermalModel:
             least_on_s=math.inf if file.least_on_s is None else file.least_on_s,
             leverage=math.inf if file.leverage_px2 is None else file.leverage_px2,
             history_s=file.history_s,
+            usual_leverage=file.usual_leverage_px2,
         ),
         has_warm_up=file.has_warm_up,
         candidates=file.candidates,

@@ -5,7 +5,9 @@ In use is the simplest family within one standard error of the best; of two as s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,7 @@ from experiments.steps import Role
 from foundation.errors import SessionError
 
 _FEWEST_FOLDS = 3
+_MOST_OF = 0.8
 _GUESSED = {Kind.AMBIENT_LAG: 0.25, Kind.CAMERA_LAG: 0.25, Kind.CAMERA_LAG_SQUARE: 0.25, Kind.POWER_LAG: 0.5}
 """How wrong the first guess of a feature may be: 5 K of 20, half of the self-heating."""
 _LEAST_PX, _STEP_S = 0.001, 300.0
@@ -42,11 +45,12 @@ class _Tried:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """The normal equations for every term, of all instants and of those of each fold."""
+    """The normal equations for every term, of all instants, of those of each set-point and of each session."""
 
     trained: Training
     whole: Equations
     folds: dict[float, Equations]
+    nights: dict[int, Equations]
 
     def columns(self, terms: Terms) -> NDArray[np.int64]:
         """Where the terms are among all."""
@@ -84,12 +88,13 @@ def left_out_thermal(model: ThermalModel, observations: Observations) -> tuple[D
     """The rows at set-points of other observations, and their residuals (M, 2), each from a new fit of the same terms
     that has not seen its set-point."""
     trained = training(observations, model.terms, model.memory)
+    rest = trained.at_rest
     plays = any(term.kind is Kind.PLAY for term in model.terms)
     try:
         held_out = _held_out(_problem(trained), model.terms, RIDGE_WITH_PLAYS if plays else RIDGE)
     except np.linalg.LinAlgError as error:
         raise SessionError("the markers and temperatures do not determine a thermal model of these terms") from error
-    return trained.fold_rows, held_out
+    return trained.fold_rows.where(rest), held_out[rest]
 
 
 def _problem(trained: Training) -> _Problem:
@@ -100,7 +105,9 @@ def _problem(trained: Training) -> _Problem:
             f"a thermal fit needs frames at {_FEWEST_FOLDS} chamber temperatures or more, found {len(set_points)}"
         )
     folds = {degC: equations(instants.where(instants.chamber_degC == degC)) for degC in set_points}
-    return _Problem(trained, equations(instants), folds)
+    sessions = np.unique(instants.session).tolist()
+    nights = {index: equations(instants.where(instants.session == index)) for index in sessions}
+    return _Problem(trained, equations(instants), folds, nights)
 
 
 def _tried(problem: _Problem, family: Family) -> _Tried | None:
@@ -123,22 +130,56 @@ def _tried(problem: _Problem, family: Family) -> _Tried | None:
 
 
 def _held_out(problem: _Problem, terms: Terms, ridge: float) -> Float:
-    """Residuals (M, 2) of the rows at set-points, each from a fit that has not seen its set-point."""
+    """Residuals (M, 2) of the fold rows, each from a fit that has not seen its set-point."""
+    return _residuals(problem, terms, ridge, problem.folds, problem.trained.fold_rows.chamber_degC)
+
+
+def _residuals(
+    problem: _Problem, terms: Terms, ridge: float, folds: Mapping[Any, Equations], of_row: NDArray[Any]
+) -> Float:
+    """Residuals (M, 2) of the fold rows, each from a fit without its own of the folds (M,)."""
     trained, columns = problem.trained, problem.columns(terms)
     rows = trained.fold_rows
     residual = rows.displacement_px.copy()
-    for chamber_degC, fold in problem.folds.items():
+    for key, fold in folds.items():
         coefficients = solve_thermal(problem.whole - fold, columns, ridge).coefficients
-        here = rows.chamber_degC == chamber_degC
+        here = of_row == key
         amounts = trained.features[rows.frame[here]][:, columns] @ coefficients.T
         moved = motions(rows.measured_px[here], trained.observations.image_size)
         residual[here] -= np.einsum("nak,nk->na", moved, amounts)
     return residual
 
 
+def _discrepancy_px(problem: _Problem, one: _Tried) -> Float:
+    """(2,): of set-points left out; of several nights also of nights left out, which shows what of the drift does not
+    repeat between them, the larger of the two."""
+    trained, rest = problem.trained, problem.trained.at_rest
+    rows = trained.fold_rows.where(rest)
+    found = discrepancy_px(rows, one.held_out[rest])
+    night = trained.observations.session[rows.frame]
+    nights = {index: fold for index, fold in problem.nights.items() if _others_know(rows.chamber_degC, night, index)}
+    if not nights:
+        return found
+    try:
+        left = _residuals(problem, one.terms, one.ridge, nights, trained.observations.session[trained.fold_rows.frame])
+    except np.linalg.LinAlgError:
+        return found
+    squares = left[rest] ** 2 - rows.variance_px2
+    each = np.array([squares[night == index].mean(axis=0) for index in nights])
+    return np.maximum(found, np.sqrt(np.maximum(each.mean(axis=0), 0.0)))
+
+
+def _others_know(chamber_degC: Float, night: NDArray[np.int64], index: int) -> bool:
+    """Whether the other nights were at all set-points of this one, and at most of all: else without it a fit has to
+    extrapolate."""
+    own, others = set(chamber_degC[night == index].tolist()), set(chamber_degC[night != index].tolist())
+    return bool(own) and own <= others and len(others) >= _MOST_OF * len(own | others)
+
+
 def _candidate(trained: Training, one: _Tried, chosen: bool) -> Candidate:
-    rows = trained.fold_rows
-    squares = fold_means(rows, one.held_out**2)
+    rest = trained.at_rest
+    rows = trained.fold_rows.where(rest)
+    squares = fold_means(rows, one.held_out[rest] ** 2)
     i, j = np.sqrt(squares.mean(axis=0))
     return Candidate(
         form="thermal",
@@ -160,24 +201,28 @@ def _model(problem: _Problem, one: _Tried, heating_K: float, candidates: tuple[C
     count = MOTIONS * len(columns)
     camera_degC = _extent(trained.states.camera_degC[np.unique(trained.rows.frame)])
     found = ThermalModel(
-        facts=facts_of(observations, trained.fold_rows, camera_degC, trained.origin.camera_degC),
+        facts=facts_of(observations, trained.fold_rows.where(trained.at_rest), camera_degC, trained.origin.camera_degC),
         terms=one.terms,
         reference_ambient_degC=trained.origin.ambient_degC,
         self_heating_K=heating_K,
         reference_features=trained.reference_features[columns],
         coefficients=solution.coefficients,
         coefficient_covariance=solution.covariance.reshape(count, count),
-        discrepancy_px=discrepancy_px(trained.fold_rows, one.held_out),
+        discrepancy_px=_discrepancy_px(problem, one),
         valid=_range(trained, one.terms),
         has_warm_up=any(term.kind is Kind.POWER_LAG for term in trained.terms),
         candidates=candidates,
     )
-    return replace(found, valid=replace(found.valid, leverage=_leverage(found, trained), history_s=_history_s(found)))
+    largest, usual = _leverages(found, trained)
+    valid = replace(found.valid, leverage=largest, history_s=_history_s(found), usual_leverage=usual)
+    return replace(found, valid=valid)
 
 
-def _leverage(model: ThermalModel, trained: Training) -> float:
-    """The largest of a training state."""
-    return float(model.leverage(trained.states.where(np.unique(trained.rows.frame))).max())
+def _leverages(model: ThermalModel, trained: Training) -> tuple[float, float]:
+    """The largest of a training state, and the mean at set-points, each counting the same."""
+    largest = float(model.leverage(trained.states.where(np.unique(trained.rows.frame))).max())
+    rows = trained.fold_rows.where(trained.at_rest)
+    return largest, float(fold_means(rows, model.leverage(trained.states)[rows.frame, None]).mean())
 
 
 def _history_s(model: ThermalModel) -> float:

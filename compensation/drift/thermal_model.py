@@ -37,7 +37,8 @@ _MARGIN = 0.02
 class ThermalRange:
     """What the calibration covered besides the camera's temperature: the slowest lag of the ambient, how fast the
     ambient changed, K/h, and the shortest time since the camera was switched on, s. leverage: the largest of a training
-    state, inf in models that do not know it. history_s: how long a state must have been followed after a guess until
+    state, inf in models that do not know it; usual_leverage: the mean of set-points that were left
+    out in turn, None there. history_s: how long a state must have been followed after a guess until
     what is left of it does not matter; None: three of the longest time constants."""
 
     ambient_degC: Pair
@@ -45,6 +46,7 @@ class ThermalRange:
     least_on_s: float
     leverage: float = math.inf
     history_s: float | None = None
+    usual_leverage: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,12 +101,14 @@ class ThermalModel:
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself. What
-        the form leaves unexplained is taken to grow with the leverage, beyond that of the training states."""
+        the form leaves unexplained was seen at set-points that were left out, and is taken to grow with the leverage
+        beyond theirs."""
         found = self._features(state, len(xy_px))
         terms = motions(xy_px, self.facts.image_size)[:, :, :, None] * found[:, None, None, :]
         terms = terms.reshape(len(xy_px), 2, -1)
         of_coefficients = (terms @ self.coefficient_covariance) @ terms.transpose(0, 2, 1)
-        more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0)
+        usual = self.valid.leverage if self.valid.usual_leverage is None else self.valid.usual_leverage
+        more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / usual, 1.0)
         return of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:

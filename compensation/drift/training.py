@@ -18,6 +18,9 @@ from foundation.errors import SessionError
 _TRUSTED_S = 3600.0
 """After a gap the state is a guess; frames within this time teach nothing, unless the reference is one of them."""
 
+_WARM_S = 3 * 3600.0
+"""So long after switching on what still moves is the air's doing."""
+
 _SAME_PLACE_PX = 10.0
 """A warm-up seen this far from the reference was of a camera that had been moved or rolled."""
 
@@ -42,13 +45,25 @@ class Training:
         return self.observations.of(Role.REFERENCE, Role.FIT)
 
     @property
+    def folds(self) -> Mask:
+        """(F,): frames that are left out with a set-point: those at it, and those on the way to it, which show nearly
+        the same state. A camera that was switched on lately is on no way to a set-point."""
+        on_the_way = self.observations.of(Role.WARM_UP) & (self.states.on_s >= _WARM_S)
+        return self.set_points | on_the_way
+
+    @property
     def fold_rows(self) -> Displacements:
-        """The rows at set-points."""
-        return self.rows.where(self.set_points[self.rows.frame])
+        """The rows of these frames."""
+        return self.rows.where(self.folds[self.rows.frame])
+
+    @property
+    def at_rest(self) -> Mask:
+        """(M,): which of the fold_rows are at set-points."""
+        return self.set_points[self.fold_rows.frame]
 
     def instants(self) -> Instants:
         """The rows condensed."""
-        return condense_instants(self.observations, self.rows, self.features, self.set_points)
+        return condense_instants(self.observations, self.rows, self.features, self.folds)
 
 
 def frame_states(observations: Observations, memory: Memory) -> States:

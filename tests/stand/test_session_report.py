@@ -1,0 +1,29 @@
+"""What `stand run --report` says of a night beside its table: steps of the image and slips, from the numbers."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from compensation.reporting import report
+from stand.session_report import report_session
+
+MOVED = "the image moved by +30 (1) mpx along I and -40 (1) along J (standard uncertainty)"
+
+
+def test_a_step_and_slips_are_said_when_the_night_is_reported(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bump = {"after": "2026-01-02T06:00:00Z", "before": "2026-01-02T06:40:00Z", "text": MOVED}
+    kinds = [{"cause": "slips", "text": "a joint sticks and slips"}, {"cause": "nothing", "text": "all repeats"}]
+
+    def analysed(_sessions: object, _model: object, page: object, _progress: object) -> None:
+        assert page == tmp_path / "report.html"
+        (tmp_path / "report.json").write_text(json.dumps({"bumps": [bump], "unrepeated": kinds}))
+
+    monkeypatch.setattr(report, "analyse", analysed)
+    lines = report_session(tmp_path / "night", tmp_path)
+    assert lines == [
+        f"warning: between 2026-01-02T06:00:00Z and 2026-01-02T06:40:00Z {MOVED}; no temperature explains it",
+        "warning: a joint sticks and slips",
+        f"report   {tmp_path / 'report.html'}",
+    ]
