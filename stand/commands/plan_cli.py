@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from experiments.looks import looks_of
 from experiments.steps import Step, kind_of, parameters_of
 from foundation.clock import NS_PER_S, WallClock
 from foundation.command_app import App
@@ -60,9 +61,16 @@ def plan(
             f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
         )
         lines = camera_lines(order.config)
-        data = {"steps": [step.as_json() for step in steps], **totals, "cameras": [asdict(line) for line in lines]}
+        looks = looks_of(step.planned for step in steps)
+        data = {
+            "steps": [step.as_json() for step in steps],
+            **totals,
+            "cameras": [asdict(line) for line in lines],
+            "looks": None if looks is None else asdict(looks),
+        }
         shared = [str(line) for line in lines if line.shared_by > 1]
-        show(data, [*map(_line, steps), *back, total, str(learned), *shared])
+        seen = [] if looks is None else [str(looks)]
+        show(data, [*map(_line, steps), *back, total, *seen, str(learned), *shared])
 
 
 @app.command()

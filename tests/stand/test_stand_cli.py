@@ -30,6 +30,7 @@ def test_plan_lists_steps_and_totals():
     assert result.exit_code == 0
     assert "SetTemperature chamber_degC=31.0" in " ".join(result.output.split())
     assert "GB; started now it ends" in result.output
+    assert "49 looks at the drift: a step of the image from 50 mpx on shows" in result.output
 
 
 def test_the_json_plan_adds_up():
