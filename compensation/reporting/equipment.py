@@ -59,7 +59,16 @@ def _stand(session: Session) -> Iterator[Line]:
             yield name, str(kind)
     thermometers = data.get("thermometers")
     if isinstance(thermometers, dict):
-        yield "Thermometer channels", ", ".join(str(name) for name in thermometers)
+        yield "Thermometer channels", ", ".join(_sensor(name, sensor) for name, sensor in thermometers.items())
+
+
+def _sensor(name: object, sensor: Any) -> str:
+    """A sensor with what is known of its calibration, as the stand's file states it."""
+    known = sensor if isinstance(sensor, dict) else {}
+    certificate = " of ".join(str(known[key]) for key in ("certificate", "calibrated") if known.get(key))
+    uncertainty = f"U = {known['uncertainty_K']:g} K" if isinstance(known.get("uncertainty_K"), int | float) else ""
+    facts = ", ".join(text for text in (certificate, uncertainty) if text)
+    return f"{name} ({facts})" if facts else str(name)
 
 
 def stated(details: Details, target: Target) -> list[Line]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from datetime import date
 
 from pydantic import Field
 
@@ -22,13 +23,16 @@ class ThermometerSettings(Document):
     """One sensor: `channel` 0.. of the module and its calibration against a certificate.
 
     T = t + offset_K + sum_k polynomial[k] * t**k, where t is what the module says, in degC. A calibrated value outside
-    plausible_degC is no measurement.
+    plausible_degC is no measurement. certificate: its number, and when (calibrated) it was made; uncertainty_K: the
+    expanded one (k = 2) that it states. All three are recorded with every session and stand in its reports.
     """
 
     channel: int = Field(ge=0, le=15)
     offset_K: float = Field(default=0.0, ge=-10, le=10)  # a Pt100 that is further off is broken
     polynomial: tuple[float, ...] = Field(default=(), max_length=8)
     certificate: Line = ""
+    calibrated: date | None = None
+    uncertainty_K: float | None = Field(default=None, gt=0, le=5)
     plausible_degC: Range = PLAUSIBLE_DEGC
 
     def calibrated_degC(self, indicated_degC: float) -> float:
