@@ -19,6 +19,7 @@ app = lazy_app(
         "resume": Lazy(_RUN, "Resume a run that was killed or interrupted, in its session."),
         "status": Lazy(_CONTROL, "What the running session is doing."),
         "watch": Lazy(_CONTROL, "What happens, as it happens."),
+        "foxglove": Lazy("stand.commands.foxglove_cli", "What happens, in Foxglove or Lichtblick."),
         "pause": Lazy(_CONTROL, "Hold the run before its next action."),
         "continue": Lazy(_CONTROL, "End a pause."),
         "clear": Lazy(_CONTROL, "Continue a run that an interlock holds, once you have removed the cause."),

@@ -46,6 +46,21 @@ class Server:
     ) -> object:
         """The JSON it answers, None when that is empty. SessionError when it does not answer, or refuses: then with its
         sentence."""
+        return self._understood(*self._answered(method, path, body, timeout_s)[:2])
+
+    def picture(self, timeout_s: float = LIMIT_S) -> tuple[int, bytes] | None:
+        """The last frame: its time in ns since the epoch, on the stand's clock, and a JPEG; None when there is none.
+        SessionError as `request`."""
+        status, content, headers = self._answered("GET", f"{API}/frame.jpg", None, timeout_s)
+        if status != http.HTTPStatus.OK:
+            self._understood(status, content)
+            return None
+        return int(headers.get("x-time-ns", "0")), content
+
+    def _answered(
+        self, method: str, path: str, body: Mapping[str, object] | None, timeout_s: float
+    ) -> tuple[int, bytes, http.client.HTTPMessage]:
+        """Status, content and headers."""
         connection = self._connection(timeout_s)
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         try:
@@ -55,7 +70,7 @@ class Server:
                     headers["Content-Type"] = "application/json"
                 connection.request(method, path, content, headers)
             reply = connection.getresponse()
-            status, text = reply.status, reply.read()
+            return reply.status, reply.read(), reply.headers
         except TimeoutError:
             raise SessionError(
                 f"{self.name}: its daemon has not answered within {timeout_s:g} s; it may hang"
@@ -72,7 +87,6 @@ class Server:
             raise SessionError(f"{self.name}: its daemon sent {_UNKNOWN}") from None
         finally:
             connection.close()
-        return self._understood(status, text)
 
     def order(self, verb: str, body: Mapping[str, object] | None = None, timeout_s: float = LIMIT_S) -> Answer:
         """What a command to the run is answered (desk.Done)."""

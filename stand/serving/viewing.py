@@ -71,8 +71,8 @@ class Viewing:
                 self.skipped += 1
             self._newest[camera] = (item, self._roles.get(item.step_id, ""))
             return
-        if isinstance(item, Event) and item.kind == _RUN_RESUME:
-            self._has_to_recall = True
+        if isinstance(item, Event) and item.kind in (_RUN_START, _RUN_RESUME):
+            self._has_to_recall = item.kind == _RUN_RESUME
         if isinstance(item, StepMark) and item.state is StepState.STARTED:
             role = item.parameters.get("role")
             self._roles = {item.step_id: role} if isinstance(role, str) else {}
@@ -154,8 +154,8 @@ class Viewing:
             self._plot(camera, preview)
 
     async def _recall(self, line: Line) -> None:
-        """Take the run's own references for drift from its session: this process or the one that looks is a new one,
-        or another run came in between."""
+        """Take the run's own references for drift from its session: this process or the one that looks is a new
+        one, or another run came in between."""
         self._has_to_recall = False
         if not (session := self._session()):
             return
@@ -182,12 +182,13 @@ class Viewing:
         line = self._started().line(_LOOK)
         if not self._knows_target:
             await asyncio.to_thread(line.make, "previewer", previewer, self.target_text)
-            self._knows_target = self._has_to_recall = True
+            self._knows_target = True
         return line
 
     async def _has_ended(self, why: str) -> None:
         self._warn(f"no new frames on the page for {_AGAIN_S:g} s: {why}")
         self._end_helper()
+        self._has_to_recall = True
         await asyncio.sleep(_AGAIN_S)
 
     def _end_helper(self) -> None:

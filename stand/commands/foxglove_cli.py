@@ -1,0 +1,51 @@
+"""`stand foxglove`: a running stand in a viewer of robots' data."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from typing import Annotated
+
+import typer
+
+from foundation.command_app import App
+from foundation.errors import ConfigError
+from stand.commands.reached import on_stand
+from stand.serving.client import Server
+
+app = App()
+_LOOK_S = 0.5
+
+
+@app.command()
+@on_stand(anywhere=True)
+def foxglove(
+    server: Server,
+    port: Annotated[int, typer.Option(help="Of this machine, at which a viewer connects.")] = 8765,
+) -> None:
+    """Show what happens in Foxglove or Lichtblick, at ws://127.0.0.1:8765, until Ctrl-C. Viewers can only read.
+
+    Example: stand foxglove
+    """
+    try:
+        from stand.watching.foxglove_live import HOST, Published
+    except ModuleNotFoundError as error:
+        raise ConfigError("it needs foxglove-sdk: pip install 'thermostand[foxglove]'") from error
+    from stand.watching.there import There
+
+    there = There(server)
+    try:
+        published = Published(server.state().stand, port)
+    except (OSError, RuntimeError) as error:
+        raise ConfigError(f"--port {port}: cannot listen at {HOST} ({error})") from error
+    typer.echo(f"ws://{HOST}:{port}; Ctrl-C ends it", err=True)
+    try:
+        with suppress(KeyboardInterrupt):
+            while True:
+                for event in there.events():
+                    published.event(event)
+                published.state(server.state())
+                published.picture(server.picture)
+                threading.Event().wait(_LOOK_S)
+    finally:
+        published.close()
