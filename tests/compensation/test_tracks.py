@@ -129,3 +129,18 @@ def test_figures_bear_missing_frames_and_temperatures():
     paths = Paths("", track.start_px, track.moved_px, holes.camera_degC[track.frames])
     for figure in (trajectories(holes, [paths]), drift_figures.against_time(holes)):
         assert as_svg(figure, "holes").startswith("<svg")
+
+
+def test_what_a_thermal_imager_saw_stands_beneath_the_drift():
+    night = observations(quadratic, 0.005)
+    times_ns = np.linspace(night.time_ns[0] - 10**12, night.time_ns[-1] + 10**12, 1000).astype(np.int64)
+    spots = {"lens": (times_ns, np.linspace(30.0, 50.0, 1000)), "back": (times_ns, np.full(1000, np.nan))}
+    without, seen = night, replace(night, sessions=(replace(facts(), spots=spots),))
+    assert len(drift_figures.against_time(without).axes) == 2
+    *_, foot = drift_figures.against_time(seen).axes
+    lens, _ = foot.lines
+    hours = (night.time_ns[-1] - night.time_ns[0]) / 3.6e12
+    assert 0 <= lens.get_xdata()[0] < 0.01 * hours
+    assert 0.99 * hours < lens.get_xdata()[-1] <= hours
+    assert [text.get_text() for text in foot.get_legend().get_texts()][:2] == ["lens", "back"]
+    assert foot.get_ylabel() == "thermal imager (°C)"
