@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foundation.errors import ConfigError
-from stand.config.stand_config import packaged
+from stand.config.stand_config import Folder, packaged
 
 _SCHEMA = re.compile(r"\$schema=\S+/([a-z-]+\.json)")
 
@@ -75,7 +75,7 @@ def _set(text: str, pattern: str, by: str) -> str:
     return found
 
 
-def _text(folder: str, name: str) -> str:
+def _text(folder: Folder, name: str) -> str:
     """Of an installed file; editors find its schema from anywhere."""
     path = packaged(folder, name)
     schemas: Mapping[str, Path] = {each.name: each for each in (packaged("", "simulated").parent / "schema").iterdir()}

@@ -1,12 +1,16 @@
 """The page in a real browser, as somebody uses it at night. The stand behind it is a desk that a test sets."""
 
 import asyncio
+import json
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 import pytest_asyncio
 
 from foundation.clock import NS_PER_S
+from foundation.documents import parse_document
+from stand.config.recipe import Recipe
+from stand.config.stand_config import packaged
 from stand.gate import OPERATOR
 from tests.stand.browser import DESKTOP, PHONE, a_page, browser, needs_chromium
 from tests.stand.page_desk import a_night, frame_of, free_port, target_image
@@ -244,6 +248,24 @@ async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):
         await page.get_by_label("frames", exact=True).first.fill("-5")
         await page.get_by_role("button", name="Add to the queue").click()
         assert len(night.queue) == 3  # the browser says what is wrong with the field
+
+
+async def test_steps_and_parts_within_parts_have_fields_of_their_own(night):
+    async with a_page(night.chromium, night.port, "queue") as page:
+        await page.get_by_label("recipe", exact=True).select_option("ramps")
+        await page.get_by_text("Look at and change its parameters").click()
+        await page.get_by_label("rate K per min").first.fill("0.7")
+        await page.get_by_label("Kind of steps, one after another").select_option("soak")
+        await page.get_by_role("button", name="Add to steps, one after another").click()
+        await page.get_by_label("soak", exact=True).last.fill("90")
+        await page.get_by_role("button", name="Add to the queue").click()
+        await page.get_by_text("is queued").wait_for()
+        told = json.loads(night.requests[night.queue[-1].key][0].recipe_text)
+        assert told["steps"][-1] == {"soak": 90}
+        repeat = next(step["repeat"] for step in told["steps"] if "repeat" in step)
+        assert repeat["steps"][0]["ramp"]["rate_K_per_min"] == 0.7
+        before = len(list(parse_document(packaged("recipes", "ramps").read_text(), Recipe, "ramps").plan()))
+        assert len(list(parse_document(json.dumps(told), Recipe, "sent").plan())) == before + 1
 
 
 async def test_runs_are_moved_by_buttons_and_by_dragging_and_removed_after_a_question(night):

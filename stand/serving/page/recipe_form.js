@@ -11,19 +11,21 @@ export class RecipeForm {
 
   resolve(schema) {
     while (schema.$ref) schema = this.schema.$defs[schema.$ref.split("/").pop()];
-    const choices = schema.anyOf?.filter((each) => each.type !== "null");
+    let choices = schema.anyOf?.filter((each) => each.type !== "null");
+    const objects = choices?.filter((each) => each.$ref);
+    if (choices?.length === 2 && objects.length === 1) choices = objects; // the other one is a short way to write it
     return choices?.length === 1 ? { ...this.resolve(choices[0]), default: schema.default } : schema;
   }
 
   // The kinds of experiment that have fields of their own.
   kinds() {
     const { properties } = this.resolve(this.schema.properties.experiments.items);
-    return Object.keys(properties).filter((kind) => this.resolve(properties[kind]).properties);
+    return Object.keys(properties).filter((kind) => { const each = this.resolve(properties[kind]); return each.properties || each.type === "array"; });
   }
 
   load(recipe) {
     this.parts = [];
-    this.steps = recipe.steps?.length ? json_field("steps, one after another", recipe.steps, "Steps of the recipe as JSON, see docs/recipes.md") : null;
+    this.steps = recipe.steps?.length ? this.rows_field("steps, one after another", this.schema.properties.steps, recipe.steps, true) : null;
     this.name = text_field("name", recipe.name ?? "", { pattern: "[a-z0-9][a-z0-9\\-]*", maxlength: 100, required: true });
     this.about = text_field("description", recipe.description ?? "", { maxlength: 1000 });
     this.places = h("div", { class: "stack" });
@@ -39,7 +41,7 @@ export class RecipeForm {
   add(kind, values) {
     const items = this.resolve(this.schema.properties.experiments.items);
     const schema = items.properties[kind] ? this.resolve(items.properties[kind]) : {};
-    const fields = schema.properties ? this.fields(schema, values) : [json_field("", values, "As JSON")];
+    const fields = schema.properties ? this.fields(schema, values) : [schema.type === "array" ? this.rows_field(kind, schema, Array.isArray(values) ? values : [], true) : json_field("", values, "As JSON")];
     const box = h("fieldset", {}, h("legend", {}, words(kind)));
     const part = { kind, fields, is_whole: !schema.properties };
     box.append(...fields.map((field) => field.row), h("button", { type: "button", class: "small", onclick: () => { this.parts.splice(this.parts.indexOf(part), 1); box.remove(); } }, `Remove this ${words(kind)}`));
@@ -59,7 +61,43 @@ export class RecipeForm {
     if (schema.type === "string") return text_field(name, given ?? "", { pattern: schema.pattern, maxlength: schema.maxLength, required });
     if (schema.type === "array" && this.resolve(schema.items ?? {}).type === "number") return list_field(name, this.resolve(schema.items), given ?? [], required);
     if (schema.type === "object" && schema.additionalProperties?.type === "number") return this.position_field(name, given ?? {});
+    if (schema.properties) return this.object_field(name, schema, given, required);
+    if (schema.type === "array" && this.resolve(schema.items ?? {}).properties) return this.rows_field(name, schema, given ?? [], required);
+    if (is_texts(schema)) return texts_field(name, given ?? [], required);
     return json_field(name, given ?? null, schema.description ?? "As JSON; empty or null for none");
+  }
+
+  // An object within another: its fields are there when it is asked for.
+  object_field(name, schema, value, required) {
+    const given = long(value), inner = this.fields(schema, given ?? {});
+    const is_asked = h("input", { type: "checkbox", "aria-label": words(name) });
+    is_asked.checked = required || Boolean(given);
+    const box = h("fieldset", { hidden: !is_asked.checked }, h("legend", {}, words(name)), inner.map((each) => each.row));
+    is_asked.addEventListener("change", () => { box.hidden = !is_asked.checked; });
+    const place = h("div", { class: "grow" }, required ? null : is_asked, inner.length ? box : null);
+    return nested(field(name, place, "", () => (is_asked.checked ? collect(inner) : undefined)));
+  }
+
+  // Objects one after another; of one with a choice of keys, such as a step, one key is chosen.
+  rows_field(name, schema, values, required) {
+    const items = this.resolve(schema.items), rows = [], kinds = Object.keys(items.properties);
+    const is_choice = kinds.length > 1 && !items.required && kinds.every((kind) => items.properties[kind].default === null);
+    const list = h("div", { class: "stack" });
+    const choice = h("select", { "aria-label": `Kind of ${words(name)}` }, kinds.map((kind) => h("option", { value: kind }, words(kind))));
+    const add = (value) => {
+      const kind = is_choice ? Object.keys(value)[0] : null;
+      const chosen = is_choice ? this.resolve(items.properties[kind]) : items;
+      const inner = chosen.properties ? this.fields(chosen, (is_choice ? value[kind] : value) ?? {}) : [this.field(kind, chosen, value[kind], true)];
+      const found = () => (chosen.properties ? collect(inner) : inner[0].value() ?? value[kind] ?? {});
+      const row = { value: () => (is_choice ? { [kind]: found() } : found()) };
+      const box = h("fieldset", {}, h("legend", {}, words(kind ?? name)), inner.map((each) => each.row),
+        h("button", { type: "button", class: "small", "aria-label": `Remove ${words(kind ?? name)} ${rows.length + 1}`, onclick: () => { rows.splice(rows.indexOf(row), 1); box.remove(); } }, "Remove"));
+      rows.push(row);
+      list.append(box);
+    };
+    for (const value of values) add(long(value));
+    const more = h("div", { class: "row" }, is_choice ? choice : null, h("button", { type: "button", class: "small", onclick: () => add(is_choice ? { [choice.value]: undefined } : {}) }, `Add to ${words(name)}`));
+    return nested(field(name, h("div", { class: "stack grow" }, list, more), "", () => (rows.length || required ? rows.map((row) => row.value()) : undefined)));
   }
 
   position_field(name, values) {
@@ -81,6 +119,17 @@ export class RecipeForm {
     return recipe;
   }
 }
+
+// What holds other fields has its name above them, so that parts within parts do not become narrower and narrower.
+function nested(made) {
+  made.row.classList.add("nested");
+  return made;
+}
+
+// What may be written as a word is an object with that key: `open_flap`, `settled`.
+const long = (value) => (typeof value === "string" ? { [value]: {} } : value);
+
+const is_texts = (schema) => schema.anyOf?.some((each) => each.type === "array" && each.items?.type === "string");
 
 function collect(fields) {
   return Object.fromEntries(fields.map((each) => [each.name, each.value()]).filter(([, value]) => value !== undefined));
@@ -130,6 +179,14 @@ function list_field(name, items, given, required) {
     const wrong = texts.find((_, index) => Number.isNaN(numbers[index]));
     if (wrong !== undefined) throw new Error(`${words(name)}: ${wrong} is not a number`);
     return numbers.length || required ? numbers : undefined;
+  });
+}
+
+function texts_field(name, given, required) {
+  const input = h("input", { type: "text", value: [given].flat().join(", "), required });
+  return field(name, input, "names with commas between them", () => {
+    const texts = input.value.split(/[\s,;]+/).filter(Boolean);
+    return texts.length ? texts : undefined;
   });
 }
 
