@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from markers.newton import (
     settle,
 )
 from markers.noise import Image, Noise, full_scale_DN
-from markers.pixels import Pixels, empty_pixels
+from markers.pixels import Bytes, Pixels, bytes_of, empty_pixels
 from markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
 from markers.sectors import misfits
 
@@ -95,7 +94,7 @@ def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float, band_s
         np.empty(count, np.uint8),
     )
     _fit_all(
-        only_read(image), parameters, start.scale_px, np.asarray(reach, np.float64),
+        bytes_of(image), parameters, start.scale_px, np.asarray(reach, np.float64),
         (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start, band_sigma)),
         band_sigma,
         covariance, quality, scatter, flags,
@@ -103,13 +102,6 @@ def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float, band_s
     return EdgeFit(
         EdgeState(parameters, start.scale_px), covariance, quality[:, 0], quality[:, 1], quality[:, 2], scatter, flags
     )
-
-
-def only_read(image: Image) -> Image:
-    """The same pixels, not to be written: one type for the compiler, whether or not the caller may write them."""
-    view = cast(Image, np.ascontiguousarray(image).view())
-    view.flags.writeable = False
-    return view
 
 
 def room(image: Image, start: EdgeState, band_sigma: float) -> int:
@@ -121,7 +113,7 @@ def room(image: Image, start: EdgeState, band_sigma: float) -> int:
 def _compiled_fit(sources: str) -> Callable[..., None]:
     @entry
     def fit_all(
-        image: Image,
+        image: Bytes,
         parameters: Float,
         scale: Float,
         reach: Float,

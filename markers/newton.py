@@ -26,8 +26,7 @@ from markers.edge_model import (
     Variance,
     normal_equations,
 )
-from markers.noise import Image
-from markers.pixels import SHARE, VALUE, Gathered, Limits, Pixels, U, V, gather
+from markers.pixels import SHARE, VALUE, Bytes, Gathered, Limits, Pixels, U, V, gather
 from markers.sectors import SECTORS, Bools, set_aside
 
 LEAST_BAND_PX = 3.5
@@ -85,7 +84,7 @@ def no_belief() -> Belief:
 
 @compiled
 def settle(
-    image: Image,
+    image: Bytes,
     p: Float,
     scale: float,
     reach: float,
@@ -136,7 +135,7 @@ def settle(
 
 @compiled
 def look(
-    image: Image, p: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels, belief: Belief
+    image: Bytes, p: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels, belief: Belief
 ) -> Gathered:
     """Gather the pixels round the outline of `p`, without those of sectors that are not kept."""
     gathered = gather(image, p[:2], p[M11:SIGMA], scale, limits, ceiling, pixels)

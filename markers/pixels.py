@@ -16,6 +16,8 @@ from markers.compiled import compiled
 from markers.noise import Image
 
 Float = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+"""An image (height, width, 1 or 2 bytes of a pixel, the low one first)."""
 
 CORE, GROUND, DISC = range(3)
 U, V, VALUE, SHARE, RESIDUAL, RISE = range(6)
@@ -50,6 +52,15 @@ class Gathered(NamedTuple):
     cut: bool
 
 
+def bytes_of(image: Image) -> Bytes:
+    """The image for `gather`: one type for the compiler, whatever the image's depth and whether or not the caller may
+    write it. A copy only of an image that is not contiguous, or of a machine whose high bytes come first."""
+    low_first = np.ascontiguousarray(image, image.dtype.newbyteorder("<"))
+    view = low_first.view(np.uint8).reshape(*image.shape, image.itemsize)
+    view.flags.writeable = False
+    return view
+
+
 def empty_pixels(capacity: int) -> Pixels:
     """Room for `capacity` pixels in each region."""
     return Pixels(np.empty((3, 6, capacity)), np.zeros(3, np.int64))
@@ -57,14 +68,14 @@ def empty_pixels(capacity: int) -> Pixels:
 
 @compiled
 def gather(
-    image: Image, centre: Float, shape: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels
+    image: Bytes, centre: Float, shape: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels
 ) -> Gathered:
     """Fill `pixels` from the image, row by row, with those whose F lies in `limits`; `shape` is m11, m12, m22.
 
     Saturated ones get the share 0 (glare), unless they are a quarter of the ground or of the disc: then the picture
     is overexposed, and clipping shifts the outline but not the centre.
     """
-    height, width = image.shape
+    height, width, size = image.shape
     table, count = pixels.table, pixels.counts
     count[:] = 0
     seen, cut = 0, False
@@ -91,12 +102,15 @@ def gather(
                 count[region] += 1
                 table[region, U, slot] = column
                 table[region, V, slot] = row
-                table[region, VALUE, slot] = image[row, column]
+                value = int(image[row, column, 0])
+                if size == 2:
+                    value += int(image[row, column, 1]) << 8
+                table[region, VALUE, slot] = value
                 table[region, SHARE, slot] = 1.0
                 outside = 1 if q > 1 else 0
                 seen += 1
                 side[outside] += 1
-                burnt[outside] += image[row, column] >= ceiling
+                burnt[outside] += value >= ceiling
     if burnt.sum() > 0:
         _set_burnt_aside(pixels, centre, shape, scale, ceiling, burnt > CLIPPED_PART * side)
     return Gathered(seen, burnt.sum(), cut)

@@ -16,11 +16,11 @@ import numpy as np
 
 from markers import edge_model, newton, pixels, sectors
 from markers.compiled import compiled, digest, entry
-from markers.edge_fit import only_read, room
+from markers.edge_fit import room
 from markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
 from markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
 from markers.noise import Image, Noise, full_scale_DN
-from markers.pixels import Pixels, empty_pixels
+from markers.pixels import Bytes, Pixels, bytes_of, empty_pixels
 from markers.sectors import SECTORS, Bools, sector_misfits
 
 _LEAST_SECTORS = 13
@@ -52,7 +52,7 @@ def refit_edges(
     parameters = np.ascontiguousarray(start.parameters).copy()
     covariance, chi = np.empty((count, 2, 2)), np.empty(count)
     _refit_all(
-        only_read(image), parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
+        bytes_of(image), parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
         (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start, band_sigma)),
         _GREATEST_MISFIT * max(patience, 1.0), band_sigma, covariance, chi,
     )  # fmt: skip
@@ -89,7 +89,7 @@ def drop_neighbours(kept: Bools) -> None:
 def _compiled_refit(sources: str) -> Callable[..., None]:
     @entry
     def refit_all(
-        image: Image,
+        image: Bytes,
         parameters: Float,
         scale: Float,
         reach: Float,

@@ -61,11 +61,14 @@ class Laboratories:
 
     def __init__(self) -> None:
         self._lock = Lock()
+        self._path = os.environ.get("PYTHONPATH")
         self._line: socket.socket | None = None
         self._server: subprocess.Popen[bytes] | None = None
 
-    def Popen(self, command: Sequence[str], env: dict[str, str], **_: Any) -> Forked:
+    def Popen(self, command: Sequence[str], env: dict[str, str], **others: Any) -> Any:
         assert list(command) == _COMMAND
+        if env.get("PYTHONPATH") != self._path:  # a program whose modules are not the loaded ones
+            return subprocess.Popen(command, env=env, **others)
         child_ends, own_ends = [], []
         for is_read_by_child in (True, False, False):
             reads, writes = os.pipe()

@@ -73,12 +73,8 @@ def apply_model(
     with one_line_errors():
         used = load_model(model)
         if source.is_dir():
-            _refuse(
-                ("--session", session),
-                ("--camera-degC", camera_degC),
-                ("--time", time),
-                why="a session has temperatures of its own",
-            )
+            own = "a session has temperatures of its own"
+            _refuse(("--session", session), ("--camera-degC", camera_degC), ("--time", time), why=own)
             _correct_session(used, open_whole(source, said_if(incomplete)), out, frames, form)
         elif source.suffix.lower() == ".csv":
             _refuse(("--frames", frames), why="it selects frames of a session")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 from contextlib import AbstractContextManager
+from typing import Literal
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -20,6 +21,8 @@ CAMERA_COLOUR, GREY, WARM_UP_COLOUR = "#CC79A7", "#6b6b6b", "#F0E442"
 SPOT_COLOURS = ("#009E73", "#E69F00", "#56B4E9")
 COORDINATES = (("I", I_COLOUR), ("J", J_COLOUR))
 FULL_WIDTH_IN = 7.4
+LAYOUT: Literal["constrained", "none"] = "constrained"
+"""How the panels of a figure find their places."""
 _STYLE = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -60,7 +63,7 @@ def new_figure(
     width_in: float, height_in: float, rows: int, columns: int, *, share: bool = True
 ) -> tuple[Figure, list[Axes]]:
     """A figure of panels; with `share` those in a column share their x, those in a row their y axis."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    figure = Figure(figsize=(width_in, height_in), layout=LAYOUT)
     FigureCanvasAgg(figure)
     panels: list[Axes] = []
     for number in range(rows * columns):

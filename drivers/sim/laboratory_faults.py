@@ -11,11 +11,7 @@ from dataclasses import dataclass
 
 from pydantic import TypeAdapter
 
-from drivers.sim.flap import (
-    ERROR_FEEDBACK_DISCONNECT,
-    ERROR_HARD_OVER_CURRENT,
-    ERROR_NO_POWER,
-)
+from drivers.sim.flap import ERROR_FEEDBACK_DISCONNECT, ERROR_HARD_OVER_CURRENT, ERROR_NO_POWER
 from drivers.sim.laboratory import Laboratory
 from drivers.sim.link_faults import LINK_FAULTS, set_link_fault
 from drivers.sim.thermal_imager import SERIAL_NUMBER

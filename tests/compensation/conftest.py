@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from compensation.reporting import figures
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.documents import parse_document
 from foundation.hub import Hub
@@ -105,6 +106,14 @@ def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     with (tmp_path_factory.getbasetemp().parent / "compiling").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         detect(photo(GLARE[0]), parse_document(TARGET_YAML, Target, "target.yaml"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _quick_layout() -> Iterator[None]:
+    """Half of a figure's time is the search for a layout without overlaps; what it draws is drawn here, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "LAYOUT", "none")
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,7 @@ from markers.edge_model import (
     normal_equations,
 )
 from markers.noise import Noise
-from markers.pixels import VALUE, Limits, U, V, empty_pixels, gather
+from markers.pixels import VALUE, Limits, U, V, bytes_of, empty_pixels, gather
 
 from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
 
@@ -97,7 +97,7 @@ def test_the_normal_equations_are_those_of_the_model():
     away = truth + np.array([0.02, -0.03, 0.002, 0.001, -0.002, 0.02, 0.5, 0.1, 0.1, -0.3, 0.1, -0.1])
     pixels = empty_pixels(41 * 41)
     image, limits = np.zeros((41, 41), np.uint8), Limits(0.0, 0.5, 1.5, 1.6)
-    gather(image, away[:2], away[2:5], 12.0, limits, 255, pixels)
+    gather(bytes_of(image), away[:2], away[2:5], 12.0, limits, 255, pixels)
     values = [pixels.table[region, :, : pixels.counts[region]] for region in range(3)]
     for part in values:
         part[VALUE] = model(truth, part)

@@ -85,6 +85,20 @@ def reads(bridge: Bridge, stream: Stream, access: Access, url: str) -> APIRouter
         seq = found[-1].seq if found else max(after, bridge.snapshot.state.seq)
         return _json(json_of({"seq": seq, "gone": gone, "events": [{"seq": m.seq, **m.data} for m in found]}))
 
+    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+    async def prometheus() -> Response:
+        """For Prometheus, in its text format."""
+        text = metrics(bridge.snapshot, stream.drops, stream.viewers)
+        return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    _add_stream(router, stream)
+    _add_logins(router, access, url)
+    return router
+
+
+def _add_stream(router: APIRouter, stream: Stream) -> None:
+    """The stream of all that happens."""
+
     @router.websocket("/api/v1/stream")
     async def follow(socket: WebSocket, after: Annotated[int | None, Query(alias="from")] = None) -> None:
         """The stream: what there is after a number, or from now on."""
@@ -94,15 +108,6 @@ def reads(bridge: Bridge, stream: Stream, access: Access, url: str) -> APIRouter
             return
         await socket.accept()
         await _follow(socket, stream, None if after is None else max(0, min(after, _MOST_SEQ)))
-
-    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
-    async def prometheus() -> Response:
-        """For Prometheus, in its text format."""
-        text = metrics(bridge.snapshot, stream.drops, stream.viewers)
-        return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
-
-    _add_logins(router, access, url)
-    return router
 
 
 def _add_logins(router: APIRouter, access: Access, url: str) -> None:
