@@ -21,8 +21,8 @@ CAMERA_COLOUR, GREY, WARM_UP_COLOUR = "#CC79A7", "#6b6b6b", "#F0E442"
 SPOT_COLOURS = ("#009E73", "#E69F00", "#56B4E9")
 COORDINATES = (("I", I_COLOUR), ("J", J_COLOUR))
 FULL_WIDTH_IN = 7.4
-LAYOUT: Literal["constrained", "none"] = "constrained"
-"""How the panels of a figure find their places."""
+LAYOUT: Literal["constrained"] | None = "constrained"
+"""How the panels of a figure find their places; None: they keep the first."""
 _STYLE = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,

@@ -112,7 +112,7 @@ def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
 def _quick_layout() -> Iterator[None]:
     """Half of a figure's time is the search for a layout without overlaps; what it draws is drawn here, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "LAYOUT", "none")
+        patch.setattr(figures, "LAYOUT", None)
         yield
 
 
