@@ -61,6 +61,7 @@ class CameraSettings(Polled):
     (constant self-heating). has_temperature: whether it measures its own temperature; false must be stated, a run needs
     no GOOD one then. boot_s: from its supply being switched on until it answers.
     ambient_degC: the lowest and the highest air that its data sheet allows; no set-point goes outside.
+    lens: which one is on it, in words; recorded with each session.
     """
 
     address: str
@@ -74,6 +75,7 @@ class CameraSettings(Polled):
     has_temperature: bool = True
     boot_s: float = Field(default=8.0, ge=0, le=600)
     ambient_degC: Range | None = None
+    lens: Line = ""
     equilibrium: EquilibriumSettings = EquilibriumSettings()
 
 

@@ -154,7 +154,7 @@ def bus_units(config: StandConfig, bus: Bus, clock: Clock) -> tuple[Controller, 
     """Regulator or climate chamber, relays, thermometers; ConfigError when a register map is missing or wrong, or that
     of another kind of unit."""
 
-    module = _register_map("thermometer_module", config.thermometer_module)
+    module = register_map("thermometer_module", config.thermometer_module)
     return (
         _controller(config, bus, clock),
         _switches(config.relays, bus, clock),
@@ -164,7 +164,7 @@ def bus_units(config: StandConfig, bus: Bus, clock: Clock) -> tuple[Controller, 
 
 def _controller(config: StandConfig, bus: Bus, clock: Clock) -> Controller:
     if isinstance(config.controller, OnBus):
-        return Regulator("regulator", bus, _register_map("regulator", config.controller), clock)
+        return Regulator("regulator", bus, register_map("regulator", config.controller), clock)
     return ClimateChamber("regulator", config.controller, config.limits.chamber_degC, clock)
 
 
@@ -172,7 +172,7 @@ def _switches(relays: RelaysSettings | None, bus: Bus, clock: Clock) -> Switches
     if relays is None:
         return NoRelays("relays", clock)
     channels = {str(name): number for name, number in relays.channels.items()}
-    return Relays("relays", bus, _register_map("relays", relays), channels)
+    return Relays("relays", bus, register_map("relays", relays), channels)
 
 
 def inputs_of(config: StandConfig, bus: Bus, clock: Clock) -> Inputs | None:
@@ -180,10 +180,11 @@ def inputs_of(config: StandConfig, bus: Bus, clock: Clock) -> Inputs | None:
     if config.inputs is None:
         return None
     channels = {name: contact.channel for name, contact in config.inputs.contacts.items()}
-    return Inputs("inputs", bus, _register_map("inputs", config.inputs), channels, clock)
+    return Inputs("inputs", bus, register_map("inputs", config.inputs), channels, clock)
 
 
-def _register_map(key: str, unit: OnBus) -> RegisterMap:
+def register_map(key: str, unit: OnBus) -> RegisterMap:
+    """The map of a unit, for its number on the bus; ConfigError when it is missing or wrong."""
     path = packaged("registers", unit.registers, key=f"{key}.registers")
     return load_register_map(path).at_unit(unit.unit)
 

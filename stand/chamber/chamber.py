@@ -92,16 +92,17 @@ class Chamber:
         await self._regulator.stop()
         await self.permits.make_safe()
 
-    async def test_dead_man(self) -> None:
+    async def test_dead_man(self, *, is_timed: bool = False) -> None:
         """Test the relay board's timer on the heater's relay while the regulator is stopped; DeviceFault when the
-        regulator gives heat all the same, or the board cannot be relied upon. Event `no_dead_man` without a board."""
+        regulator gives heat all the same, or the board cannot be relied upon. is_timed: as of Permits. Event
+        `no_dead_man` without a board."""
         if not self._relays.has_timer:
             return self._tell_dead_man()
         output = {reading.channel: reading.value for reading in await self._regulator.read()}
         name = self._regulator.name
         if not output.get(f"{name}.mv_heat", 0.0) <= 0:
             raise DeviceFault(name, f"is stopped and yet gives {output[f'{name}.mv_heat']:g} % heat; look at the unit")
-        await self.permits.test_dead_man()
+        await self.permits.test_dead_man(is_timed=is_timed)
 
     def _tell_dead_man(self) -> None:
         """No board drops the heat when this daemon dies: what ends it then is recorded with the session."""

@@ -26,6 +26,7 @@ _EARLY_S = 1.0  # a relay that is off so shortly before its time may just have d
 
 # The self-test of the dead-man, in units of self_test_s / 3: armed, armed again, must be on, must be off.
 _AGAIN, _STILL_ON, _OFF, _PULSE = 2.0, 4.0, 6.5, 3.0
+_LOOK = 0.05  # between looks of a test that is timed
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,11 +132,12 @@ class Permits:
                     await self._intruded(channel)
             return coils
 
-    async def test_dead_man(self) -> None:
+    async def test_dead_man(self, *, is_timed: bool = False) -> None:
         """Before the heater's relay is trusted: does the board drop it in time, and does arming it again start its time
         again? DeviceFault when not: such a board would cut the heat at random, or never.
 
-        The regulator must be stopped, with an output of 0. Event "dead_man_tested" with what was found.
+        The regulator must be stopped, with an output of 0. Event "dead_man_tested" with what was found; is_timed: the
+        board is looked at all the time, and `held_s` is how long after the second arming its relay was seen to drop.
         """
         unit_s, begin_ns = self._limits.self_test_s / _PULSE, self._clock.now_ns()
 
@@ -146,11 +148,19 @@ class Permits:
         try:
             await self._relays.hold_on(HEATER, self._limits.self_test_s)
             await at(_AGAIN)
+            again_ns = self._clock.now_ns()
             await self._relays.hold_on(HEATER, self._limits.self_test_s)
-            on, off = await at(_STILL_ON), not await at(_OFF)
+            on = await at(_STILL_ON)
+            units, held_s = _STILL_ON, None
+            while is_timed and held_s is None and (units := units + _LOOK) < _OFF:
+                if not await at(units):
+                    held_s = round((self._clock.now_ns() - again_ns) / NS_PER_S, 2)
+            off = not await at(_OFF)
         finally:
             await self._relays.switch(HEATER, on=False)
         data: dict[str, object] = {"rearmed": on, "dropped": off, "pulse_s": self._limits.self_test_s}
+        if is_timed:
+            data["held_s"] = held_s
         if on and off:
             text = f"{self.name}: the heater's relay is held by timed commands and drops without them"
             self._hub.publish(Event(self._clock.now_ns(), "info", "dead_man_tested", text, data))

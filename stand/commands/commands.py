@@ -26,6 +26,7 @@ app = lazy_app(
         "skip": Lazy(_CONTROL, "Leave a step out."),
         "extend": Lazy(_CONTROL, "Soak for longer in a step."),
         "stop": Lazy(_CONTROL, "Make the stand safe and end the run, as Ctrl-C does."),
+        "check": Lazy("stand.commands.check_cli", "Is each device of a stand there, the right one, and well?"),
         "submit": Lazy("stand.commands.order_cli", "Queue a run of the stand's daemon."),
         "device": Lazy("stand.commands.order_cli", "Tell a device something by hand, between runs."),
         "devices": Lazy("stand.commands.devices_cli", "What is connected to this computer."),

@@ -94,22 +94,26 @@ _HOLDER_TRIES, _HOLDER_PAUSE_S = 10, 0.02
 
 
 @asynccontextmanager
-async def claimed(config: StandConfig, session: Path | None) -> AsyncGenerator[None]:
-    """Every address of the stand belongs to the run of `session` while inside, without one to a daemon.
+async def claimed(config: StandConfig, session: Path | None, command: str = "") -> AsyncGenerator[None]:
+    """Every address of the stand belongs to the run of `session` while inside, without one to a daemon, or to a
+    `command` that is over soon.
 
     InUse when another run has one of them: then nothing was touched. SessionError when the runtime folder cannot be
     used.
     """
     wanted = await asyncio.to_thread(addresses, config)
-    with _claimed(wanted, session, config.name):
+    with _claimed(wanted, session, config.name, command):
         yield
 
 
-def _claimed(wanted: Iterable[Address], session: Path | None, stand: str) -> AbstractContextManager[object]:
+def _claimed(
+    wanted: Iterable[Address], session: Path | None, stand: str, command: str = ""
+) -> AbstractContextManager[object]:
     """All of them, or none and what `claimed` raises. In one order for all processes: of two that want the same ones,
     one gets them."""
     folder = runtime_folder()
-    content = {"session": os.path.abspath(session) if session else "", "pid": os.getpid(), "stand": stand}
+    content: dict[str, object] = {"session": os.path.abspath(session) if session else "", "pid": os.getpid()}
+    content |= {"stand": stand, "command": command}
     stack = ExitStack()
     try:
         for place, device in sorted({address.place: address.device for address in wanted}.items()):
@@ -163,7 +167,7 @@ def daemon_pid(config: StandConfig) -> int | None:
         for folder in runtime_folders():
             with suppress(OSError, ValueError, LookupError, TypeError):
                 said = _said(folder / _file_name(address.place))
-                if not said["session"]:
+                if not said["session"] and not said.get("command"):
                     return int(str(said["pid"]))
     return None
 
@@ -179,5 +183,6 @@ def _said(path: Path) -> dict[str, object]:
 def _told(path: Path) -> str:
     """Who has it, in words; raises as `_said`."""
     said = _said(path)
-    who = f"session {said['session']}" if said["session"] else "the daemon of `stand serve`"
+    daemon = f"`{said['command']}`" if said.get("command") else "the daemon of `stand serve`"
+    who = f"session {said['session']}" if said["session"] else daemon
     return f"{who} (pid {said['pid']})"

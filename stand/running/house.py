@@ -260,7 +260,7 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
         stack.push_async_callback(cancelled, house.background)
         if time is not None:
             house.background.append(asyncio.create_task(time()))
-        stack.push_async_callback(_close, assembly)
+        stack.push_async_callback(close_devices, assembly)
         stack.callback(assembly.stand.gate.let_go)
         stack.push_async_callback(stop.settled)
         stop.watch(assembly.stand)
@@ -290,7 +290,8 @@ async def _open(assembly: Assembly) -> None:
     await stand.chamber.test_dead_man()
 
 
-async def _close(assembly: Assembly) -> None:
+async def close_devices(assembly: Assembly) -> None:
+    """Let go of every wire; actuators stay as they are."""
     devices = assembly.devices
     imagers = (devices.imager,) if devices.imager is not None else ()
     for device in (*devices.cameras.values(), *devices.axes.values(), *imagers, devices.flap, devices.regulator):

@@ -62,20 +62,22 @@ def load_order(recipe: str, config: str) -> Order:
 def with_register_maps(order: Order) -> Order:
     """The order with the register maps as they are now; ConfigError when one is wrong, or that of another kind of
     unit."""
-    texts: dict[str, str] = {}
-    for name in MAPPED:
-        if (unit := getattr(order.config, name)) is None:
-            continue
-        path = packaged("registers", unit.registers, key=f"{name}.registers")
-        texts[_REGISTERS.format(name)] = read_document(path)
-    if order.config.inputs is not None:
-        path = packaged("registers", order.config.inputs.registers, key="inputs.registers")
-        texts[_REGISTERS.format("inputs")] = read_document(path)
+    texts = register_texts(order.config)
     clock = WallClock()
     bus = Bus("bus", order.config.bus, clock)
     bus_units(order.config, bus, clock)
     inputs_of(order.config, bus, clock)
     return replace(order, register_texts=texts)
+
+
+def register_texts(config: StandConfig) -> dict[str, str]:
+    """The register maps of a stand as they are now, by names of attachments; ConfigError when one is missing."""
+    units = {name: getattr(config, name) for name in (*MAPPED, "inputs")}
+    return {
+        _REGISTERS.format(name): read_document(packaged("registers", unit.registers, key=f"{name}.registers"))
+        for name, unit in units.items()
+        if unit is not None
+    }
 
 
 def check_plan(plan: Iterable[PlannedStep], config: StandConfig) -> None:

@@ -1,0 +1,94 @@
+"""The commissioning record: what `stand check` found, beside the stand's file, as JSON and as HTML for people."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+
+from drivers.settings import Identity
+from foundation.clock import NS_PER_S
+from foundation.files import write_whole
+from stand.commissioning.finding import Finding, Verdict, worst
+from stand.config.checked import digest, record_files
+from stand.config.stand_config import StandConfig
+
+SCHEMA = "stand-check/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One check. texts: the stand's file and its register maps, by the names under which sessions have them."""
+
+    config: StandConfig
+    file: str
+    texts: Mapping[str, str]
+    began_ns: int
+    ended_ns: int
+    has_moves: bool
+    findings: Sequence[Finding]
+    identities: Mapping[str, Identity]
+
+    def json(self) -> str:
+        """The whole record; instants are UTC."""
+        known: dict[str, object] = {
+            "schema": SCHEMA,
+            "stand": self.config.name,
+            "config": self.file,
+            "digests": {name: digest(text) for name, text in self.texts.items()},
+            "began": _utc(self.began_ns),
+            "ended": _utc(self.ended_ns),
+            "moves": self.has_moves,
+            "simulated": self.config.simulation is not None,
+            "operator": self.config.operator,
+            "host": platform.node(),
+            "software_version": importlib.metadata.version("thermostand"),
+            "verdict": worst(self.findings),
+            "identities": {name: asdict(identity) for name, identity in self.identities.items()},
+            "lenses": {name: camera.lens for name, camera in self.config.cameras.items() if camera.lens},
+            "findings": [asdict(finding) for finding in self.findings],
+        }
+        return json.dumps(known, indent=2, ensure_ascii=False) + "\n"
+
+    def html(self) -> str:
+        """The same, to be read and printed."""
+        counts: dict[Verdict, int] = {"failed": 0, "warning": 0, "unverified": 0, "ok": 0}
+        for finding in self.findings:
+            counts[finding.verdict] += 1
+        groups = [(name, tuple(found)) for name, found in groupby(self.findings, lambda finding: finding.device)]
+        return _template().render(
+            record=self,
+            counts=counts,
+            groups=[(name, worst(found), found) for name, found in groups],
+            began=_utc(self.began_ns).replace("T", " ").removesuffix("+00:00"),
+            took_s=(self.ended_ns - self.began_ns) / NS_PER_S,
+            host=platform.node(),
+            version=importlib.metadata.version("thermostand"),
+            digests={name: digest(text)[:16] for name, text in self.texts.items()},
+        )
+
+    def write(self, config: Path) -> tuple[Path, Path]:
+        """Beside the stand's file `config`, the last record replaced; the files. SessionError when refused."""
+        data, page = record_files(config)
+        write_whole(page, self.html())
+        write_whole(data, self.json())
+        return data, page
+
+
+def _utc(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns // NS_PER_S, UTC).isoformat()
+
+
+@cache
+def _template() -> Template:
+    loader = PackageLoader("stand", "commissioning")
+    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return made.get_template("record.html.jinja")
