@@ -44,6 +44,7 @@ class Target(Document):
     of a nominal coordinate; flatness_mm: of a marker's height above the plane. nominal_roll_deg: counter-clockwise
     angle of the rows in the image as the target is mounted; decides between the orientations a symmetrical grid leaves
     open. minimum_markers: identification is refused below this count (default three quarters of the markers).
+    certificate: what states its measured centres, in words; recorded with each session.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Target(Document):
     cmm_uncertainty_mm: Positive = 0.001
     printing_error_mm: Positive = 0.02
     flatness_mm: Positive = 0.005
+    certificate: str = ""
 
     @model_validator(mode="after")
     def _consistent(self) -> Target:

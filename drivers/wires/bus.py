@@ -169,7 +169,7 @@ class Bus:
         return result
 
     def _failure(self, device: str, unit: int, fault: WireFault) -> DeviceError:
-        """Count `fault` against the unit or the line; the error to raise."""
+        """Count `fault` against the unit, 0 for none, or the line; the error to raise."""
         self.counters.count(fault.fault)
         now_ns = self.clock.now_ns()
         match fault.fault:
@@ -182,7 +182,8 @@ class Bus:
                 self._health[unit] = self._health.get(unit, _Health()).failed(silent, now_ns)
             case FaultKind.REFUSED:
                 self._health[unit] = _Health()
-        return ERRORS[fault.fault](device, f"unit {unit} on {self.name}: {fault}")
+        where = f"unit {unit} on {self.name}: " if unit else ""
+        return ERRORS[fault.fault](device, f"{where}{fault}")
 
     def _transact(self, function: Callable[..., Result], *args: object) -> Result:
         """In the lane: wait until the line is free and clean, run one transaction, set when it is free again."""

@@ -70,16 +70,18 @@ def _nothing(_: tuple[Finding, ...]) -> None:
 
 
 def _tell(findings: tuple[Finding, ...]) -> None:
-    """A line for each device, and two for each thing that is not well."""
+    """A line for each device with what is well, and two for each thing that is not."""
     for name, group in groupby(findings, lambda finding: finding.device):
         found = tuple(group)
-        well = "; ".join(each.text for each in found if each.verdict == "ok")
-        typer.echo(one_line(f"{name:<{_NAME}}{worst(found):<{_VERDICT}}{well}".rstrip()))
+        lines = (
+            [(worst(found), well)] if (well := "; ".join(each.text for each in found if each.verdict == "ok")) else []
+        )
         for each in found:
             if each.verdict != "ok":
-                typer.echo(one_line(f"{'':<{_NAME}}{each.verdict:<{_VERDICT}}{each.what}: {each.text}"))
-                if each.advice:
-                    typer.echo(one_line(f"{'':<{_NAME + _VERDICT}}-> {each.advice}"))
+                lines.append((each.verdict, f"{each.what}: {each.text}"))
+                lines += [("", f"-> {each.advice}")] if each.advice else []
+        for number, (verdict, text) in enumerate(lines):
+            typer.echo(one_line(f"{name if number == 0 else '':<{_NAME}}{verdict:<{_VERDICT}}{text}"))
 
 
 def _summary(findings: tuple[Finding, ...], kept: str, *, moves: bool) -> str:

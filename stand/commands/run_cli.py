@@ -20,7 +20,9 @@ from foundation.exit_codes import INTERRUPTED, NOT_REPORTED, one_line_errors
 from foundation.output import output, say, show
 from foundation.usage import one_line, tell
 from recording.repair.salvage import salvage_line
+from stand.commands.checked_cli import warn_unchecked
 from stand.commands.submitted import daemon_of, follow, submit
+from stand.config.checked import load_checked
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.learned import learn
 from stand.estimating.night import price_night
@@ -96,6 +98,9 @@ def run(
         order = replace(load_order(recipe, config), attended=attended)
         if report:
             check_reportable(order.recipe.plan())
+        if not virtual_time:
+            path = packaged("", config)
+            warn_unchecked(path, order.config, load_checked(path))
         if not virtual_time and (server := daemon_of(order.config)) is not None:
             _run_there(server, order, out, detach=detach, report=report)
             return

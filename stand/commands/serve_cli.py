@@ -20,6 +20,8 @@ from foundation.items import Event, Item
 from foundation.output import Output, output, say
 from foundation.usage import one_line
 from stand.aside import aside
+from stand.commands.checked_cli import warn_unchecked
+from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.interface import load_tokens
 from stand.config.stand_config import load_config, packaged
 from stand.daemon.desk import DaemonDesk
@@ -51,6 +53,10 @@ def serve(
         path = packaged("", config)
         stand = load_config(path)
         texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
+        record = load_checked(path)
+        if record is not None:
+            texts[ATTACHMENT] = record.text
+        warn_unchecked(path, stand, record)
         directory = (out or stand.recording.directory).absolute()
         tokens, hosts = load_tokens(stand.interface.secrets), stand.interface.hosts
         secop_port = stand.interface.secop_port if secop is None else secop

@@ -46,7 +46,7 @@ def for_axis(error: DeviceError, name: str) -> str:
 def for_flap(error: DeviceError) -> str:
     """The flap."""
     if isinstance(error, Unreachable):
-        return "is it plugged in and powered? `stand devices` lists USB devices with their serial numbers"
+        return "is it plugged in and powered, and flap.serial_number its own? `stand devices` lists all with theirs"
     return "look at the flap and its controller's settings"
 
 

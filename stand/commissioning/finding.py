@@ -29,4 +29,5 @@ Add = Callable[[Finding], None]
 
 def worst(findings: Iterable[Finding]) -> Verdict:
     """ok when there is none."""
-    return max((finding.verdict for finding in findings), key=_RISING.index, default="ok")
+    found = {finding.verdict for finding in findings}
+    return next((verdict for verdict in reversed(_RISING) if verdict in found), "ok")

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from drivers.devices.protocols import Camera, Device, Sensor
 from drivers.devices.relays import CAMERA_POWER
-from drivers.settings import Identity, OnBus
+from drivers.settings import OnBus
 from foundation.errors import DeviceError, StandError, Unreachable
 from foundation.readings import Quality, Reading
 from stand.assembly import Assembly, register_map
@@ -117,14 +117,22 @@ class Links:
             self._add(Finding(name, "link", "unverified", text, "`stand check --moves` switches it on"))
             return
         address = assembly.config.cameras[name].address
-        await self._device(camera, lambda error: advice.for_camera(error, name, address))
+        is_known = assembly.devices.relays.name in self.opened
+
+        def advise(error: DeviceError) -> str:
+            return (
+                advice.for_camera(error, name, address) if is_known else "mend the relays first: its supply may be off"
+            )
+
+        await self._device(camera, advise)
         if name in self.opened:
             await self.camera_settings(camera)
 
     async def camera_settings(self, camera: Camera) -> None:
         """What the camera made of its settings, and where it shows its temperature."""
         effective = cast("Any", getattr(camera, "effective", None))
-        data = cast("dict[str, object]", asdict(effective)) if is_dataclass(effective) else {}
+        is_told = is_dataclass(effective) and not isinstance(effective, type)
+        data: dict[str, object] = asdict(effective) if is_told else {}
         size = f"{data['width_px']} x {data['height_px']} {data['pixel_format']}, " if "width_px" in data else ""
         data["temperature_place"] = await camera.temperature_place()
         self._add(Finding(camera.name, "settings", "ok", f"{size}settings taken over and read back", data=data))
@@ -151,7 +159,7 @@ class Links:
         try:
             await device.open()
             self.opened.add(device.name)
-            self._add(_identity(device))
+            self._add(identity_finding(device))
             readings = await device.read()
         except DeviceError as error:
             what = "reading" if device.name in self.opened else _what(error)
@@ -176,16 +184,13 @@ def _what(error: StandError) -> str:
     return "link" if isinstance(error, Unreachable) else "identity"
 
 
-def _identity(device: Device) -> Finding:
+def identity_finding(device: Device) -> Finding:
+    """What a device that answers tells of itself, and what it does not."""
     identity = device.identity
     if identity is None:
         return Finding(device.name, "identity", "ok", "answers; it does not tell what it is")
-    return Finding(device.name, "identity", "ok", told(identity), data=asdict(identity))
-
-
-def told(identity: Identity) -> str:
-    """With what it does not tell."""
-    return str(identity) if identity.serial_number else f"{identity}; it tells no serial number"
+    text = str(identity) if identity.serial_number else f"{identity}; it tells no serial number"
+    return Finding(device.name, "identity", "ok", text, data=asdict(identity))
 
 
 def _of_readings(device: str, readings: Iterable[Reading]) -> Iterable[Finding]:

@@ -16,7 +16,7 @@ from foundation.readings import Quality
 from stand.assembly import Assembly
 from stand.commissioning import advice
 from stand.commissioning.finding import Add, Finding
-from stand.commissioning.links import Links, told
+from stand.commissioning.links import Links, identity_finding
 
 _FRAMES = 6
 _SLOW = 0.8  # of the longest travel that the stand's file allows
@@ -139,7 +139,7 @@ class Moves:
         for name, camera in devices.cameras.items():
             if name not in self._links.opened:
                 self._links.opened.add(name)
-                self._add(Finding(name, "identity", "ok", told(camera.identity)))
+                self._add(identity_finding(camera))
                 await self._links.camera_settings(camera)
             await self._frames(name, camera)
         if supply.was_on is False:

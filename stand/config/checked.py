@@ -60,8 +60,9 @@ def doubt(config: Path, record: Checked | None, texts: Mapping[str, str], *, is_
         return "" if is_simulated else f"{config} was never checked on this stand; {again} does it"
     at = f"{record.at.astimezone():%Y-%m-%d %H:%M}"
     if changed := sorted(name for name, text in texts.items() if record.digests.get(name) != digest(text)):
-        named = ", ".join("it" if name == "config.yaml" else name for name in changed)
-        return f"{config}: {named} has changed since the check of {at}; {again} looks again"
+        maps = [name for name in changed if name != "config.yaml"]
+        named = " and ".join([*([str(config)] if len(maps) < len(changed) else []), *maps])
+        return f"{named} {'has' if len(changed) == 1 else 'have'} changed since the check of {at}; {again} looks again"
     if record.failed:
         things = "1 thing was" if record.failed == 1 else f"{record.failed} things were"
         return f"{config}: {things} wrong at the check of {at}; {again} looks again"

@@ -11,7 +11,7 @@ import importlib.metadata
 import itertools
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -28,7 +28,7 @@ from recording.writing.disk import Disk
 from recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
 from recording.writing.settings import SessionInfo
 from stand.assembly import Assembly
-from stand.running.session_files import recorder_in
+from stand.running.session_files import recorder_in, tell_identities
 
 HOUSE = "house"  # in place of a recipe's name
 
@@ -52,11 +52,12 @@ class _Recording:
 
 
 class HouseRecord:
-    """Records what passes the hub from `begin` to `end`, as often as wanted; of one day all is in one session."""
+    """Records what passes the hub from `begin` to `end`, as often as wanted; of one day all is in one session. texts:
+    attached, by their names there."""
 
-    def __init__(self, assembly: Assembly, config_text: str, out: Path, clock: WallClock) -> None:
+    def __init__(self, assembly: Assembly, texts: Mapping[str, str], out: Path, clock: WallClock) -> None:
         self._assembly = assembly
-        self._config_text = config_text
+        self._texts = dict(texts)
         self._out = out
         self._clock = clock
         self._now: _Recording | None = None
@@ -79,9 +80,9 @@ class HouseRecord:
         async with self._turn:
             day = self._today()
             info = self._info(await asyncio.to_thread(self._place, day))
-            directory, texts = self._out / info.session_id, {"config.yaml": self._config_text}
+            directory = self._out / info.session_id
             tap, disk = _Tap(self._assembly.hub), Disk()
-            recorder = recorder_in(directory, info, texts, self._assembly.config, tap, self._clock, disk)
+            recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk)
             try:
                 await recorder.begin(tuple)
             except BaseException:
@@ -90,6 +91,7 @@ class HouseRecord:
             self._cut()
             self._day = day
             self._now = _Recording(recorder, tap, disk, asyncio.create_task(recorder.run()))
+            tell_identities(self._assembly)
             return recorder
 
     async def complete(self, within_s: float = COMPLETE_WITHIN_S) -> None:
@@ -131,7 +133,7 @@ class HouseRecord:
             session = Session.open(directory)
             return (
                 SessionInfo.of(session.metadata) == self._info(directory.name)
-                and session.attachments.get("config.yaml") == self._config_text
+                and dict(session.attachments) == self._texts
             )
         except (SessionError, OSError, LookupError, ValueError):
             return False

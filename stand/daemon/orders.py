@@ -20,6 +20,7 @@ from foundation.errors import ConfigError, SessionError, StandError
 from foundation.hub import Hub
 from foundation.readings import Quality
 from recording.reading.session import Session
+from stand.config.checked import ATTACHMENT
 from stand.config.stand_config import StandConfig
 from stand.estimating.estimate import price
 from stand.estimating.learned import load_learned
@@ -41,7 +42,8 @@ _SHOWN = 50  # runs that have ended
 
 
 class Orders:
-    """Of the daemon that has `house`. texts: config.yaml and target.yaml, as they were when it began.
+    """Of the daemon that has `house`. texts: config.yaml, target.yaml and the record of `stand check` where there is
+    one, as they were when it began.
 
     queued: as it was last read. stop: of the run under way. leaving: the daemon ends, and its run is interrupted by it.
     """
@@ -205,7 +207,8 @@ class Orders:
         """The same on the stand as it is open now."""
         config = self._house.assembly.config
         check_plan(order.recipe.plan(), config)
-        return replace(order, config=config, config_text=self._texts["config.yaml"])
+        record = self._texts.get(ATTACHMENT, "")
+        return replace(order, config=config, config_text=self._texts["config.yaml"], commissioning_text=record)
 
     def _recorded(self, session: str) -> Order:
         """What a session was to run; Missing when there is no such session, Conflict when it cannot be resumed."""

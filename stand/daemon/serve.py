@@ -15,6 +15,7 @@ from recording.repair.salvage import salvage_line, salvage_unfinished
 from recording.writing.disk import FILES_LINE
 from stand.assembly import assemble
 from stand.clock_watch import ClockWatch
+from stand.config.checked import ATTACHMENT
 from stand.config.safe_ranges import accepted_text
 from stand.config.stand_config import StandConfig
 from stand.daemon.daemon import Daemon
@@ -32,7 +33,8 @@ Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[objec
 
 
 async def serve(config: StandConfig, config_name: str, texts: dict[str, str], out: Path, front: Front) -> None:
-    """Own the stand until SIGINT, SIGTERM, SIGQUIT or SIGHUP. texts: config.yaml and target.yaml.
+    """Own the stand until SIGINT, SIGTERM, SIGQUIT or SIGHUP. texts: config.yaml, target.yaml, and the record of
+    `stand check` where there is one.
 
     InUse when it belongs to another daemon or run: then nothing was touched. Raises what opening raises, and
     StandTripped when the stand could not be confirmed safe at the end.
@@ -50,7 +52,8 @@ async def serve(config: StandConfig, config_name: str, texts: dict[str, str], ou
                 await stack.enter_async_context(alerting(config.name, config.alerts, hub, clock, house.is_well))
                 if house.disk is None:
                     raise ValueError("a daemon is on the host's clock, and has a process for its disk")
-                record = HouseRecord(assembly, texts["config.yaml"], out, clock)
+                own = {name: text for name, text in texts.items() if name in ("config.yaml", ATTACHMENT)}
+                record = HouseRecord(assembly, own, out, clock)
                 keep = KeptFile(out, house.disk.line(FILES_LINE).run, hub, clock)
                 orders = Orders(house, out, config_name, texts)
                 for segment in await asyncio.to_thread(salvage_unfinished, out):

@@ -72,7 +72,14 @@ class CameraSupply:
         self.last = None
         await self._supply()
         self.is_on = True
+        self.tell_identities()
         self.equilibrium.begin()
+
+    def tell_identities(self) -> None:
+        """Which cameras are on, for the recording; nothing when one was lost meanwhile."""
+        if self._cameras.is_usable:
+            for event in self._cameras.identities(self._clock.now_ns()):
+                self._hub.publish(event)
 
     async def switch_off(self) -> None:
         """Close the camera, then switch it off."""

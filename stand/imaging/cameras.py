@@ -8,7 +8,9 @@ from collections.abc import Mapping
 from drivers.devices.protocols import Camera
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import ConfigError
+from foundation.items import Event
 from foundation.readings import Frame
+from stand.identities import identity_event
 
 _APART_S = 0.001  # between two cameras' frames: an image and its description are found by their instant
 
@@ -30,6 +32,10 @@ class Cameras:
     def restarted(self) -> str:
         """Why one has, or may have, restarted by itself; "" when none has."""
         return "; ".join(camera.restarted for camera in self._cameras if camera.restarted)
+
+    def identities(self, now_ns: int) -> tuple[Event, ...]:
+        """Which have answered, as events; Unreachable when one is not open."""
+        return tuple(identity_event(each.name, each.identity, now_ns, each.settings) for each in self._cameras)
 
     async def open(self) -> None:
         """Open every camera, those that are open already again."""

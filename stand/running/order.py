@@ -14,6 +14,7 @@ from foundation.documents import parse_document, read_document
 from foundation.errors import ConfigError
 from markers.target import Target
 from stand.assembly import bus_units, inputs_of
+from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.recipe import Recipe
 from stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
 from stand.estimating.estimate import price
@@ -26,7 +27,7 @@ class Order:
     """What to run: the checked files and their texts (they are attached to the recording). attended: somebody is there
     to do what the plan prompts for. at_configured_addresses: the laboratory of a virtual run answers there instead of
     at free addresses, for a program that has to find it. register_texts: the register maps, by names of attachments; a
-    session that was recorded without them has none."""
+    session that was recorded without them has none. commissioning_text: the record of `stand check`, "" without one."""
 
     config: StandConfig
     recipe: Recipe
@@ -36,11 +37,13 @@ class Order:
     attended: bool = False
     at_configured_addresses: bool = False
     register_texts: Mapping[str, str] = field(default_factory=dict[str, str])
+    commissioning_text: str = ""
 
     def attachments(self) -> dict[str, str]:
         """The texts by the names under which a session has them."""
         texts = {"config.yaml": self.config_text, "recipe.yaml": self.recipe_text, "target.yaml": self.target_text}
-        return texts | dict(self.register_texts)
+        record = {ATTACHMENT: self.commissioning_text} if self.commissioning_text else {}
+        return texts | dict(self.register_texts) | record
 
 
 def load_order(recipe: str, config: str) -> Order:
@@ -48,11 +51,14 @@ def load_order(recipe: str, config: str) -> Order:
     names what is wrong in which of them."""
     paths = {"config.yaml": packaged("", config), "recipe.yaml": packaged("recipes", recipe)}
     stand = load_config(paths["config.yaml"])
+    record = load_checked(paths["config.yaml"])
     paths["target.yaml"] = packaged("targets", stand.target, paths["config.yaml"], "target")
     texts = {name: read_document(path) for name, path in paths.items()}
     order = parse_order(texts, {name: str(path) for name, path in paths.items()})
     try:
-        order = with_register_maps(replace(order, config=stand))
+        order = with_register_maps(
+            replace(order, config=stand, commissioning_text="" if record is None else record.text)
+        )
     except ConfigError as error:
         raise ConfigError(f"{paths['config.yaml']}: {error}") from error
     price(order.recipe.plan(), order.config)
@@ -101,6 +107,7 @@ def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:
         texts["recipe.yaml"],
         texts["target.yaml"],
         register_texts={name: texts[name] for name in map(_REGISTERS.format, (*MAPPED, "inputs")) if name in texts},
+        commissioning_text=texts.get(ATTACHMENT, ""),
     )
     parse_document(order.target_text, Target, names["target.yaml"])
     return order

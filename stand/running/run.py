@@ -29,7 +29,7 @@ from stand.running.house import House, Time, opened
 from stand.running.order import Order
 from stand.running.rehearsal import rehearsed
 from stand.running.resume import Interruption, is_of_virtual_time
-from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory
+from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory, tell_identities
 from stand.running.stop import Interrupted, Stop
 from stand.serving.alerts import alerting
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
@@ -210,6 +210,7 @@ async def _stay(job: Job, directory: Path, house: House, early: _Early, stop: St
     """From the camera's start to the end of the recording."""
     is_camera_on = job.before is None or job.before.kept.set_up.camera_on
     async with AsyncExitStack() as stack:
+        tell_identities(house.assembly)
         if is_camera_on:
             await house.or_safe(_with_camera(house.assembly), stop)
         recorder = await house.or_safe(_recording(job, directory, house.assembly, early, disk), stop)
@@ -224,6 +225,8 @@ async def _with_camera(assembly: Assembly) -> None:
     supply, cameras = assembly.stand.imaging.supply, assembly.devices.cameras.values()
     if cameras and not (supply.is_on and all(camera.is_usable for camera in cameras)):
         await supply.switch_on()
+    elif cameras:
+        supply.tell_identities()
     for camera in cameras:
         await check_temperature(camera, assembly.hub, assembly.clock)
 

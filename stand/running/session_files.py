@@ -21,6 +21,7 @@ from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from recording.writing.settings import VIRTUAL_COMMIT_S
 from stand.assembly import Assembly
 from stand.config.stand_config import RecordingConfig, StandConfig
+from stand.identities import identity_event
 from stand.running.order import Order
 
 
@@ -51,6 +52,15 @@ def info_of(order: Order, directory: Path, assembly: Assembly) -> SessionInfo:
 def camera_serials(assembly: Assembly) -> str:
     """Which cameras have answered; "" on a stand without any."""
     return ", ".join(camera.identity.serial_number for camera in assembly.devices.cameras.values())
+
+
+def tell_identities(assembly: Assembly) -> None:
+    """Which devices have answered, but for the cameras, as events; those are told when they are on."""
+    devices, now_ns = assembly.devices, assembly.clock.now_ns()
+    units = (devices.regulator, devices.relays, devices.thermometers, devices.inputs, devices.flap)
+    for device in (*units, *devices.axes.values()):
+        if device is not None and device.identity is not None:
+            assembly.hub.publish(identity_event(device.name, device.identity, now_ns))
 
 
 def recorder_of(

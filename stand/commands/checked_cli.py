@@ -1,0 +1,20 @@
+"""What those who run a stand are told about its check: that there was none, or that it was of another file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from foundation.documents import read_document
+from foundation.usage import one_line
+from stand.config.checked import Checked, doubt
+from stand.config.stand_config import StandConfig
+from stand.running.order import register_texts
+
+
+def warn_unchecked(path: Path, stand: StandConfig, record: Checked | None) -> None:
+    """A sentence on standard error when the stand at `path` should be checked before it is relied upon."""
+    texts = {"config.yaml": read_document(path), **register_texts(stand)}
+    if found := doubt(path, record, texts, is_simulated=stand.simulation is not None):
+        typer.echo(one_line(f"warning: {found}"), err=True)
