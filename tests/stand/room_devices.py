@@ -9,6 +9,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from drivers.devices.relays import CAMERA_POWER
+from drivers.settings import CameraSettings, Identity
 from foundation.clock import VirtualClock, seconds_ns
 from foundation.errors import StandError
 from foundation.hub import Hub
@@ -105,6 +106,8 @@ class Camera(Device):
     restarted: str = ""
     is_usable: bool = True
     frames: int = 0
+    settings: ClassVar[CameraSettings] = CameraSettings(address="127.0.0.20", lens="25 mm")
+    identity: ClassVar[Identity] = Identity("Make", "Model", "1", "2.0")
 
     async def open(self) -> None:
         await self.act("open")

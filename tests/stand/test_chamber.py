@@ -73,5 +73,5 @@ async def test_each_beat_shows_the_relays_to_who_watches_the_camera():
         await here.stand.imaging.supply.switch_on()
         here.relays.on.clear()
         await here.stand.chamber.keeper.beat()
-        assert here.kinds == ["camera_supply_off", "camera_equilibrium_lost"]
+        assert here.kinds == ["device_identity", "camera_supply_off", "camera_equilibrium_lost"]
         assert not here.stand.imaging.supply.is_on
