@@ -11,20 +11,22 @@ from typing import Annotated
 import typer
 
 from foundation.clock import WallClock
+from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.errors import ConfigError
 from foundation.exit_codes import FAILED, INTERRUPTED, one_line_errors
-from foundation.usage import OneLineUsage, one_line
+from foundation.output import output, say, show
+from foundation.usage import one_line
 from stand.commands.reached import ConfigOption
-from stand.commands.session_args import JsonOption
 from stand.commissioning.commissioning import commission
 from stand.commissioning.finding import Finding, worst
+from stand.commissioning.genicam import rehearse
 from stand.commissioning.record import Record
-from stand.config.stand_config import load_config, packaged
+from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import register_texts
 from stand.running.stop import Interrupted
 
-app = typer.Typer(cls=OneLineUsage, add_completion=False)
+app = App()
 
 _NAME, _VERDICT = 16, 11  # columns
 
@@ -35,34 +37,52 @@ def check(
     moves: Annotated[
         bool, typer.Option("--moves", help="Flap, stages and cameras, too, and the timer that guards the heat.")
     ] = False,
-    as_json: JsonOption = False,
+    genicam: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Only: which features of this camera's GenICam file the stand would use."),
+    ] = None,
 ) -> None:
     """Each device of a stand: its link, identity, settings and a reading; what is wrong, and what to do. Status 1 when
     something has failed.
 
     Without --moves nothing moves and nothing heats. The record is kept beside the stand's file, and goes with sessions.
+    With --genicam no device is asked: the file is tried on a simulated camera; status 1 when it is refused.
 
     Example: stand check --config my-stand.yaml --moves
     """
     with one_line_errors():
         path = packaged("", config)
         stand = load_config(path)
+        if genicam is not None:
+            _rehearse(genicam, stand)
+            return
         texts = {"config.yaml": read_document(path), **register_texts(stand)}
         clock = WallClock()
         began_ns = clock.now_ns()
         try:
-            found, identities = asyncio.run(commission(stand, _nothing if as_json else _tell, has_moves=moves))
+            found, identities = asyncio.run(commission(stand, _nothing if output().as_json else _tell, has_moves=moves))
         except Interrupted as error:
-            typer.echo(one_line(error), err=True)
+            say(error)
             raise typer.Exit(INTERRUPTED) from error
         record = Record(stand, str(path), texts, began_ns, clock.now_ns(), moves, found, identities)
         kept = "not kept, since this is an installed file; copy it to have a stand of your own"
         if not _is_installed(path):
             _, page = record.write(path)
             kept = f"kept as {page}"
-        typer.echo(record.json() if as_json else one_line(_summary(found, kept, moves=moves)))
+        show(record.data(), [one_line(_summary(found, kept, moves=moves))])
         if worst(found) == "failed":
             raise typer.Exit(FAILED)
+
+
+def _rehearse(file: Path, stand: StandConfig) -> None:
+    """What of a GenICam file would be used."""
+    found = asyncio.run(rehearse(file, stand))
+    lines = [found.camera or str(file), *(f"  {purpose:<14}{name or '-'}" for purpose, name in found.features.items())]
+    if found.refusal:
+        lines.append(f"refused: {found.refusal}")
+    show(found, map(one_line, lines))
+    if found.refusal:
+        raise typer.Exit(FAILED)
 
 
 def _nothing(_: tuple[Finding, ...]) -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import typer
-
 from foundation.documents import read_document
-from foundation.usage import one_line
+from foundation.output import say
 from stand.config.checked import Checked, doubt
 from stand.config.stand_config import StandConfig
 from stand.running.order import register_texts
@@ -17,4 +15,4 @@ def warn_unchecked(path: Path, stand: StandConfig, record: Checked | None) -> No
     """A sentence on standard error when the stand at `path` should be checked before it is relied upon."""
     texts = {"config.yaml": read_document(path), **register_texts(stand)}
     if found := doubt(path, record, texts, is_simulated=stand.simulation is not None):
-        typer.echo(one_line(f"warning: {found}"), err=True)
+        say(f"warning: {found}")

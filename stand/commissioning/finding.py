@@ -30,4 +30,7 @@ Add = Callable[[Finding], None]
 def worst(findings: Iterable[Finding]) -> Verdict:
     """ok when there is none."""
     found = {finding.verdict for finding in findings}
-    return next((verdict for verdict in reversed(_RISING) if verdict in found), "ok")
+    for verdict in reversed(_RISING):
+        if verdict in found:
+            return verdict
+    return "ok"

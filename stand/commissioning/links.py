@@ -131,8 +131,7 @@ class Links:
     async def camera_settings(self, camera: Camera) -> None:
         """What the camera made of its settings, and where it shows its temperature."""
         effective = cast("Any", getattr(camera, "effective", None))
-        is_told = is_dataclass(effective) and not isinstance(effective, type)
-        data: dict[str, object] = asdict(effective) if is_told else {}
+        data: dict[str, object] = asdict(cast("Any", effective)) if is_dataclass(effective) else {}
         size = f"{data['width_px']} x {data['height_px']} {data['pixel_format']}, " if "width_px" in data else ""
         data["temperature_place"] = await camera.temperature_place()
         self._add(Finding(camera.name, "settings", "ok", f"{size}settings taken over and read back", data=data))

@@ -37,9 +37,9 @@ class Record:
     findings: Sequence[Finding]
     identities: Mapping[str, Identity]
 
-    def json(self) -> str:
+    def data(self) -> dict[str, object]:
         """The whole record; instants are UTC."""
-        known: dict[str, object] = {
+        return {
             "schema": SCHEMA,
             "stand": self.config.name,
             "config": self.file,
@@ -56,7 +56,6 @@ class Record:
             "lenses": {name: camera.lens for name, camera in self.config.cameras.items() if camera.lens},
             "findings": [asdict(finding) for finding in self.findings],
         }
-        return json.dumps(known, indent=2, ensure_ascii=False) + "\n"
 
     def html(self) -> str:
         """The same, to be read and printed."""
@@ -79,7 +78,7 @@ class Record:
         """Beside the stand's file `config`, the last record replaced; the files. SessionError when refused."""
         data, page = record_files(config)
         write_whole(page, self.html())
-        write_whole(data, self.json())
+        write_whole(data, json.dumps(self.data(), indent=2, ensure_ascii=False) + "\n")
         return data, page
 
 
