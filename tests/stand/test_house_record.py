@@ -42,8 +42,10 @@ class Calendar(WallClock):
 @pytest.fixture
 async def house(tmp_path: Path) -> AsyncGenerator[tuple[HouseRecord, Hub, Calendar]]:
     hub, clock = Hub(), Calendar()
-    assembly = cast("Assembly", SimpleNamespace(hub=hub, config=load_config(CONFIG)))
-    record = HouseRecord(assembly, CONFIG.read_text("utf-8"), tmp_path, clock)
+    units = dict.fromkeys(("regulator", "relays", "thermometers", "inputs", "flap"))
+    devices = SimpleNamespace(**units, axes={})
+    assembly = cast("Assembly", SimpleNamespace(hub=hub, clock=clock, devices=devices, config=load_config(CONFIG)))
+    record = HouseRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock)
     yield record, hub, clock
     await record.end(20.0)
 
