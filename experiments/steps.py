@@ -97,13 +97,15 @@ class CloseFlap:
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """`frames` images, one every `interval_s`, each exposed for `exposure_s`; `chamber_degC` labels the set-point."""
+    """`frames` images, one every `interval_s`, each exposed for `exposure_s`; `chamber_degC` labels the set-point.
+    `cameras`: the names of those that expose, none for all of the stand."""
 
     frames: int
     interval_s: float
     exposure_s: float
     role: Role
     chamber_degC: float
+    cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,8 +219,9 @@ def kind_of(step: Step) -> str:
 
 
 def parameters_of(step: Step) -> dict[str, object]:
-    """The step's fields as JSON-able values."""
-    return {name: str(value) if isinstance(value, Role) else value for name, value in asdict(step).items()}
+    """The step's fields as JSON-able values; without the names of a capture's cameras when there are none."""
+    values = {name: str(value) if isinstance(value, Role) else value for name, value in asdict(step).items()}
+    return {name: value for name, value in values.items() if value != ()}
 
 
 _KINDS: dict[str, type[Step]] = {kind.__name__: kind for kind in get_args(Step)}

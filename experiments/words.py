@@ -41,7 +41,8 @@ def in_words(step: Step) -> str:
             return "close the flap"
         case Capture():
             frames = "frame" if step.frames == 1 else "frames"
-            return f"{step.frames} {frames} at {step.chamber_degC:g} °C ({step.role.replace('_', ' ')})"
+            of = f" of {', '.join(step.cameras)}" if step.cameras else ""
+            return f"{step.frames} {frames}{of} at {step.chamber_degC:g} °C ({step.role.replace('_', ' ')})"
         case MoveTo():
             return f"move {step.axis} to {step.position:g}"
         case PowerCamera():

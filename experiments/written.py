@@ -60,11 +60,13 @@ class Nothing(_Part):
 
 class CaptureEntry(CaptureParameters):
     """`frames` images. role: what they are for; `other` frames are recorded and shown, and nothing is fitted to them.
-    chamber_degC: the set-point they are made at, by default that of the steps before."""
+    chamber_degC: the set-point they are made at, by default that of the steps before. cameras: the names of those that
+    expose, by default all of the stand."""
 
     frames: FrameCount = 1
     role: Role = Role.OTHER
     chamber_degC: Chamber_degC | None = None
+    cameras: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _has_a_purpose(self) -> Self:
@@ -237,7 +239,9 @@ def _steps(name: str, value: object, place: Place, at_degC: float | None) -> Ite
         case _, CaptureEntry() as capture:
             degC = at_degC if capture.chamber_degC is None else capture.chamber_degC
             degC = _known(degC, place, "start_chamber before it, or chamber_degC")
-            return (Capture(capture.frames, capture.interval_s, capture.exposure_s, capture.role, degC),)
+            return (
+                Capture(capture.frames, capture.interval_s, capture.exposure_s, capture.role, degC, capture.cameras),
+            )
         case "move_to", dict() as positions:
             return placed(cast("dict[str, float]", positions))
         case "check_home", tuple() as axes:

@@ -247,6 +247,9 @@ def _check(planned: PlannedStep, config: StandConfig) -> None:
         raise ConfigError(
             f"{where}: needs a camera, and this stand has none; name it under cameras in the stand's file"
         )
+    if isinstance(step, Capture) and (unknown := [name for name in step.cameras if name not in config.cameras]):
+        known = ", ".join(config.cameras) or "none"
+        raise ConfigError(f"{where}: this stand has no camera {unknown[0]}; it has {known}")
     if isinstance(step, Capture) and step.frames > 1 and (reason := overloaded(config, step.interval_s)):
         raise ConfigError(f"{where}: {reason}")
     for name, camera in config.cameras.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from drivers.devices.protocols import Camera
 from foundation.clock import Clock, seconds_ns
@@ -49,18 +49,18 @@ class Cameras:
         for camera in self._cameras:
             await camera.close()
 
-    async def grab(self, exposure_s: float, due_ns: int = 0) -> tuple[Frame, ...]:
-        """One frame of each, the first at `due_ns` when that is still ahead, the others a little later each.
-        Unreachable when one was lost: then there is a frame of none.
+    async def grab(self, exposure_s: float, due_ns: int = 0, names: Collection[str] = ()) -> tuple[Frame, ...]:
+        """One frame of each, or of those named, the first at `due_ns` when that is still ahead, the others a little
+        later each. Unreachable when one was lost: then there is a frame of none.
 
         In real time they expose and send together; in virtual time, which stands still meanwhile, one after the other.
         """
-        if not self._clock.lead_ns or len(self._cameras) == 1:
-            return await self._one_by_one(exposure_s, due_ns)
+        cameras = [each for name, each in zip(self.names, self._cameras, strict=True) if not names or name in names]
+        if not self._clock.lead_ns or len(cameras) == 1:
+            return await self._one_by_one(cameras, exposure_s, due_ns)
         first_ns = max(due_ns, self._clock.now_ns())
         grabs = (
-            camera.grab(exposure_s, first_ns + number * seconds_ns(_APART_S))
-            for number, camera in enumerate(self._cameras)
+            camera.grab(exposure_s, first_ns + number * seconds_ns(_APART_S)) for number, camera in enumerate(cameras)
         )
         results = await asyncio.gather(*grabs, return_exceptions=True)  # each ends: none may be in the wire's lane
         frames: list[Frame] = []
@@ -70,9 +70,9 @@ class Cameras:
             frames.append(result)
         return tuple(frames)
 
-    async def _one_by_one(self, exposure_s: float, due_ns: int) -> tuple[Frame, ...]:
+    async def _one_by_one(self, cameras: Iterable[Camera], exposure_s: float, due_ns: int) -> tuple[Frame, ...]:
         frames: list[Frame] = []
-        for camera in self._cameras:
+        for camera in cameras:
             if frames:
                 await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_APART_S))
             frames.append(await camera.grab(exposure_s, due_ns if not frames else 0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 from drivers.devices.flap import Flap
@@ -64,12 +64,12 @@ class Imaging:
             with self._motions.under_way("flap", "closing"):
                 await self._flap.move_closed()
 
-    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0) -> bool:
-        """One frame of each camera for the step, published; the first exposed at `due_ns` when that is still ahead.
-        False when a camera was lost: see `_regain`; the flap may have been shut meanwhile."""
+    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0, cameras: Collection[str] = ()) -> bool:
+        """One frame of each camera, or of those named, for the step, published; the first exposed at `due_ns` when that
+        is still ahead. False when a camera was lost: see `_regain`; the flap may have been shut meanwhile."""
         self._interlock.check()
         try:
-            self._publish(await self._cameras.grab(exposure_s, due_ns), step_id)
+            self._publish(await self._cameras.grab(exposure_s, due_ns, cameras), step_id)
         except Unreachable as error:
             await self._regain(error)
             return False

@@ -325,7 +325,7 @@ class Executor:
             missing_s = (self._clock.now_ns() - self._state.seen_ns) / NS_PER_S
             text = f"the run was held: the camera has warmed up for {missing_s:.1f} s without a frame"
             self._log.tell("warning", "warm_up_gap", text)
-        is_taken = await self._stand.imaging.take_frame(capture.exposure_s, step_id, frame.due_ns)
+        is_taken = await self._stand.imaging.take_frame(capture.exposure_s, step_id, frame.due_ns, capture.cameras)
         now_ns = self._clock.now_ns()
         if is_taken:
             self._log.enter(Taken(now_ns, step_id))

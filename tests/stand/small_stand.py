@@ -104,7 +104,7 @@ class SmallStand:
     async def approach_again(self):
         self._check()
 
-    async def take_frame(self, exposure_s, step_id, due_ns):
+    async def take_frame(self, exposure_s, step_id, due_ns, cameras):
         try:
             await self._act("take_frame")
             is_lost = self._clock.now_ns() < self.camera_back_ns or not self.supplied

@@ -1,10 +1,13 @@
 """Cameras on one line: the pause between their packets, and what the line carries."""
 
+from dataclasses import replace
+
 import pytest
 import yaml
 
 from drivers.devices.camera_gige import Camera
 from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
+from experiments.steps import Capture, parameters_of
 from foundation.clock import WallClock
 from foundation.documents import parse_document
 from foundation.errors import ConfigError
@@ -66,3 +69,20 @@ def test_each_camera_is_told_how_many_share_its_line():
     own = assemble(of(2, line_shared_by=1), Hub(), WallClock()).devices.cameras["camera"]
     assert isinstance(own, Camera)
     assert own.settings.line_shared_by == 1
+
+
+CAPTURE_OF = """
+name: captures
+experiments:
+  - steps: [{{start_chamber: 24}}, {{power_camera: on}}, open_flap, {{capture: {{cameras: [{name}]}}}}, close_flap]
+"""
+
+
+def test_a_capture_may_name_its_cameras_which_the_stand_has_to_have():
+    plan = parse_document(CAPTURE_OF.format(name="left"), Recipe, "recipe").plan()
+    captures = [each.planned.step for each in price(plan, of(3)) if isinstance(each.planned.step, Capture)]
+    assert [capture.cameras for capture in captures] == [("left",)]
+    assert parameters_of(captures[0])["cameras"] == ("left",)
+    assert "cameras" not in parameters_of(replace(captures[0], cameras=()))  # the plans of before keep their step ids
+    with pytest.raises(ConfigError, match="this stand has no camera top; it has camera, left, right"):
+        price(parse_document(CAPTURE_OF.format(name="top"), Recipe, "recipe").plan(), of(3))

@@ -70,6 +70,11 @@ async def test_in_real_time_they_expose_together_a_millisecond_apart():
     assert [frame.time_ns - due_ns for frame in frames] == [0, 1_000_000]
 
 
+async def test_those_that_are_named_expose_and_no_other(pair: tuple[Camera, Camera, Cameras]):
+    frames = await pair[2].grab(0.2, names=("side",))
+    assert [frame.channel for frame in frames] == ["side.image"]
+
+
 async def test_when_one_is_lost_there_is_a_frame_of_none_until_all_are_open_again(
     pair: tuple[Camera, Camera, Cameras],
 ):
