@@ -19,6 +19,8 @@ _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera
 _DEALT_OUT = PurePath("tests/system")
 # What compiles the marker fit goes first: the workers that need it later find it kept, instead of waiting for it.
 _FIRST = {"tests/compensation/test_markers.py"}
+# A worker that took these last would be the only one at work for a minute.
+_LONG_FILES = {"tests/stand/test_page.py", "tests/stand/test_page_room.py"}
 _TOGETHER = {
     "tests/system/test_camera_wire.py",
     "tests/system/test_failure_table.py",
@@ -86,7 +88,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     def turn(item: pytest.Item) -> int:
         file = item.nodeid.partition("::")[0]
-        return 0 if file in _FIRST else 1 if PurePath(file).parent == _DEALT_OUT else 2
+        if file in _FIRST:
+            return 0
+        return 1 if file in _LONG_FILES or PurePath(file).parent == _DEALT_OUT else 2
 
     items.sort(key=turn)
 
