@@ -19,6 +19,7 @@ from stand.estimating.estimate import PricedStep
 _REMEMBERED = 9  # the last measurements of a kind of work count
 _LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
 _LEAST_WITHIN_S = 60.0
+_LEAST_SHARE = 0.5
 
 
 class Eta:
@@ -85,9 +86,12 @@ class Eta:
     def within_s(self) -> float | None:
         """By how much the plan may end earlier or later, s: twice the deviation of the steps so far from what was
         expected of each, for as many of their kind of work as are to come; no less than a minute. None before three
-        are done, and when none is left."""
+        are done, while the kinds that are still to take half of the time have not been seen, and when none is left."""
         left = self._count + Counter(() if self._running is None else (self._running.work,))
         if sum(map(len, self._off_s.values())) < _LEAST_SEEN or not left.total():
+            return None
+        known_s = sum(step.duration_s for step in self._waiting.values() if step.work in self._off_s)
+        if known_s < _LEAST_SHARE * sum(step.duration_s for step in self._waiting.values()):
             return None
         variance_s2 = sum(left[work] * sum(off * off for off in seen) / len(seen) for work, seen in self._off_s.items())
         return max(_LEAST_WITHIN_S, 2.0 * math.sqrt(variance_s2))

@@ -71,7 +71,7 @@ class RunStatus(Value):
     step: number of the step under way, 1 is the first; doing: that step in words. since_ns: when the present state
     began. end_ns: when the run is expected to end, the way back to the laboratory's temperature included, None when
     unknown; end_within_s: by how much it may be earlier or later, from how far this run's steps were from what was
-    expected of them, None before three are done. frames_planned: how many the plan is expected to give.
+    expected of them, None before that says enough. frames_planned: how many the plan is expected to give.
     temperatures_degC: by channel, None for a BAD reading. warning: the text of the last warning or error, published at
     warning_ns. fault_rule, fault: the rule that has tripped and holds or ends the run, and what was found, "" when all
     is well.
