@@ -17,6 +17,7 @@ from foundation.errors import Unreachable
 from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
 from stand.commissioning import host
+from stand.commissioning.camera_lines import shared_lines
 from stand.commissioning.finding import Finding
 from stand.commissioning.links import Links
 from stand.commissioning.moves import Moves
@@ -98,6 +99,8 @@ async def _looks(assembly: Assembly, add: Callable[[Finding], None], *, has_move
         yield
     for name in devices.cameras:
         await links.camera(name, is_switched_on_later=has_moves)
+        for finding in shared_lines(assembly.config, name):
+            add(finding)
     if moves is not None:
         await moves.cameras()
     yield

@@ -13,6 +13,7 @@ from foundation.documents import parse_document
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from stand.assembly import assemble
+from stand.commissioning.camera_lines import shared_lines
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, packaged
 from stand.estimating.camera_lines import camera_lines
@@ -61,6 +62,15 @@ def test_what_the_line_does_not_carry_is_refused_before_the_night():
     with pytest.raises(ConfigError, match=r"faster than the line of 100 Mbit/s that 3 cameras share"):
         price(parse_document(RECIPE, Recipe, "recipe").plan(), of(3, line_Mbps=100))
     assert price(parse_document(RECIPE, Recipe, "recipe").plan(), of(3))
+
+
+def test_the_check_shows_what_each_camera_needs_of_a_shared_line():
+    assert shared_lines(of(1), "camera") == ()
+    (fits,) = shared_lines(of(3), "left")
+    assert (fits.device, fits.verdict, fits.advice) == ("left", "ok", "")
+    assert fits.text.startswith("3 on a line of 1000 Mbit/s, 141.5 us between packets")
+    (slow,) = shared_lines(of(2, line_Mbps=100), "left")
+    assert (slow.verdict, bool(slow.advice)) == ("failed", True)
 
 
 def test_each_camera_is_told_how_many_share_its_line():
