@@ -137,6 +137,18 @@ def _of_table(paths: list[Path]) -> Observations:
     return observations_of_table(paths[0])
 
 
+def _extras(
+    sessions: list[Path], budget: str | None, target: str | None, validation: Path | None, details: Path | None
+) -> Extras:
+    return Extras(
+        details=load_details(details),
+        budgets={} if budget is None else budgets_of_sessions(sessions, budget, named_target(target)),
+        positions=table_positions([Session.open(path).steps() for path in sessions]),
+        validation=None if validation is None else load_validation(validation),
+        equipment=equipment_of(Session.open(sessions[0])),
+    )
+
+
 @app.command()
 def report(
     sessions: Sessions,
@@ -165,15 +177,8 @@ def report(
     """
     with one_line_errors():
         check_report_writable(out, model, validation)
-        stated = load_details(details)
         given = None if model is None else load_model(model)
-        extras = Extras(
-            budgets={} if budget is None else budgets_of_sessions(sessions, budget, named_target(target)),
-            positions=table_positions([Session.open(path).steps() for path in sessions]),
-            validation=None if validation is None else load_validation(validation),
-            equipment=equipment_of(Session.open(sessions[0])),
-            details=stated,
-        )
+        extras = _extras(sessions, budget, target, validation, details)
         observations = observed(
             sessions,
             target,

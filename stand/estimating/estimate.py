@@ -205,19 +205,19 @@ def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
     return whole * _BYTES_PER_PIXEL["png"] + (frames - whole) * _BYTES_PER_PIXEL[recording.frame_encoding]
 
 
+def _check_set_point(chamber_degC: float, where: str, config: StandConfig) -> None:
+    cameras = {f"cameras.{name}.ambient_degC": camera.ambient_degC for name, camera in config.cameras.items()}
+    for key, limits_degC in {"limits.chamber_degC": config.limits.chamber_degC, **cameras}.items():
+        if limits_degC is not None and not limits_degC[0] <= chamber_degC <= limits_degC[1]:
+            low, high = limits_degC
+            raise ConfigError(f"{where}: {chamber_degC} degC is outside {key} {low}..{high}")
+
+
 def _check(planned: PlannedStep, config: StandConfig) -> None:
     step = planned.step
     where = f"step {planned.index + 1} ({kind_of(step)})"
     if isinstance(step, StartChamber | SetTemperature):
-        low, high = config.limits.chamber_degC
-        if not low <= step.chamber_degC <= high:
-            raise ConfigError(f"{where}: {step.chamber_degC} degC is outside limits.chamber_degC {low}..{high}")
-        for name, camera in config.cameras.items():
-            low, high = camera.ambient_degC or (low, high)
-            if not low <= step.chamber_degC <= high:
-                raise ConfigError(
-                    f"{where}: {step.chamber_degC} degC is outside cameras.{name}.ambient_degC {low}..{high}"
-                )
+        _check_set_point(step.chamber_degC, where, config)
     if isinstance(step, Capture | SoakUntilSettled) and config.dew is not None:
         lowest_degC = config.dew.lowest_degC(math.nan)
         if step.chamber_degC < lowest_degC:
