@@ -32,7 +32,7 @@ def night(cameras: int, out: Path) -> tuple[float, Counter[str], int]:
     session = Session.open(path)
     metas = [meta for _, meta in session.frame_metas]
     later = metas[cameras:]  # the simulated scene's first image is slow
-    times_ns = session.readings("thermometers.air").time_ns
+    times_ns = session.readings("thermometers.air")[0]
     duration_s = float(times_ns[-1] - times_ns[0]) / 1e9
     return duration_s, Counter(meta.channel for meta in metas), sum(meta.dropped for meta in later)
 
