@@ -177,8 +177,7 @@ def report(
     """
     with one_line_errors():
         check_report_writable(out, model, validation)
-        given = None if model is None else load_model(model)
-        extras = _extras(sessions, budget, target, validation, details)
+        given, extras = model and load_model(model), _extras(sessions, budget, target, validation, details)
         observations = observed(
             sessions,
             target,
@@ -199,5 +198,5 @@ def report(
             raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
         alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
         scores = {} if evaluation is None else _scores(evaluation)
-        data = {"report": out, "numbers": numbers_path(out), **scores}
-        show(data, [alone if evaluation is None else table(evaluation)])
+        lines = [alone if evaluation is None else table(evaluation)]
+        show({"report": out, "numbers": numbers_path(out), **scores}, lines)
