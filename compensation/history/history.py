@@ -56,12 +56,16 @@ class History:
         return len(self.ambient_ns) > 1
 
 
-def recorded_history(session: Session) -> History:
-    """What the session's telemetry has of it; a channel that was not recorded is empty."""
-    ambient_ns, ambient_degC = _good(session, _AMBIENT)
-    camera_ns, camera_degC = _good(session, f"{session.camera}.temperature")
-    powered_ns, powered = _powered(session)
-    return refined(History(ambient_ns, ambient_degC, powered_ns, powered, camera_ns, camera_degC))
+def recorded_history(session: Session, until_ns: int | None = None) -> History:
+    """What the session's telemetry has of it, to that instant or its end; a channel that was not recorded is empty."""
+    columns = (_good(session, _AMBIENT), _powered(session), _good(session, f"{session.camera}.temperature"))
+    ambient, powered, camera = columns if until_ns is None else (_until(column, until_ns) for column in columns)
+    return refined(History(*ambient, *powered, *camera))
+
+
+def _until(column: tuple[TimesNs, Float], until_ns: int) -> tuple[TimesNs, Float]:
+    known = column[0] <= until_ns
+    return column[0][known], column[1][known]
 
 
 def refined(history: History) -> History:

@@ -1,0 +1,139 @@
+"""The next visit of a night that decides, or its end: I-optimal design over the wanted temperatures.
+
+I-optimal: the next visits are those after which the drift model's variance, averaged over the states in which it is
+wanted, is least. A slow part of a camera shows only on a long way in one direction, so whole courses of some hours
+are compared, and of the best one the first visit is made; then the model is fitted again.
+
+Pure: what was observed goes in, a decision comes out, the same for the same observations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+
+from compensation.design.courses import Known, best_course
+from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
+from compensation.drift.terms import Origin, features
+from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.training import frame_states
+from compensation.history.states import Float
+from compensation.observations import Observations
+from experiments.steps import Role
+from foundation.clock import NS_PER_S
+from foundation.errors import SessionError
+
+_GRID, _PLACES = 13, 7
+_APART_K = 1.0
+"""From a held-out temperature: nearer ones would show it to the fitter."""
+
+_ARRIVED_S = 2700.0
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What a night is for, and within what it decides. range_degC: set-points at which the model is wanted; none
+    outside is chosen, nor one of held_out_degC. residual_px: the predicted residual with which the night is content.
+    dwells_s: to choose from. ramp_K_per_min: of the chamber, at most."""
+
+    range_degC: tuple[float, float]
+    residual_px: float
+    held_out_degC: tuple[float, ...] = ()
+    dwells_s: tuple[float, ...] = (900.0, 1500.0, 2700.0)
+    ramp_K_per_min: float = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """kind: "visit" or "enough". chamber_degC, dwell_s: of the visit. predicted_px: the residual that the model
+    predicts over the wanted states, RMS of a coordinate, NaN without a model. reason: in words."""
+
+    kind: Literal["visit", "enough"]
+    chamber_degC: float
+    dwell_s: float
+    predicted_px: float
+    reason: str
+
+
+def decide(observations: Observations, wanted: Wanted) -> Decision:
+    """What to do next. While no model can be fitted, the temperature that is furthest from those visited."""
+    grid = _grid(wanted)
+    try:
+        model = fit_thermal(observations)
+        around = surroundings(observations, wanted.ramp_K_per_min)
+    except SessionError as error:
+        return _furthest(observations, wanted, grid, str(error))
+    asked = _asked(around, model, wanted)
+    predicted_px = predicted_residual_px(model, asked)
+    if predicted_px <= wanted.residual_px:
+        reason = f"the residual is predicted at {1e3 * predicted_px:.1f} mpx, {1e3 * wanted.residual_px:g} are wanted"
+        return Decision("enough", math.nan, 0.0, predicted_px, reason)
+    known = Known(
+        model.leverage_matrix,
+        _noise_px2(model, observations),
+        _features(model, asked),
+        lambda situation: _features(model, situation),
+    )
+    seed = int(observations.time_ns[-1] % (1 << 32))
+    course = best_course(known, now(observations, model.memory), around, grid, wanted.dwells_s, seed)
+    reason = (
+        f"the residual is predicted at {1e3 * predicted_px:.1f} mpx; {course.chamber_degC:g} degC for "
+        f"{course.dwell_s / 60:g} min begins the course that lowers it most"
+    )
+    return Decision("visit", course.chamber_degC, course.dwell_s, predicted_px, reason)
+
+
+def predicted_residual_px(model: ThermalModel, asked: Situation) -> float:
+    """RMS of a coordinate over these situations and the outline of the markers."""
+    hull_px = model.facts.hull_px
+    situations, places = len(asked.air_degC), len(hull_px)
+    states = asked.states.where(np.repeat(np.arange(situations), places))
+    covariance = model.covariance(np.tile(hull_px, (situations, 1)), states)
+    return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 2))
+
+
+def _grid(wanted: Wanted) -> Float:
+    """Set-points to choose from; SessionError never: the ends stay when all is held out."""
+    grid = np.linspace(*wanted.range_degC, _GRID)
+    held_out = np.array(wanted.held_out_degC)
+    near = np.abs(grid[:, None] - held_out).min(axis=1, initial=np.inf)
+    return np.round(grid[near >= _APART_K] if (near >= _APART_K).any() else grid[[0, -1]], 1)
+
+
+def _furthest(observations: Observations, wanted: Wanted, grid: Float, why: str) -> Decision:
+    seen = observations.chamber_degC[observations.of(Role.REFERENCE, Role.FIT)]
+    distance_K = np.abs(grid[:, None] - seen).min(axis=1, initial=np.inf)
+    degC, dwell_s = float(grid[np.argmax(distance_K)]), max(wanted.dwells_s)
+    return Decision(
+        "visit", degC, dwell_s, math.nan, f"no model yet ({why}); {degC:g} degC is furthest from the others"
+    )
+
+
+def _asked(around: Surroundings, model: ThermalModel, wanted: Wanted) -> Situation:
+    """Where the model is wanted: throughout the range, 45 min after a camera at rest in its middle, or half way to
+    either end, was brought there."""
+    low, high = wanted.range_degC
+    places = np.linspace(low, high, _PLACES)
+    begins = np.linspace(low, high, 5)[1:4]
+    pairs = np.array(list(product(begins, places)))
+    begun = at_rest(around, pairs[:, 0], model.memory)
+    return after(around, begun, pairs[:, 1], np.full(len(pairs), _ARRIVED_S))
+
+
+def _features(model: ThermalModel, situation: Situation) -> Float:
+    origin = Origin(model.facts.reference_degC, model.reference_ambient_degC)
+    return features(situation.states, model.terms, origin) - model.reference_features
+
+
+def _noise_px2(model: ThermalModel, observations: Observations) -> float:
+    """What one instant leaves open, px^2: the hat matrix of all instants has as many ones as there are terms."""
+    frames = np.flatnonzero(observations.of(Role.REFERENCE, Role.FIT, Role.WARM_UP))
+    minute = observations.time_ns[frames] // (60 * NS_PER_S)
+    _, first = np.unique(minute, return_index=True)
+    leverage = model.leverage(frame_states(observations, model.memory).where(frames[first]))
+    return float(np.nansum(leverage)) / len(model.terms)

@@ -1,0 +1,151 @@
+"""How the air, the camera and what it remembers go on when the chamber is given set-points: a forecast of the features
+of the drift model, for many courses at once.
+
+The air follows a set-point by a limited ramp and a first-order lag; the camera is linear in lags of the air, fitted to
+the night so far. Lags and plays are those of compensation/drift_runtime.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.history.history import states_at
+from compensation.history.states import Float, Memory, States
+from compensation.observations import Observations
+from experiments.steps import Role
+from foundation.errors import SessionError
+
+STEP_S = 60.0
+_AIR_TAU_S = 300.0
+_CAMERA_TAUS_S = (150.0, 480.0, 1200.0, 4000.0)
+_RIDGE = 1e-8
+_EVERY = 6
+"""Of the camera's readings, for its fit: they come every few seconds, it moves within minutes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What the night says of chamber and camera. air (2,): offset and slope of the recorded air over set-points.
+    camera (2 + K,): of a powered camera, a constant, the weights of the air and of its lags. ramp_K_per_min: at most.
+    """
+
+    air: Float
+    camera: Float
+    ramp_K_per_min: float
+
+    def air_degC(self, set_point_degC: Float) -> Float:
+        """The air near the camera after a long time at set-points."""
+        return self.air[0] + self.air[1] * set_point_degC
+
+    def camera_degC(self, air_degC: Float, lags_degC: Float) -> Float:
+        """(S,): of air (S,) and its lags (S, K)."""
+        return self.camera[0] + self.camera[1] * air_degC + lags_degC @ self.camera[2:]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Situation:
+    """S situations. target_degC (S,): what the air follows. air_degC (S,). camera_lags (S, K): lags of the air that the
+    camera is made of. states: what a drift model remembers, of the air, the supply and the camera."""
+
+    target_degC: Float
+    air_degC: Float
+    camera_lags: Float
+    states: States
+
+    def where(self, rows: NDArray[np.int64]) -> Situation:
+        """These situations, in this order."""
+        return Situation(self.target_degC[rows], self.air_degC[rows], self.camera_lags[rows], self.states.where(rows))
+
+
+def surroundings(observations: Observations, ramp_K_per_min: float) -> Surroundings:
+    """What the last session says; SessionError when it has no history of the air or too few readings of the camera."""
+    history = observations.histories[-1] if observations.histories else None
+    if history is None or not history.has_ambient or len(history.camera_ns) < 10 * _EVERY:
+        raise SessionError("the session has no history of air and camera; nothing can be foreseen")
+    at_ns, told = history.camera_ns[::_EVERY], history.camera_degC[::_EVERY]
+    states = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, told)
+    air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
+    # While it warms up the supply's lags explain it; of a camera that has been on for long they are 1.
+    terms = np.column_stack([np.ones(len(air)), air, states.ambient_lag_degC, states.power_lag - 1])
+    known = np.isfinite(terms).all(axis=1) & np.isfinite(told)
+    normal = terms[known].T @ terms[known]
+    damped = normal + _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    weights = np.linalg.solve(damped, terms[known].T @ told[known])
+    return Surroundings(_air(observations), weights[: 2 + len(_CAMERA_TAUS_S)], ramp_K_per_min)
+
+
+def _air(observations: Observations) -> Float:
+    """Offset and slope; the air is taken to be at the set-point until two of them have been visited."""
+    frames = observations.of(Role.REFERENCE, Role.FIT, Role.VALIDATION) & np.isfinite(observations.air_degC)
+    set_points, air = observations.chamber_degC[frames], observations.air_degC[frames]
+    if len(set_points) < 2 or np.ptp(set_points) < 2.0:
+        return np.array([0.0, 1.0])
+    slope, offset = np.polyfit(set_points, air, 1)
+    return np.array([offset, slope]) if 0.5 < slope < 1.5 else np.array([0.0, 1.0])
+
+
+def now(observations: Observations, memory: Memory) -> Situation:
+    """At the last frame of the last session."""
+    history = observations.histories[-1]
+    own = observations.session == len(observations.sessions) - 1
+    at_ns, told = observations.time_ns[own][-1:], observations.camera_degC[own][-1:]
+    lags = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, told).ambient_lag_degC
+    air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
+    return Situation(air, air, lags, states_at(history, memory, at_ns, told))
+
+
+def at_rest(around: Surroundings, set_points_degC: Float, memory: Memory) -> Situation:
+    """Of a powered camera after a long time at set-points (S,); plays are as after a way from a colder place."""
+    air = around.air_degC(set_points_degC)
+    lags = np.repeat(air[:, None], len(_CAMERA_TAUS_S), axis=1)
+    camera = around.camera_degC(air, lags)
+    unknown = States.at_degC(camera, len(air), memory)
+    taus, count = len(memory.taus_s), len(air)
+    states = replace(
+        unknown,
+        ambient_lag_degC=np.repeat(air[:, None], taus, axis=1),
+        power_lag=np.ones((count, taus)),
+        camera_lag_degC=np.repeat(camera[:, None], taus, axis=1),
+        play_degC=camera[:, None] - np.array(memory.plays_K)[None, :],
+        rate_K_per_h=np.zeros(count),
+        on_s=np.full(count, np.inf),
+        settled_s=np.full(count, np.inf),
+    )
+    return Situation(air, air, lags, states)
+
+
+def after(around: Surroundings, situation: Situation, set_points_degC: Float, dwell_s: Float) -> Situation:
+    """After dwells (S,) at set-points (S,), s and degC."""
+    goal, before = around.air_degC(set_points_degC), situation.states
+    left_s = np.asarray(dwell_s, np.float64).copy()
+    target, air, lags = situation.target_degC, situation.air_degC, situation.camera_lags
+    camera, ambient_lag, power_lag = before.camera_degC, before.ambient_lag_degC, before.power_lag
+    camera_lag, play = before.camera_lag_degC, before.play_degC
+    taus, radii = np.array(before.memory.taus_s), np.array(before.memory.plays_K)
+    for _ in range(int(np.ceil(left_s.max() / STEP_S))):
+        dt = np.clip(left_s, 0.0, STEP_S)[:, None]
+        left_s -= STEP_S
+        reach_K = around.ramp_K_per_min / 60 * dt[:, 0]
+        target = target + np.clip(goal - target, -reach_K, reach_K)
+        before_air, before_camera = air, camera
+        air = air + (target - air) * -np.expm1(-dt[:, 0] / _AIR_TAU_S)
+        mean_air = ((air + before_air) / 2)[:, None]
+        lags = lags + (mean_air - lags) * -np.expm1(-dt / np.array(_CAMERA_TAUS_S))
+        camera = np.where(dt[:, 0] > 0, around.camera_degC(air, lags), before_camera)
+        gained = -np.expm1(-dt / taus)
+        ambient_lag = ambient_lag + (mean_air - ambient_lag) * gained
+        power_lag = power_lag + (1 - power_lag) * gained
+        camera_lag = camera_lag + (((camera + before_camera) / 2)[:, None] - camera_lag) * gained
+        play = np.clip(play, camera[:, None] - radii, camera[:, None] + radii)
+    states = replace(
+        before,
+        camera_degC=camera,
+        ambient_lag_degC=ambient_lag,
+        power_lag=power_lag,
+        camera_lag_degC=camera_lag,
+        play_degC=play,
+    )
+    return Situation(target, air, lags, states)

@@ -1,0 +1,67 @@
+"""The process that decides for a night: `python -m compensation.design.process DAEMON FD ...`, see
+foundation/helper_process.py. Everything else on the machine goes before it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from foundation.errors import StandError
+from foundation.helper_process import serve
+
+_LEFT_NAME = "stand-known-left"  # of a process whose daemon has gone
+
+
+def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """The decision about a session that is being recorded. asked: the parameters of the plan's step. kind: "visit",
+    with chamber_degC and dwell_s, "enough", or "none", when the frames so far allow no decision; reason: in words.
+    Plain values: the daemon that reads them has nothing of this package."""
+    import cv2
+
+    from compensation.design.deciding import Wanted, decide
+    from compensation.design.night import recorded_so_far
+
+    cv2.setNumThreads(1)
+    wanted = Wanted(
+        (asked["coldest_degC"], asked["warmest_degC"]),
+        asked["residual_px"],
+        tuple(asked["held_out_degC"]),
+        tuple(asked["dwells_s"]),
+        asked["ramp_K_per_min"],
+    )
+    try:
+        found = decide(recorded_so_far(Path(session)), wanted)
+    except (StandError, OSError) as error:
+        return {"kind": "none", "reason": str(error)}
+    except Exception as error:  # noqa: BLE001 - whatever it is, the fixed plan goes on
+        return {"kind": "none", "reason": f"the drift model was not fitted ({type(error).__name__}: {error})"}
+    return {
+        "kind": found.kind,
+        "reason": found.reason,
+        "chamber_degC": float(found.chamber_degC),
+        "dwell_s": float(found.dwell_s),
+    }
+
+
+def _go_behind_all_others() -> None:
+    with suppress(OSError):
+        os.nice(19)
+    with suppress(OSError, AttributeError):  # Linux
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def main() -> None:
+    """Serve until the daemon is gone."""
+    for library in ("OMP", "OPENBLAS", "NUMBA"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
+    _go_behind_all_others()
+    serve([int(number) for number in sys.argv[2:]], _LEFT_NAME)
+
+
+if __name__ == "__main__":
+    main()

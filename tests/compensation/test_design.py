@@ -1,0 +1,91 @@
+"""A night that decides: what is foreseen of a camera, what is chosen to be visited, and when enough is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from compensation.design.courses import Known, best_course
+from compensation.design.deciding import Wanted, decide
+from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
+from compensation.drift.training import frame_states
+from compensation.history.states import Float, Memory
+from compensation.observations import Observations
+
+from .drawn_cameras import drawn_camera
+from .drawn_nights import Stretch, night, reference, warm_up
+
+WANTED = Wanted((10.0, 52.0), 0.005, held_out_degC=(20.0, 34.0))
+MEMORY = Memory((480.0, 3000.0), (5.0,), 15.0)
+BEGUN = [*warm_up(), *reference()]
+VISITS = [Stretch(degC, 1500, "fit", 5) for degC in (52.0, 10.0, 45.0, 17.0, 31.0)]
+
+
+@pytest.fixture(scope="module")
+def observed() -> Observations:
+    return night(drawn_camera(3), [*BEGUN, *VISITS]).observed
+
+
+def up_to(observed: Observations, frames: int) -> Observations:
+    """As if the night had only so many frames so far."""
+    columns = {
+        name: getattr(observed, name)[:frames]
+        for name in ("session", "frame", "time_ns", "role", "step_id", "chamber_degC", "camera_degC", "air_degC")
+    }
+    centres = {name: getattr(observed, name)[:frames] for name in ("centres_px", "covariance_px2", "flags", "reasons")}
+    return replace(observed, **columns, **centres)
+
+
+def test_camera_and_lags_are_foreseen(observed: Observations):
+    before = up_to(observed, len(observed.frame) - 5)
+    around = surroundings(before, ramp_K_per_min=20.0)
+    foreseen = after(around, now(before, MEMORY), np.array([31.0]), np.array([1500.0])).states
+    came = frame_states(observed, MEMORY).where(np.array([len(observed.frame) - 1]))
+    assert foreseen.camera_degC == pytest.approx(came.camera_degC, abs=0.5)
+    assert foreseen.ambient_lag_degC[0] == pytest.approx(came.ambient_lag_degC[0], abs=0.5)
+    assert foreseen.camera_lag_degC[0] == pytest.approx(came.camera_lag_degC[0], abs=0.5)
+
+
+def test_a_long_dwell_comes_to_rest(observed: Observations):
+    around = surroundings(observed, ramp_K_per_min=2.0)
+    begun = at_rest(around, np.array([10.0, 50.0]), MEMORY)
+    rest = at_rest(around, np.array([40.0, 40.0]), MEMORY).states
+    long = after(around, begun, np.array([40.0, 40.0]), np.full(2, 12 * 3600.0)).states
+    assert long.camera_degC == pytest.approx(rest.camera_degC, abs=0.01)
+    assert long.ambient_lag_degC == pytest.approx(rest.ambient_lag_degC, abs=0.01)
+    assert long.play_degC[:, 0] - long.camera_degC == pytest.approx([-5.0, 5.0], abs=0.01)
+
+
+def test_the_ends_of_the_range_teach_most_about_a_straight_line():
+    around = Surroundings(np.array([0.0, 1.0]), np.array([15.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 20.0)
+    here = at_rest(around, np.array([24.0]), MEMORY)
+
+    def line(situation: Situation) -> Float:
+        return np.column_stack([np.ones(len(situation.air_degC)), (situation.air_degC - 31.0) / 20.0])
+
+    wanted = np.column_stack([np.ones(9), np.linspace(-1.0, 1.0, 9)])
+    known = Known(np.diag([1e-8, 1e-4]), 1e-6, wanted, line)
+    chosen = best_course(known, here, around, np.linspace(10.0, 52.0, 13), (14400.0,), seed=1)
+    assert chosen.chamber_degC in (10.0, 52.0)
+    assert chosen.variance_px2 < 1e-8 + 1e-4 / 20
+
+
+def test_decisions_are_the_same_for_the_same_frames_and_stay_within_what_is_wanted(observed: Observations):
+    decisions = [decide(observed, WANTED) for _ in range(2)]
+    assert decisions[0] == decisions[1]
+    assert decisions[0].kind == "visit"
+    assert 10.0 <= decisions[0].chamber_degC <= 52.0
+    assert min(abs(decisions[0].chamber_degC - degC) for degC in WANTED.held_out_degC) >= 1.0
+    assert decisions[0].dwell_s in WANTED.dwells_s
+
+
+def test_before_there_is_a_model_what_is_furthest_is_visited(observed: Observations):
+    first = decide(up_to(observed, 80), WANTED)
+    assert (first.kind, first.chamber_degC) == ("visit", 52.0)
+    assert np.isnan(first.predicted_px)
+
+
+def test_enough_is_known_when_the_predicted_residual_is_the_wanted_one(observed: Observations):
+    predicted_px = decide(observed, WANTED).predicted_px
+    assert decide(observed, replace(WANTED, residual_px=1.01 * predicted_px)).kind == "enough"
+    assert decide(observed, replace(WANTED, residual_px=0.99 * predicted_px)).kind == "visit"
