@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self, cast
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 COLDEST_degC, WARMEST_degC = -10.0, 70.0  # the paper's chamber, section 2
+_SHORTEST_DWELL_s = 60.0
 Chamber_degC = Annotated[float, Field(ge=COLDEST_degC, le=WARMEST_degC)]
 Wait_s = Annotated[float, Field(ge=0, le=7 * 86400)]  # longer is a slip of the keyboard
 FrameCount = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -56,15 +58,46 @@ class Settled(BaseModel):
         return self
 
 
+class Known(BaseModel):
+    """Experimental: when enough is known of a camera, and within what the night decides; see steps.Decide.
+
+    wait_s: for a decision, in real time.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    residual_px: float = Field(default=0.005, gt=0, le=10)
+    dwells_s: tuple[Wait_s, ...] = Field(default=(900.0, 1500.0, 2700.0), min_length=1, max_length=5)
+    ramp_K_per_min: float = Field(default=2.0, gt=0, le=20)
+    wait_s: float = Field(default=120.0, ge=5, le=3600)
+
+    @model_validator(mode="after")
+    def _dwells(self) -> Self:
+        if min(self.dwells_s) < _SHORTEST_DWELL_s:
+            raise ValueError(f"dwells_s has {min(self.dwells_s)}; a visit takes at least {_SHORTEST_DWELL_s:g} s")
+        return self
+
+
 def _settled(value: object) -> object:
     """`settled` alone takes the defaults, `{settled: {...}}` has some of its own."""
-    if value == "settled":
-        return Settled()
-    if isinstance(value, dict) and set(cast("dict[object, object]", value)) == {"settled"}:
-        return cast("dict[str, object]", value)["settled"]
-    if value is None or isinstance(value, Settled):
+    return _either(value, {"settled": Settled})
+
+
+def _settled_or_known(value: object) -> object:
+    return _either(value, {"settled": Settled, "known": Known})
+
+
+def _either(value: object, kinds: Mapping[str, type[Settled | Known]]) -> object:
+    if isinstance(value, str) and value in kinds:
+        return kinds[value]()
+    if isinstance(value, dict) and len(cast("dict[object, object]", value)) == 1:
+        ((name, given),) = cast("dict[object, object]", value).items()
+        if name in kinds:
+            return kinds[str(name)].model_validate(given)
+    if value is None or isinstance(value, tuple(kinds.values())):
         return value
-    raise ValueError(f"until takes `settled`, or `settled:` with thresholds, not {value!r}")
+    names = " or ".join(f"`{name}`" for name in kinds)
+    raise ValueError(f"until takes {names}, alone or with thresholds behind a colon, not {value!r}")
 
 
 class _UntilSettled(BaseModel):
@@ -76,6 +109,22 @@ class _UntilSettled(BaseModel):
 
 
 Until = Annotated[Settled | None, BeforeValidator(_settled, json_schema_input_type=_UntilSettled | Literal["settled"])]
+
+
+class _UntilKnown(BaseModel):
+    """As a recipe writes it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    known: Known
+
+
+UntilSettledOrKnown = Annotated[
+    Settled | Known | None,
+    BeforeValidator(
+        _settled_or_known, json_schema_input_type=_UntilSettled | _UntilKnown | Literal["settled"] | Literal["known"]
+    ),
+]
 
 
 def check_until(until: Settled | None, dwell_s: float, name: str = "dwell_s") -> None:

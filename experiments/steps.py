@@ -150,6 +150,35 @@ class Prompt:
     text: str
 
 
+@dataclass(frozen=True, slots=True)
+class Decide:
+    """Ask what to visit next, or whether enough is known: the answer replaces what is left of its cycle, which are
+    visits of `set_points_degC` for `dwell_s` each (experiments/known.py).
+
+    Wanted is a predicted residual of `residual_px` from `coldest_degC` to `warmest_degC`. No temperature outside is
+    visited, none of `held_out_degC` is shown to the fitter; of these `unvalidated_degC` have not been visited yet.
+    `dwells_s`: to choose from. `ramp_K_per_min`: of the chamber, at most. `left_s`: of the fixed cycle's time.
+    `visits`: that were decided so far. `wait_s`: for an answer, in real time; without one the fixed visits go on.
+    `frames`, `interval_s`, `exposure_s`: of a visit.
+    """
+
+    dwell_s: float
+    residual_px: float
+    coldest_degC: float
+    warmest_degC: float
+    dwells_s: tuple[float, ...]
+    ramp_K_per_min: float
+    left_s: float
+    visits: int
+    wait_s: float
+    frames: int
+    interval_s: float
+    exposure_s: float
+    set_points_degC: tuple[float, ...] = ()
+    held_out_degC: tuple[float, ...] = ()
+    unvalidated_degC: tuple[float, ...] = ()
+
+
 Step = (
     StartChamber
     | SetTemperature
@@ -164,6 +193,7 @@ Step = (
     | CoolDown
     | CheckHome
     | Prompt
+    | Decide
 )
 
 
@@ -172,7 +202,7 @@ AnySoak = Soak | SoakUntilSettled
 
 def is_setup(step: Step) -> bool:
     """Whether the step brings about a state, to be restored after an interruption; the others are work, done once."""
-    return not isinstance(step, AnySoak | CoolDown | Capture | CheckHome | Prompt)
+    return not isinstance(step, AnySoak | CoolDown | Capture | CheckHome | Prompt | Decide)
 
 
 def longest_s(soak: AnySoak) -> float:
@@ -184,6 +214,7 @@ def longest_s(soak: AnySoak) -> float:
 _FLAP_S = 3.0
 _MOVE_S = 15.0
 _CHECK_HOME_S = 120.0
+_DECIDE_S = 10.0
 _CAMERA_EXCESS_K = 20.0  # of a camera that has been on for an hour, over the air around it
 
 
@@ -204,6 +235,8 @@ def estimate_s(step: Step, camera_boot_s: float) -> float:
             return min(step.max_s, step.time_constant_s * max(0.0, math.log(_CAMERA_EXCESS_K / step.band_K)))
         case CheckHome():
             return _CHECK_HOME_S
+        case Decide():
+            return _DECIDE_S
         case StartChamber() | SetTemperature() | StopChamber() | Prompt():
             return 0.0
 
@@ -219,7 +252,7 @@ def kind_of(step: Step) -> str:
 
 
 def parameters_of(step: Step) -> dict[str, object]:
-    """The step's fields as JSON-able values; without the names of a capture's cameras when there are none."""
+    """The step's fields as JSON-able values; without those that list nothing, such as a capture's cameras."""
     values = {name: str(value) if isinstance(value, Role) else value for name, value in asdict(step).items()}
     return {name: value for name, value in values.items() if value != ()}
 

@@ -5,6 +5,9 @@ for the captures. Set-points listed as held out are recorded for validation and 
 
 With `until: settled` a dwell ends when the camera has settled, at the latest after `dwell_s`; the flap then opens for
 short looks at the target too.
+
+With `until: known` (experimental) the visits are decided one after the other, and the cycle ends when enough is known
+(experiments/known.py).
 """
 
 from __future__ import annotations
@@ -14,7 +17,16 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import Chamber_degC, FrameCount, StillTable, Until, Wait_s, check_until
+from experiments.known import MOST_VISITS, Frames, first_decision, fixed_visits
+from experiments.parameters import (
+    Chamber_degC,
+    FrameCount,
+    Known,
+    StillTable,
+    UntilSettledOrKnown,
+    Wait_s,
+    check_until,
+)
 from experiments.pieces import dwell, frames_through_flap, placed
 from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
 
@@ -27,7 +39,7 @@ class ThermalCycle(StillTable):
     set_points_degC: tuple[Chamber_degC, ...] = Field(min_length=1, max_length=1000)
     held_out_degC: tuple[Chamber_degC, ...] = Field(default=(), max_length=1000)
     dwell_s: Wait_s = 2700.0
-    until: Until = None
+    until: UntilSettledOrKnown = None
     cycles: int = Field(default=1, ge=1, le=100)
     reference_frames: FrameCount = 20
     frames_per_point: FrameCount = 1
@@ -39,7 +51,12 @@ class ThermalCycle(StillTable):
             raise ValueError(f"held_out_degC has {unvisited}, which set_points_degC never visits")
         if self.reference_degC in self.held_out_degC:
             raise ValueError(f"the reference {self.reference_degC} degC cannot be held out")
-        check_until(self.until, self.dwell_s)
+        if not isinstance(self.until, Known):
+            check_until(self.until, self.dwell_s)
+        elif self.visits > MOST_VISITS:
+            raise ValueError(f"until: known is for cycles of at most {MOST_VISITS} visits, this one has {self.visits}")
+        elif min(self.set_points_degC) == max(self.set_points_degC):
+            raise ValueError("until: known needs set_points_degC that span the range in which the model is wanted")
         return self
 
     @property
@@ -55,10 +72,26 @@ def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     yield StartChamber(parameters.reference_degC)
     yield Soak(parameters.equilibrium_s)
     yield from frames_through_flap(parameters, parameters.reference_frames, Role.REFERENCE, parameters.reference_degC)
+    if isinstance(parameters.until, Known):
+        yield from _deciding(parameters, parameters.until)
+        return
     for _ in range(parameters.cycles):
         for chamber_degC in parameters.set_points_degC:
             yield SetTemperature(chamber_degC)
             yield dwell(parameters.dwell_s, parameters.until, parameters.exposure_s, chamber_degC)
             role = Role.VALIDATION if chamber_degC in parameters.held_out_degC else Role.FIT
             yield from frames_through_flap(parameters, parameters.frames_per_point, role, chamber_degC)
+    yield StopChamber()
+
+
+def _deciding(parameters: ThermalCycle, known: Known) -> Iterator[Step]:
+    decide = first_decision(
+        known,
+        parameters.set_points_degC * parameters.cycles,
+        parameters.held_out_degC,
+        parameters.dwell_s,
+        Frames(parameters.frames_per_point, parameters.interval_s, parameters.exposure_s),
+    )
+    yield decide
+    yield from fixed_visits(decide)
     yield StopChamber()

@@ -9,6 +9,7 @@ from experiments.steps import (
     CheckHome,
     CloseFlap,
     CoolDown,
+    Decide,
     MoveTo,
     OpenFlap,
     PowerCamera,
@@ -53,6 +54,8 @@ def in_words(step: Step) -> str:
             return f"check the home of {step.axis}"
         case Prompt():
             return f"ask the operator: {step.text}"
+        case Decide():
+            return f"decide the next visit, until {1e3 * step.residual_px:g} mpx are predicted"
 
 
 def mark_in_words(kind: str, parameters: Mapping[str, object]) -> str:

@@ -30,7 +30,7 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     wanted = Wanted(
         (asked["coldest_degC"], asked["warmest_degC"]),
         asked["residual_px"],
-        tuple(asked["held_out_degC"]),
+        tuple(asked.get("held_out_degC", ())),
         tuple(asked["dwells_s"]),
         asked["ramp_K_per_min"],
     )

@@ -9,7 +9,7 @@ journal (recording/reading/journal_lines.py).
     Again     steps that were done are to be done again
     Skipped   a step is left out, or broken off, by an operator
     Extended  a soak is made longer by an operator
-    Edited    the steps from a place on are replaced by an operator
+    Edited    the steps from a place on are replaced, by an operator or by the plan's own decision
     Tripped   the guard has made the stand safe, and why
     Cleared   an operator has removed the cause of a trip
     Ended     complete, stopped by the operator, tripped, or failed
@@ -28,13 +28,15 @@ Instants are ns on the stand's clock, so a run in virtual time has the same jour
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, asdict, dataclass, fields
 from functools import cache
 from typing import Literal, cast
 
 from pydantic import TypeAdapter, ValidationError
 
+from experiments.steps import Step as PlanStep
+from experiments.steps import kind_of, parameters_of
 from foundation.errors import SessionError
 from recording.reading.journal_lines import JOURNAL_NAME, journal_line, lines_of
 
@@ -113,11 +115,16 @@ class Extended:
 
 @dataclass(frozen=True, slots=True)
 class Edited:
-    """The steps from the place `from_index` on are these instead, each its kind and its parameters (JSON-able)."""
+    """The steps from the place `from_index` on are these instead, each its kind and its parameters (JSON-able).
+
+    decided: the id of the step `Decide` whose decision this is, "" for an operator's change. reason: for a decision.
+    """
 
     time_ns: int
     from_index: int
     by: list[dict[str, object]]
+    decided: str = ""
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +195,7 @@ class Cooled:
 
 Written = Begun | Step | Dwell | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Cleared | Ended
 Entry = Written | Taken | Due | Readying | Restored | Cooled
-Change = Skipped | Extended | Edited  # of the plan, by an operator
+Change = Skipped | Extended | Edited  # of the plan
 
 _WRITTEN: dict[str, type[Written]] = {
     kind.__name__: kind
@@ -196,12 +203,19 @@ _WRITTEN: dict[str, type[Written]] = {
 }
 
 
+def edited(time_ns: int, from_index: int, steps: Iterable[PlanStep], decided: str = "", reason: str = "") -> Edited:
+    """The steps from a place on replaced by these."""
+    by: list[dict[str, object]] = [{"kind": kind_of(step), "parameters": parameters_of(step)} for step in steps]
+    return Edited(time_ns, from_index, by, decided, reason)
+
+
 _CHANGES: dict[object, type[Change]] = {kind.__name__: kind for kind in (Skipped, Extended, Edited)}
 
 
 def data_of(change: Change) -> dict[str, object]:
-    """The change of a plan as the recording has it, but for its instant."""
-    return {"change": type(change).__name__, **{name: v for name, v in asdict(change).items() if name != "time_ns"}}
+    """The change of a plan as the recording has it, but for its instant and what an operator's change has none of."""
+    left_out = {each.name for each in fields(change) if getattr(change, each.name) == each.default} | {"time_ns"}
+    return {"change": type(change).__name__, **{name: v for name, v in asdict(change).items() if name not in left_out}}
 
 
 def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
@@ -210,8 +224,9 @@ def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
     if kind is None:
         return None
     names = [each.name for each in fields(kind) if each.name != "time_ns"]
+    optional = {each.name for each in fields(kind) if each.default is not MISSING}
     try:
-        return kind(time_ns, **{name: data[name] for name in names})  # pyright: ignore[reportArgumentType] - as written
+        return kind(time_ns, **{name: data[name] for name in names if name in data or name not in optional})  # pyright: ignore[reportArgumentType] - as written
     except LookupError:
         return None
 

@@ -13,11 +13,13 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
 from contextlib import contextmanager
 
+from experiments.known import Undecided
 from experiments.steps import (
     Capture,
     CheckHome,
     CloseFlap,
     CoolDown,
+    Decide,
     MoveTo,
     OpenFlap,
     PlannedStep,
@@ -62,9 +64,9 @@ from stand.running.actions import (
     has_all_frames,
     next_action,
     next_due_ns,
-    worth_of_soaks,
 )
 from stand.running.camera_gap import OffsetWatch
+from stand.running.deciding import Decided, change_of_plan, fixed_plan
 from stand.running.entries import (
     Again,
     Change,
@@ -74,16 +76,17 @@ from stand.running.entries import (
     Edited,
     Extended,
     Readying,
-    Restored,
     Skipped,
     Step,
     Taken,
     data_of,
+    edited,
 )
 from stand.running.fold import after, change_text, refusal
 from stand.running.journal import Logbook
+from stand.running.restoring import restore
 from stand.running.settling_watch import SettlingWatch
-from stand.running.state import Plan, RunState, SetUp, duration_of
+from stand.running.state import Plan, RunState, duration_of
 from stand.stand import Stand
 
 _TRIES = 3  # to have all frames of a capture on the disk, beyond the first
@@ -95,7 +98,7 @@ class Executor:
 
     `flushed` returns when all that was published is on the disk. `settling` decides when a soak may end early,
     `offsets` gets what has settled. `allowed` raises ConfigError when this stand may not do a plan. `lost` says how
-    many frames of a capture are not on the disk.
+    many frames of a capture are not on the disk. `decider` makes the decisions of the plan.
     """
 
     def __init__(
@@ -109,6 +112,7 @@ class Executor:
         offsets: OffsetWatch,
         allowed: Callable[[Plan], object] = len,
         lost: Callable[[str], int] = lambda _: 0,
+        decider: Callable[[Decide], Awaitable[Decided]] = fixed_plan,
     ) -> None:
         self._stand = stand
         self._hub = hub
@@ -119,6 +123,7 @@ class Executor:
         self._offsets = offsets
         self._allowed = allowed
         self._lost = lost
+        self._decider = decider
         self._taken_again = Counter[str]()  # captures, by id, of which the disk has lost frames
         self._changed = asyncio.Event()  # set, and replaced, when the plan was changed
         if stand.imaging.supply.equilibrium.is_lost:
@@ -148,8 +153,7 @@ class Executor:
 
     async def edit(self, from_index: int, steps: Sequence[PlanStep]) -> None:
         """Replace the steps from the place `from_index` on, none of which was begun; else as `skip`."""
-        data: list[dict[str, object]] = [{"kind": kind_of(step), "parameters": parameters_of(step)} for step in steps]
-        await self._change(Edited(self._clock.now_ns(), from_index, data))
+        await self._change(edited(self._clock.now_ns(), from_index, steps))
 
     async def _change(self, change: Change) -> None:
         """Published before it is journaled, as everything that the recording needs."""
@@ -159,7 +163,8 @@ class Executor:
         self._allowed(changed.plan)
         if isinstance(change, Skipped) and (planned := self._state.step(change.step_id)):
             self._mark(planned, StepState.SKIPPED)
-        self._log.tell("warning", PLAN_CHANGED, change_text(self._state, change), {**data_of(change), **changed.size})
+        level = "info" if isinstance(change, Edited) and change.decided else "warning"
+        self._log.tell(level, PLAN_CHANGED, change_text(self._state, change), {**data_of(change), **changed.size})
         self._changed.set()
         self._changed = asyncio.Event()
         await self._log.write(change)
@@ -228,7 +233,7 @@ class Executor:
             case Wait():
                 await stand.gate.passed()
             case Restore(set_up):
-                await self._restore(set_up)
+                await restore(stand, self._log, self._clock, set_up, self._surroundings)
             case Earn(soak):
                 await self._earn(soak.step_id)
             case Equilibrate():
@@ -307,8 +312,23 @@ class Executor:
                 await stand.table.check_home(axis)
             case Prompt(text):
                 await self._unless_skipped(planned.step_id, stand.prompt(text))
+            case Decide():
+                await self._unless_skipped(planned.step_id, self._decide(planned, planned.step))
             case Soak() | SoakUntilSettled() | Capture():
                 pass  # are earned and taken
+
+    async def _decide(self, planned: PlannedStep, step: Decide) -> None:
+        """Not again after a kill between the decision and the end of the step."""
+        if self._state.is_decided(planned.step_id):
+            return
+        decided = await self._decider(step)
+        if isinstance(decided.answer, Undecided):
+            self._log.tell("warning", "undecided", f"{decided.reason}; the fixed plan goes on")
+        change = change_of_plan(self._state, planned, decided, self._clock.now_ns())
+        if change is None:
+            self._log.tell("warning", "undecided", "an operator has changed the plan; nothing more is decided about it")
+        else:
+            await self._change(change)
 
     async def _aim(self, capture: Capture) -> None:
         await self._stand.table.approach_again()
@@ -366,30 +386,6 @@ class Executor:
                 task.result()
         finally:
             await cancelled([task])
-
-    async def _restore(self, set_up: SetUp) -> None:
-        """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
-        stand, disturbances = self._stand, self._state.disturbances
-        await stand.imaging.close_flap()
-        for axis, position in set_up.positions.items():
-            await stand.gate.passed()
-            await stand.table.move_to(axis, position)
-        await stand.gate.passed()
-        if set_up.camera_on:
-            await stand.imaging.supply.restore()
-        else:
-            stand.imaging.supply.equilibrium.forget()
-            await stand.imaging.supply.switch_off()
-        if set_up.chamber_degC is not None:
-            await stand.gate.passed()
-            worth, now_ns = worth_of_soaks(self._state, set_up, self._surroundings()), self._clock.now_ns()
-            if worth.lost:
-                await self._log.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in worth.lost))
-            if worth.kind:
-                self._log.tell("warning" if worth.lost else "info", worth.kind, worth.text)
-            await stand.chamber.start(set_up.chamber_degC)
-        self._log.enter(Restored(self._clock.now_ns(), disturbances))
-        self._log.tell("info", "restored", set_up.text)
 
     def _on_lost_equilibrium(self) -> None:
         """The camera has to be brought back as well; in a plan that has it off that is nothing."""

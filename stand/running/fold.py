@@ -124,6 +124,8 @@ def refusal(state: RunState, change: Change) -> str:
 def change_text(state: RunState, change: Change) -> str:
     """The change of a plan, in words."""
     if isinstance(change, Edited):
+        if change.decided:
+            return f"{len(change.by)} steps are to come, decided: {change.reason}"
         return (
             f"the steps from number {change.from_index + 1} on are replaced by {len(change.by)} others by an operator"
         )

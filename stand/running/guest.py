@@ -26,6 +26,7 @@ from stand.estimating.night import price_night
 from stand.fault import Fault
 from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.running.camera_gap import OffsetGap, OffsetWatch, doubt
+from stand.running.deciding import Decider
 from stand.running.entries import Cleared, Ended, Gap, Written
 from stand.running.executor import Executor
 from stand.running.fold import fold
@@ -175,7 +176,16 @@ class Guest:
         leaving.callback(offsets.close)
         allowed = partial(check_plan, config=self.job.order.config)
         executor = Executor(
-            assembly.stand, hub, clock, log, recorder.flushed, settling, offsets, allowed, recorder.lost_of
+            assembly.stand,
+            hub,
+            clock,
+            log,
+            recorder.flushed,
+            settling,
+            offsets,
+            allowed,
+            recorder.lost_of,
+            Decider(recorder.directory, clock).decide,
         )
         leaving.callback(executor.close)
         return executor

@@ -25,7 +25,7 @@ from experiments.steps import (
     longest_s,
 )
 from foundation.clock import NS_PER_S, seconds_ns
-from stand.running.entries import Change, Ended
+from stand.running.entries import Change, Edited, Ended
 from stand.running.ids import Ids
 
 Plan = tuple[PlannedStep, ...]
@@ -122,6 +122,10 @@ class RunState:
     is_lost: bool = False
     tripped: str = ""
     ended: Ended | None = None
+
+    def is_decided(self, step_id: str) -> bool:
+        """Whether the decision of that step was made; it is not made again."""
+        return any(isinstance(change, Edited) and change.decided == step_id for change in self.changes)
 
     @property
     def is_disturbed(self) -> bool:

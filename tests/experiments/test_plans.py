@@ -84,7 +84,7 @@ def test_a_validation_waits_for_the_camera_too():
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        ({"until": "soon"}, "until takes `settled`, or `settled:` with thresholds, not 'soon'"),
+        ({"until": "soon"}, "until takes `settled` or `known`, alone or with thresholds behind a colon, not 'soon'"),
         ({"until": {"min_s": 900}}, "until takes `settled`"),
         ({"until": {"settled": {"drift": 1}}}, "Extra inputs"),
         ({"until": {"settled": {"window_s": 300}}}, "window_s 300.0 holds less than four looks every 120.0 s"),

@@ -18,6 +18,7 @@ from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
 from stand.imaging.equilibrium import LOST, CameraEquilibrium
 from stand.interlock import Interlocked
 from stand.running.camera_gap import OffsetWatch
+from stand.running.deciding import Decider, fixed_plan
 from stand.running.entries import Gap
 from stand.running.executor import Executor
 from stand.running.fold import fold
@@ -166,12 +167,14 @@ class SmallStand:
 
 
 class Life:
-    """One daemon, from its start to its death; what it leaves is in `folder`, and what it recorded in `disk`."""
+    """One daemon, from its start to its death; what it leaves is in `folder`, and what it recorded in `disk`. decides:
+    the module of the process that makes the plan's decisions."""
 
-    def __init__(self, folder: Path, plan, start_ns, disk, chamber_degC):
+    def __init__(self, folder: Path, plan, start_ns, disk, chamber_degC, decides=""):
         self.loop = asyncio.new_event_loop()
         self.wrong = []
         self.hub, self.clock = Hub(), VirtualClock(start_ns)
+        self._decider = Decider(folder, self.clock, decides).decide if decides else fixed_plan
         self.stop = Stop()
         self.stand = SmallStand(self.clock, self.hub, self.wrong)
         self.stand.gate.subscribe(self._on_gate)
@@ -205,7 +208,7 @@ class Life:
         stand = cast(Stand, self.stand)  # run_stand.py holds the one against the other
         settling = SettlingWatch(stand, self.hub, self.clock, TARGET)
         watches = settling, OffsetWatch(self.hub, self.clock)
-        self.executor = Executor(stand, self.hub, self.clock, self.log, self._flushed, *watches)
+        self.executor = Executor(stand, self.hub, self.clock, self.log, self._flushed, *watches, decider=self._decider)
         self._flap = asyncio.create_task(keep_shut_in_holds(stand, self.hub, self.clock))
         self.run = asyncio.create_task(self._run(self.executor))
 

@@ -1,0 +1,129 @@
+"""A thermal cycle that decides (`until: known`): its decisions as steps.
+
+The plan always holds a whole night: behind the step `Decide` stand the fixed visits that are left. A decision puts a
+visit, and the next `Decide`, before them, and takes as many of the fixed ones away as its time would have paid for: a
+night that gets no more decisions goes on with the fixed plan, and none takes much longer than that.
+
+Every third visit is followed by one of a held-out temperature, and those that are left are visited at the end: what
+compensation leaves there is measured in the same night.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from experiments.parameters import Known
+from experiments.steps import Capture, CloseFlap, Decide, OpenFlap, Role, SetTemperature, Soak, Step, estimate_s
+
+MOST_VISITS = 200
+_VALIDATED_AFTER = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Of a visit."""
+
+    count: int
+    interval_s: float
+    exposure_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A decision: a set-point that is new, and for how long it is held."""
+
+    chamber_degC: float
+    dwell_s: float
+
+
+class Enough:
+    """A decision: enough is known."""
+
+
+class Undecided:
+    """There was no decision; the fixed plan goes on."""
+
+
+Answer = Visit | Enough | Undecided
+
+
+def first_decision(
+    known: Known, set_points_degC: Sequence[float], held_out_degC: Sequence[float], dwell_s: float, frames: Frames
+) -> Decide:
+    """The step that begins a cycle of these fixed visits; it is followed by `fixed_visits`."""
+    decide = Decide(
+        set_points_degC=tuple(set_points_degC),
+        held_out_degC=tuple(held_out_degC),
+        unvalidated_degC=tuple(dict.fromkeys(held_out_degC)),
+        dwell_s=dwell_s,
+        residual_px=known.residual_px,
+        coldest_degC=min(set_points_degC),
+        warmest_degC=max(set_points_degC),
+        dwells_s=tuple(sorted(known.dwells_s)),
+        ramp_K_per_min=known.ramp_K_per_min,
+        left_s=0.0,
+        visits=0,
+        wait_s=known.wait_s,
+        frames=frames.count,
+        interval_s=frames.interval_s,
+        exposure_s=frames.exposure_s,
+    )
+    return replace(decide, left_s=_duration_s(fixed_visits(decide)))
+
+
+def fixed_visits(decide: Decide) -> tuple[Step, ...]:
+    """What follows a `Decide` in the plan: the visits that are made when nothing is decided."""
+    return tuple(step for degC in decide.set_points_degC for step in _visit(decide, degC, decide.dwell_s))
+
+
+def after_decision(decide: Decide, answer: Answer) -> tuple[Step, ...]:
+    """What follows that `Decide` instead of `fixed_visits`."""
+    match answer:
+        case Enough():
+            return _validations(decide, decide.unvalidated_degC)
+        case Undecided():
+            first, rest = decide.set_points_degC[:1], decide.set_points_degC[1:]
+            steps = tuple(step for degC in first for step in _visit(decide, degC, decide.dwell_s))
+            unvalidated = tuple(degC for degC in decide.unvalidated_degC if degC not in first)
+            left = replace(decide, set_points_degC=rest, unvalidated_degC=unvalidated)
+            return _continued(left, steps) if first else ()
+        case Visit(chamber_degC, dwell_s):
+            visits = decide.visits + 1
+            count = 1 if visits % _VALIDATED_AFTER == 0 else 0
+            now, later = decide.unvalidated_degC[:count], decide.unvalidated_degC[count:]
+            steps = (*_visit(decide, chamber_degC, dwell_s), *_validations(decide, now))
+            return _continued(replace(decide, visits=visits, unvalidated_degC=later), steps)
+
+
+def _continued(decide: Decide, steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """These steps, then the next decision and the fixed visits for which there is time behind them."""
+    left_s = max(0.0, decide.left_s - _duration_s(steps))
+    validations = _validations(decide, decide.unvalidated_degC)
+    longest_s = _duration_s(_visit(decide, decide.warmest_degC, max(decide.dwells_s)))
+    if left_s < _duration_s(validations) + longest_s:
+        return (*steps, *validations)
+    fixed = round(left_s / _duration_s(_visit(decide, decide.warmest_degC, decide.dwell_s)))
+    kept = decide.set_points_degC[max(0, len(decide.set_points_degC) - fixed) :]
+    following = replace(decide, set_points_degC=kept, left_s=left_s)
+    return (*steps, following, *fixed_visits(following))
+
+
+def _validations(decide: Decide, degC: Sequence[float]) -> tuple[Step, ...]:
+    dwell_s = decide.dwells_s[len(decide.dwells_s) // 2]
+    return tuple(step for each in degC for step in _visit(decide, each, dwell_s))
+
+
+def _visit(decide: Decide, chamber_degC: float, dwell_s: float) -> tuple[Step, ...]:
+    role = Role.VALIDATION if chamber_degC in decide.held_out_degC else Role.FIT
+    return (
+        SetTemperature(chamber_degC),
+        Soak(dwell_s),
+        OpenFlap(),
+        Capture(decide.frames, decide.interval_s, decide.exposure_s, role, chamber_degC),
+        CloseFlap(),
+    )
+
+
+def _duration_s(steps: Sequence[Step]) -> float:
+    return sum(estimate_s(step, 0.0) for step in steps)

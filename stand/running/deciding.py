@@ -1,0 +1,104 @@
+"""Asks for the decisions of a cycle that decides (experiments/known.py), as changes of the plan.
+
+The drift model is fitted in a process of its own, which runs behind everything else on the machine and reads what is
+on the disk. It is started for one decision and ended after it. One that is late, has ended or finds no answer leaves
+the fixed plan, and the change says so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.known import Answer, Enough, Undecided, Visit, after_decision, fixed_visits
+from experiments.steps import Decide, PlannedStep, kind_of, parameters_of
+from foundation.clock import Clock
+from foundation.errors import StandError
+from foundation.helper import Helper
+from foundation.lane import Lane
+from stand.running.entries import Edited, edited
+from stand.running.state import RunState
+
+MODULE = "compensation.design.process"  # by its name: the daemon imports nothing of it
+_LINE, _KEPT = "design", "design"
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """An answer and its reason, in words."""
+
+    answer: Answer
+    reason: str
+
+
+async def fixed_plan(decide: Decide) -> Decided:
+    """The decision where nobody decides."""
+    return Decided(Undecided(), "nobody decides here")
+
+
+class Decider:
+    """Of the run whose session is in `directory`. module: of the process."""
+
+    def __init__(self, directory: Path, clock: Clock, module: str = MODULE) -> None:
+        self._directory = directory
+        self._clock = clock
+        self._module = module
+
+    async def decide(self, decide: Decide) -> Decided:
+        """The decision, from what is on the disk; virtual time stands still meanwhile."""
+        try:
+            helper = Helper(self._module, (_LINE,), "the process that fits the drift model has ended")
+        except OSError as error:
+            return Decided(Undecided(), f"no process can be started that fits the drift model ({error.strerror})")
+        lane = Lane("design", self._clock, patient=False)
+        try:
+            async with asyncio.timeout(decide.wait_s):
+                return _decided(await lane.call(self._asked, helper, decide))
+        except TimeoutError:
+            return Decided(Undecided(), f"the drift model was not fitted within {decide.wait_s:g} s")
+        except (OSError, StandError, ValueError) as error:
+            return Decided(Undecided(), getattr(error, "strerror", None) or str(error))
+        finally:
+            lane.abandon()
+            helper.close()
+
+    def _asked(self, helper: Helper, decide: Decide) -> Mapping[str, Any]:
+        """In the lane."""
+        line = helper.line(_LINE)
+        line.make(_KEPT, importlib.import_module, self._module)
+        return line.call(_KEPT, "decided", str(self._directory), parameters_of(decide))
+
+
+def _decided(found: Mapping[str, Any]) -> Decided:
+    """ValueError, or another error, for what is no decision."""
+    reason = str(found["reason"])
+    match found["kind"]:
+        case "visit":
+            visit = Visit(float(found["chamber_degC"]), float(found["dwell_s"]))
+            if not (math.isfinite(visit.chamber_degC) and 0 < visit.dwell_s < math.inf):
+                raise ValueError(f"a visit of {visit.chamber_degC} degC for {visit.dwell_s} s was decided")
+            return Decided(visit, reason)
+        case "enough":
+            return Decided(Enough(), reason)
+        case _:
+            return Decided(Undecided(), reason)
+
+
+def change_of_plan(state: RunState, planned: PlannedStep, decided: Decided, time_ns: int) -> Edited | None:
+    """What the decision of the step `planned` makes of the plan; None when an operator has changed what it decides
+    about."""
+    step = planned.step
+    if not isinstance(step, Decide):
+        raise ValueError(f"{kind_of(step)} decides nothing")
+    first = planned.index + 1
+    fixed = fixed_visits(step)
+    there = tuple(each.step for each in state.plan[first : first + len(fixed)])
+    if there != fixed:
+        return None
+    steps = (*after_decision(step, decided.answer), *(each.step for each in state.plan[first + len(fixed) :]))
+    return edited(time_ns, first, steps, planned.step_id, decided.reason)

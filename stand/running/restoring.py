@@ -1,0 +1,39 @@
+"""Brings about again what the steps so far have set up, after something has undone it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from foundation.clock import Clock
+from stand.running.actions import Surroundings, worth_of_soaks
+from stand.running.entries import Dwell, Restored
+from stand.running.journal import Logbook
+from stand.running.state import SetUp
+from stand.stand import Stand
+
+
+async def restore(
+    stand: Stand, log: Logbook, clock: Clock, set_up: SetUp, surroundings: Callable[[], Surroundings]
+) -> None:
+    """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
+    disturbances = log.state.disturbances
+    await stand.imaging.close_flap()
+    for axis, position in set_up.positions.items():
+        await stand.gate.passed()
+        await stand.table.move_to(axis, position)
+    await stand.gate.passed()
+    if set_up.camera_on:
+        await stand.imaging.supply.restore()
+    else:
+        stand.imaging.supply.equilibrium.forget()
+        await stand.imaging.supply.switch_off()
+    if set_up.chamber_degC is not None:
+        await stand.gate.passed()
+        worth, now_ns = worth_of_soaks(log.state, set_up, surroundings()), clock.now_ns()
+        if worth.lost:
+            await log.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in worth.lost))
+        if worth.kind:
+            log.tell("warning" if worth.lost else "info", worth.kind, worth.text)
+        await stand.chamber.start(set_up.chamber_degC)
+    log.enter(Restored(clock.now_ns(), disturbances))
+    log.tell("info", "restored", set_up.text)

@@ -1,0 +1,27 @@
+"""Stands for the process that fits the drift model: its decisions are those of a file in the session, one for each
+number of visits; it notes what it was asked."""
+
+import json
+import os
+import sys
+import threading
+from pathlib import Path
+
+from foundation.helper_process import serve
+
+ANSWERS, ASKED = "answers.json", "asked.jsonl"
+
+
+def decided(session, asked):
+    with (Path(session) / ASKED).open("a") as file:
+        file.write(json.dumps(asked) + "\n")
+    found = json.loads((Path(session) / ANSWERS).read_text())[len((Path(session) / ASKED).read_text().splitlines()) - 1]
+    if found == "die":
+        os._exit(3)
+    if found == "hang":
+        threading.Event().wait(60.0)
+    return found
+
+
+if __name__ == "__main__":
+    serve([int(number) for number in sys.argv[2:]], "test-left")

@@ -1,0 +1,148 @@
+"""A thermal cycle whose visits are decided one after the other: live, after a kill, and without the process that
+decides. On a stand in memory."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments.known import Enough, Undecided, Visit, after_decision, fixed_visits
+from experiments.parameters import Known
+from experiments.steps import Capture, Decide, PlannedStep, Role, SetTemperature, Soak, Step, estimate_s, number_steps
+from experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from foundation.clock import NS_PER_S, WallClock
+from foundation.items import Event
+from foundation.readings import Frame
+from stand.running.deciding import Decider
+from stand.running.entries import Edited, read_lines
+from stand.running.fold import fold
+from stand.running.journal import JOURNAL_NAME
+from tests.stand.decisions_process import ANSWERS, ASKED
+from tests.stand.small_stand import Life
+
+CYCLE = ThermalCycle(
+    equilibrium_s=100.0,
+    set_points_degC=(30.0, 40.0, 50.0, 40.0, 30.0, 20.0, 10.0, 20.0),
+    held_out_degC=(40.0,),
+    dwell_s=600.0,
+    until=Known(dwells_s=(60.0, 120.0)),
+)
+PLAN = tuple(number_steps(thermal_cycle(CYCLE)))
+DECIDE = next(planned.step for planned in PLAN if isinstance(planned.step, Decide))
+START_NS = 1_767_290_400 * NS_PER_S
+ENOUGH = {"kind": "enough", "reason": "known to 4 mpx"}
+
+
+def visit(chamber_degC: float, dwell_s: float) -> dict[str, object]:
+    return {"kind": "visit", "chamber_degC": chamber_degC, "dwell_s": dwell_s, "reason": "it teaches most"}
+
+
+@pytest.fixture
+def life(tmp_path: Path):
+    """begin(answers): a daemon that runs PLAN, or resumes it; the last one is ended with the test."""
+    lives: list[Life] = []
+    disk: list[object] = []
+
+    def begin(*answers: object, start_ns: int = START_NS) -> Life:
+        if answers:
+            (tmp_path / ANSWERS).write_text(json.dumps(answers))
+        begun = Life(tmp_path, PLAN, start_ns, disk, 24.0, "tests.stand.decisions_process")
+        begun.told = []
+        begun.hub.subscribe(begun.told.append)
+        lives.append(begun)
+        return begun
+
+    yield begin
+    if not lives[-1].loop.is_closed():
+        lives[-1].kill()
+    assert not any(each.wrong for each in lives)
+
+
+def captured(plan: tuple[PlannedStep, ...]) -> list[tuple[float, Role]]:
+    return [(each.step.chamber_degC, each.step.role) for each in plan if isinstance(each.step, Capture)]
+
+
+def asked_times(folder: Path) -> int:
+    return len((folder / ASKED).read_text().splitlines())
+
+
+def test_visits_are_decided_until_enough_is_known(life: Callable[..., Life], tmp_path: Path):
+    here = life(visit(47.0, 120.0), visit(12.0, 60.0), visit(33.0, 60.0), ENOUGH)
+    here.passes(1500.0)
+    assert here.run.done()
+    assert not [item.text for item in here.told if isinstance(item, Event) and item.kind == "undecided"]
+    fit = [(47.0, Role.FIT), (12.0, Role.FIT), (33.0, Role.FIT)]
+    assert captured(here.log.state.plan) == [(24.0, Role.REFERENCE), *fit, (40.0, Role.VALIDATION)]
+    assert sum(isinstance(item, Frame) for item in here.told) == 20 + 4
+    entries, _ = read_lines((tmp_path / JOURNAL_NAME).read_bytes())
+    decisions = [entry for entry in entries if isinstance(entry, Edited)]
+    assert [each.reason for each in decisions] == ["it teaches most"] * 3 + ["known to 4 mpx"]
+    assert fold(PLAN, entries).plan == here.log.state.plan
+
+
+def test_a_killed_night_decides_the_same_and_asks_for_nothing_twice(life: Callable[..., Life], tmp_path: Path):
+    answers = visit(47.0, 120.0), visit(12.0, 60.0), visit(33.0, 60.0), ENOUGH
+    first = life(*answers)
+    while not (tmp_path / ASKED).exists():
+        first.passes(0.5)
+    killed_ns = first.kill()
+    entries, _ = read_lines((tmp_path / JOURNAL_NAME).read_bytes())
+    assert isinstance(entries[-1], Edited)  # the end of its step is not in the journal
+    second = life(start_ns=killed_ns + 5 * NS_PER_S)
+    assert captured(second.log.state.plan)[1] == (47.0, Role.FIT)
+    second.passes(400.0)
+    third = life(start_ns=second.kill() + 5 * NS_PER_S)
+    third.passes(1500.0)
+    assert third.run.done()
+    assert [degC for degC, _ in captured(third.log.state.plan)] == [24.0, 47.0, 12.0, 33.0, 40.0]
+    assert asked_times(tmp_path) == len(answers)
+
+
+def test_without_decisions_the_fixed_plan_goes_on_and_it_is_said(life: Callable[..., Life]):
+    here = life(visit(47.0, 120.0), "die", {"kind": "none", "reason": "too few frames"}, *["die"] * 8)
+    here.passes(8 * 700.0)
+    assert here.run.done()
+    assert [degC for degC, _ in captured(here.log.state.plan)] == [24.0, 47.0, *CYCLE.set_points_degC]
+    texts = [item.text for item in here.told if isinstance(item, Event) and item.kind == "undecided"]
+    assert texts[0] == "the process that fits the drift model has ended; the fixed plan goes on"
+    assert texts[1] == "too few frames; the fixed plan goes on"
+
+
+async def test_a_late_decision_is_not_waited_for(tmp_path: Path):
+    (tmp_path / ANSWERS).write_text('["hang"]')
+    decider = Decider(tmp_path, WallClock(), "tests.stand.decisions_process")
+    decided = await decider.decide(replace(DECIDE, wait_s=0.5))
+    assert isinstance(decided.answer, Undecided)
+    assert decided.reason == "the drift model was not fitted within 0.5 s"
+
+
+def total_s(steps: tuple[Step, ...]) -> float:
+    return sum(estimate_s(step, 0.0) for step in steps if not isinstance(step, Decide))
+
+
+@pytest.mark.parametrize("answer", [Visit(47.0, 120.0), Visit(11.0, 60.0), Undecided()])
+def test_no_course_of_decisions_takes_much_longer_than_the_fixed_cycle(answer: Any):
+    steps: tuple[Step, ...] = (DECIDE, *fixed_visits(DECIDE))
+    gone: list[Step] = []
+    while steps:
+        step, *rest = steps
+        if isinstance(step, Decide):
+            assert tuple(rest) == fixed_visits(step)
+            steps = after_decision(step, answer)
+        else:
+            gone.append(step)
+            steps = tuple(rest)
+    assert total_s(tuple(gone)) < 1.1 * total_s(fixed_visits(DECIDE))
+    held_out = [step for step in gone if isinstance(step, Capture) and step.role is Role.VALIDATION]
+    assert held_out
+    assert all(step.chamber_degC == 40.0 for step in held_out)
+
+
+def test_enough_ends_the_cycle_with_what_was_not_validated():
+    steps = after_decision(DECIDE, Enough())
+    assert [step for step in steps if isinstance(step, SetTemperature | Soak)] == [SetTemperature(40.0), Soak(120.0)]
+    assert not math.isnan(DECIDE.left_s)

@@ -1,0 +1,56 @@
+"""A thermal cycle that decides, over every wire in virtual time: the drift model is fitted in its own process from what
+the night has recorded so far."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from experiments.steps import Capture, Decide, parameters_of
+from foundation.clock import WallClock
+from recording.reading.session import Session
+from stand.running.deciding import MODULE, Decider
+from stand.running.entries import Edited, read_lines
+from stand.running.order import Order
+from stand.running.run import run_virtual
+from tests.system.conftest import WHOLE_SENSOR, require_aravis
+
+pytestmark = pytest.mark.nightly
+
+RECIPE = """
+name: known
+experiments:
+  - thermal_cycle:
+      table_position: {linear: 0, rotary: 0}
+      equilibrium_s: 900
+      set_points_degC: [28, 34, 28, 20, 14, 20, 24]
+      held_out_degC: [28]
+      dwell_s: 1200
+      until: {known: {residual_px: 5.0, dwells_s: [600, 900]}}
+      reference_frames: 3
+      frames_per_point: 1
+"""
+
+
+async def test_a_night_decides_from_what_it_has_recorded(tmp_path: Path, order: Callable[..., Order]):
+    require_aravis()
+    session = Session.open(await run_virtual(order(RECIPE, camera=WHOLE_SENSOR), tmp_path, 3, lambda _: None))
+    entries, _ = read_lines((session.path / "journal.jsonl").read_bytes())
+    decisions = [entry for entry in entries if isinstance(entry, Edited)]
+    assert len(decisions) > 3
+    assert not [event.text for event in session.events() if event.kind == "undecided"]
+    visited = [mark.parameters["chamber_degC"] for mark in session.steps() if mark.kind == Capture.__name__]
+    assert {14.0, 34.0} < set(visited)
+    assert "mpx are wanted" in decisions[-1].reason or len(visited) > 5
+
+
+async def test_the_same_frames_are_decided_the_same(tmp_path: Path, order: Callable[..., Order]):
+    require_aravis()
+    short = RECIPE.replace("[28, 34, 28, 20, 14, 20, 24]", "[28, 34, 14]")
+    given = order(short, camera=WHOLE_SENSOR)
+    session = await run_virtual(given, tmp_path, 3, lambda _: None)
+    decide = next(planned.step for planned in given.recipe.plan() if isinstance(planned.step, Decide))
+    assert parameters_of(decide)["residual_px"] == 5.0
+    decider = Decider(session, WallClock(), MODULE)
+    first, second = await decider.decide(decide), await decider.decide(decide)
+    assert (type(first.answer), first.reason) == (type(second.answer), second.reason)
