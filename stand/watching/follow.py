@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from experiments.words import mark_in_words
 from foundation.clock import NS_PER_S, seconds_ns
-from foundation.items import Batch, Event, Item, StepMark
+from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality
 from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
 from stand.estimating.eta import Eta
@@ -71,6 +71,8 @@ class Follow:
                 self._moment = replace(self._moment, step=item.index + 1, steps=self.eta.count, doing=doing)
                 self._begin_ns = item.time_ns if self._begin_ns is None else self._begin_ns
                 self._next_ns = item.time_ns
+            case Original():
+                return
         if self._begin_ns is not None and item.time_ns >= self._next_ns:
             self._show_at(item.time_ns, self._begin_ns)
 
