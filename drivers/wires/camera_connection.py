@@ -337,14 +337,14 @@ class Connection:
         self._stream_counts = now
 
     def _stand_ns(self, timestamp_ns: int) -> int | None:
-        """The camera's time stamp on the stand's clock, None when it is not to be believed: 0, not after the one
-        before, or in the future. The clocks are compared again before the next frame then."""
+        """The camera's time stamp on the stand's clock, None when it is not to be believed: 0, before the last
+        one, or in the future. The clocks are compared again before the next frame then."""
         if self._offset_ns is None:
             return None
         earlier_ns, self._stamped_ns = self._stamped_ns, timestamp_ns
         time_ns = timestamp_ns + self._offset_ns
         is_ahead = time_ns > self._clock.now_ns() + seconds_ns(self._exposure_s) + FUTURE_NS
-        if timestamp_ns <= earlier_ns or is_ahead:
+        if timestamp_ns == 0 or timestamp_ns < earlier_ns or is_ahead:
             self._counts["bad_time_stamps"] += 1
             self._latched_at_ns = 0
             return None

@@ -89,6 +89,7 @@ async def test_a_time_stamp_that_cannot_be_is_counted_and_the_frame_has_the_trig
     clock, fake = wired
     async with opened(clock) as camera:
         await grabbed(camera, clock, 2)
+        await clock.sleep_until(clock.now_ns() + 60 * NS_PER_S)
         fake.faults.stamp = stamp  # pyright: ignore[reportAttributeAccessIssue] - one of the two
         assert all(map(is_right, await grabbed(camera, clock, 3)))
         assert camera.counters()["bad_time_stamps"] == 3
