@@ -10,6 +10,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from foundation.readings import Quality
 from stand.serving.desk import ReadingState, StandState
 from tests.addresses import free_port
 
@@ -21,8 +22,10 @@ _DATA = struct.Struct("<BIQ")  # opcode, subscription, time
 
 def state(air_degC: float, time_ns: int) -> StandState:
     readings = {
-        "thermometers.air": ReadingState(value=air_degC, unit="degC", quality="good", time_ns=time_ns),
-        "thermometers.granite": ReadingState(value=None, unit="degC", quality="bad", time_ns=time_ns, reason="broken"),
+        "thermometers.air": ReadingState(value=air_degC, unit="degC", quality=Quality.GOOD, time_ns=time_ns),
+        "thermometers.granite": ReadingState(
+            value=None, unit="degC", quality=Quality.BAD, time_ns=time_ns, reason="broken"
+        ),
     }
     return StandState(
         stand="a stand",
