@@ -1,6 +1,6 @@
 """The simulated laboratories of the tests are forked from one process that has their modules loaded: a start then
-does without the 0.44 s of processor time that importing them takes. What a person starts is a program of its own, and so
-are those that other programs of the tests start."""
+does without the 0.44 s of processor time that importing them takes. What a person starts is a program of its own, and
+so are those that other programs of the tests start."""
 
 from __future__ import annotations
 
