@@ -84,8 +84,15 @@ def _fault(step: object) -> str:
         value = getattr(step, name)
         if name in ("axis", "text", "role", "on"):
             continue
-        least = _AT_LEAST.get(name, 0.0 if name.endswith("_s") else -math.inf)
-        if not isinstance(value, float | int) or not math.isfinite(value) or value < least:
+        if name == "cameras":
+            is_right = isinstance(value, tuple) and all(
+                isinstance(each, str) for each in cast("Iterable[object]", value)
+            )
+        else:
+            least = _AT_LEAST.get(name, 0.0 if name.endswith("_s") else -math.inf)
+            numbers = cast("tuple[object, ...]", value) if isinstance(value, tuple) else (value,)
+            is_right = all(isinstance(each, float | int) and least <= each < math.inf for each in numbers)
+        if not is_right:
             return f"({kind_of(step)}) has {name} {value!r}"
     return ""
 

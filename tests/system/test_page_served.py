@@ -9,7 +9,7 @@ import pytest
 
 from tests.stand.browser import a_page, browser, needs_chromium
 from tests.stand.page_desk import free_port
-from tests.system.test_daemon import Served, laboratory  # noqa: F401 - a fixture
+from tests.system.test_daemon import Served
 
 pytestmark = needs_chromium
 
@@ -37,7 +37,7 @@ class ServedPage(Served):
 
 
 @pytest.fixture
-def served_page(tmp_path, laboratory):  # noqa: F811
+def served_page(tmp_path, laboratory):
     started, port = [], free_port()
 
     def start():

@@ -51,9 +51,11 @@ export class Queue {
   }
 
   async choose() {
-    this.installed = this.choice.value;
+    const wanted = this.choice.value;
     try {
-      const recipe = await get(`/recipes/${encodeURIComponent(this.installed)}`);
+      const recipe = await get(`/recipes/${encodeURIComponent(wanted)}`);
+      if (this.choice.value !== wanted) return;  // another was chosen meanwhile, whose answer may have come first
+      this.installed = wanted;
       this.about.textContent = recipe.description ?? "";
       this.form.load(recipe);
       this.unchanged = JSON.stringify(this.form.recipe());
