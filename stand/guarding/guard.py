@@ -149,8 +149,11 @@ class Guard:
         self._endings_ns = [time_ns for time_ns in self._endings_ns if now_ns - time_ns < seconds_ns(3600)]
         data: dict[str, object] = {"rule": fault.rule, "endings_in_last_h": len(self._endings_ns)}
         if self.release is None or len(self._endings_ns) >= _ENDINGS_PER_H:
-            text = f"this has held the stand more than {_ENDINGS_PER_H} times in an hour; `stand clear` continues"
-            self.held = Fault(fault.rule, f"{fault.text}; {text}", fault.action)
+            text = (
+                f"{fault.text}; this has held the stand more than {_ENDINGS_PER_H} times in an hour, so it stays held: "
+                "`stand clear` continues"
+            )
+            self.held = Fault(fault.rule, text, fault.action)
             self.hub.publish(Event(now_ns, "error", "hold_stays", text, data))
             self._notify(text)
             return
