@@ -123,10 +123,18 @@ class Moves:
 
     async def cameras(self) -> None:
         """Frames as fast as they come, and the temperature behind them; a supply that was off is off again at the
-        end."""
-        devices, supply = self._assembly.devices, self._assembly.stand.imaging.supply
-        if not devices.cameras:
+        end, also when an operator breaks the check off: it is then made safe with what moved."""
+        stand = self._assembly.stand
+        if not self._assembly.devices.cameras:
             return
+        try:
+            await self._supplied_cameras()
+        finally:
+            if stand.imaging.supply.was_on is False:
+                stand.safety.take(stand.imaging.supply)
+
+    async def _supplied_cameras(self) -> None:
+        devices, supply = self._assembly.devices, self._assembly.stand.imaging.supply
         try:
             await supply.switch_on()
         except Superseded:
