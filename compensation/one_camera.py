@@ -34,6 +34,18 @@ def serial_of(session: Session) -> str:
     return serials[names.index(session.camera)] if session.camera in names and len(names) == len(serials) else text
 
 
+def name_of(session: Session, serial: str) -> str | None:
+    """The camera of a session of several that has this serial number; None when no single one has."""
+    names, serials = _names(session), session.metadata.get("camera_serial", "").split(", ")
+    return names[serials.index(serial)] if len(names) == len(serials) > 1 and serials.count(serial) == 1 else None
+
+
+def own_frames(session: Session) -> list[int]:
+    """The numbers of the camera's frames among all of the session."""
+    others = others_ns(session)
+    return [number for number, time_ns in enumerate(session.frame_times_ns.tolist()) if time_ns not in others]
+
+
 def _names(session: Session) -> tuple[str, ...]:
     channels = dict.fromkeys(meta.channel for _, meta in session.frame_metas)
     return tuple(channel.removesuffix(".image") for channel in channels)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, TypeVar, cast
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any, TypeVar, cast, get_type_hints
 
 import typer
 
@@ -36,14 +37,33 @@ class App(typer.Typer):
     def command(
         self, name: str | None = None, *, has_json: bool = True, **settings: Any
     ) -> Callable[[Function], Function]:
-        """As typer has it."""
+        """As typer has it; a parameter that is a dataclass is given by options, one for each of its fields."""
         register = super().command(name, **settings)
 
         def take(function: Function) -> Function:
-            register(_with_common(function, has_json=has_json))
+            register(_with_common(_with_groups(function), has_json=has_json))
             return function
 
         return take
+
+
+def _with_groups(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` with the options of its groups instead of them."""
+    for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
+        if is_dataclass(parameter.annotation):
+            function = _with_group(function, name, cast("type[Any]", parameter.annotation))
+    return function
+
+
+def _with_group(function: Callable[..., Any], group: str, kind: type[Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def command(*args: Any, **options: Any) -> Any:
+        chosen = {field.name: options.pop(field.name) for field in fields(kind)}
+        return function(*args, **options, **{group: kind(**chosen)})
+
+    hints = get_type_hints(kind, include_extras=True)
+    added = {field.name: (hints[field.name], field.default) for field in fields(kind)}
+    return with_parameters(command, function, added, without=group)
 
 
 def _with_common(function: Callable[..., Any], *, has_json: bool) -> Callable[..., Any]:

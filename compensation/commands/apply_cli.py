@@ -17,12 +17,13 @@ from compensation.apply.export import export
 from compensation.apply.images import Form, corrected_image, middle_flags, write_image
 from compensation.apply.points import CAMERA, X, Y, numbers, outside_text, read_points, times, write_corrected
 from compensation.apply.ros2_package import export_ros2
-from compensation.commands.options import Incomplete, said_if
+from compensation.commands.options import CameraName, Incomplete, open_session
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
 from compensation.history.history import recorded_history, states_at
 from compensation.history.states import States
+from compensation.one_camera import name_of, own_frames, take
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import one_line_errors
@@ -31,12 +32,11 @@ from foundation.output import say, show
 from foundation.progress import progress
 from markers.image_file import read_image
 from recording.reading.session import Session
-from recording.reading.using import open_whole
 
 app = App()
 
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")]
-CameraOption = Annotated[
+TemperatureOption = Annotated[
     float | None, typer.Option("--camera-degC", help="The camera's own temperature, where it was not recorded.")
 ]
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -54,19 +54,21 @@ def apply_model(
     time: Annotated[
         str | None, typer.Option(help="Of an image: when it was taken, UTC (2026-01-01T18:00:00) or time_ns.")
     ] = None,
-    camera_degC: CameraOption = None,
+    camera_degC: TemperatureOption = None,
     frames: Annotated[
         str | None, typer.Option(metavar="FIRST:END", help="Of a session: these frames, counted from 0, without END.")
     ] = None,
     form: Annotated[
         Form, typer.Option("--format", help="Of images: tiff is float32, png rounded to the original's bits.")
     ] = "tiff",
+    camera: CameraName = None,
     incomplete: Incomplete = False,
 ) -> None:
     """Put points or images where they would have been at the reference temperature.
 
     A table gets columns: corrected place, covariance of the correction, and why it is an extrapolation, if it is. For
-    measurement correct points; images are for software that wants pixels.
+    measurement correct points; images are for software that wants pixels. Of a session of several cameras it is the
+    model's own, or --camera.
 
     Example: compensate apply model.json markers.csv --session sessions/20260101T180000Z-thermal-cycle -o corrected.csv
     """
@@ -75,22 +77,29 @@ def apply_model(
         if source.is_dir():
             own = "a session has temperatures of its own"
             _refuse(("--session", session), ("--camera-degC", camera_degC), ("--time", time), why=own)
-            _correct_session(used, open_whole(source, said_if(incomplete)), out, frames, form)
+            _correct_session(used, _opened(source, used, camera, incomplete), out, frames, form)
         elif source.suffix.lower() == ".csv":
             _refuse(("--frames", frames), why="it selects frames of a session")
             _refuse(("--time", time), why="the points have a column time_ns")
             check_writable(out)
-            recorded = None if session is None else open_whole(session, said_if(incomplete))
+            recorded = None if session is None else _opened(session, used, camera, incomplete)
             _correct_points(used, source, out, recorded, camera_degC)
         else:
             _refuse(("--frames", frames), why="it selects frames of a session")
-            recorded = None if session is None else open_whole(session, said_if(incomplete))
+            recorded = None if session is None else _opened(session, used, camera, incomplete)
             used, states = _of_image(used, source, recorded, time, camera_degC)
             check_writable(out)
             image = read_image(source)
             write_image(out, corrected_image(image, used, states), form, image.dtype)
             _warn(middle_flags(used, states))
         show({"out": out}, ())
+
+
+def _opened(path: Path, model: DriftModel, camera: str | None, incomplete: bool) -> Session:
+    session = open_session(path, camera, incomplete)
+    if camera is None:
+        take(session, name_of(session, model.facts.camera_serial))
+    return session
 
 
 def _of_image(
@@ -213,8 +222,9 @@ def _check_known(model: DriftModel, xy_px: np.ndarray[tuple[int, ...], np.dtype[
 
 
 def _correct_session(model: DriftModel, session: Session, out: Path, frames: str | None, form: Form) -> None:
-    selected = _selected(frames, session.frame_count)
-    states = _recorded_states(model, session, session.frame_times_ns[selected.start : selected.stop].tolist())
+    own = own_frames(session)
+    selected = [own[index] for index in _selected(frames, len(own))]
+    states = _recorded_states(model, session, session.frame_times_ns[selected].tolist())
     try:
         out.mkdir()
     except OSError as error:
@@ -241,7 +251,7 @@ def _selected(frames: str | None, count: int) -> range:
         raise ConfigError(f"--frames {frames}: give FIRST:END, such as 0:10")
     selected = range(int(first or 0), int(end or count))
     if not selected or selected.stop > count:
-        raise ConfigError(f"--frames {frames}: the session has {count} frames, counted from 0")
+        raise ConfigError(f"--frames {frames}: the session has {count} frames of the camera, counted from 0")
     return selected
 
 

@@ -10,14 +10,14 @@ import typer
 
 from compensation.budget.budget import Budget, budget, table
 from compensation.budget.geometry import load_geometry
-from compensation.commands.options import Incomplete, TargetOption, named_target, said_if
+from compensation.commands.options import CameraName, Incomplete, TargetOption, named_target, open_session
 from compensation.observations import session_target
+from compensation.one_camera import take
 from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
 from foundation.output import show
 from markers.target import Target
 from recording.reading.session import Session
-from recording.reading.using import open_whole
 
 app = App()
 
@@ -27,6 +27,7 @@ def budget_of_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded session.")],
     geometry: Annotated[str, typer.Option(help="The stand's geometry: a file, or the installed `paper`.")] = "paper",
     target: TargetOption = None,
+    camera: CameraName = None,
     incomplete: Incomplete = False,
 ) -> None:
     """The stand's error budget: refraction, granite, target and table, in um and px, with uncertainty.
@@ -35,15 +36,19 @@ def budget_of_session(
     """
     with one_line_errors():
         stand = load_geometry(geometry)
-        recorded = open_whole(session, said_if(incomplete))
+        recorded = open_session(session, camera, incomplete)
         found = budget(recorded, named_target(target) or session_target(recorded), stand)
         show(found, [table(found)])
 
 
-def budgets_of_sessions(paths: Sequence[Path], geometry: str, target: Target | None) -> dict[str, Budget]:
+def budgets_of_sessions(
+    paths: Sequence[Path], camera: str | None, geometry: str, target: Target | None
+) -> dict[str, Budget]:
     """The budget of each session, by its name. SessionError or ConfigError with a sentence."""
     stand = load_geometry(geometry)
     opened = [Session.open(path) for path in paths]
+    for session in opened:
+        take(session, camera)
     return {
         session.metadata.get("session_id", ""): budget(session, target or session_target(session), stand)
         for session in opened

@@ -14,8 +14,9 @@ from compensation.calibration.exports import EXPORTS, refit_radtan, write_export
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.positions import observe_positions
 from compensation.calibration.stages import TableSigma
-from compensation.commands.options import Incomplete, TargetOption, named_target, said_if
+from compensation.commands.options import CameraName, Incomplete, TargetOption, named_target, open_session
 from compensation.observations import session_target
+from compensation.one_camera import serial_of
 from compensation.reporting.calibration_report import report_page
 from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
@@ -24,7 +25,6 @@ from foundation.output import show
 from foundation.progress import progress
 from markers.target import Target
 from recording.reading.session import Session
-from recording.reading.using import open_whole
 
 app = App()
 
@@ -51,6 +51,7 @@ def calibrate_session(
     ),
     straightness_um: Annotated[float, typer.Option(min=0, help="Of the table across its axis; 0: straight.")] = 0.0,
     wobble_arcmin: Annotated[float, typer.Option(min=0, help="Of the table's tilt; 0: none.")] = 0.0,
+    camera: CameraName = None,
     incomplete: Incomplete = False,
 ) -> None:
     """Calibrate the camera: pinhole and ray model, with board and table adjusted within their uncertainties.
@@ -63,7 +64,7 @@ def calibrate_session(
                 check_writable(path)
         if export is not None:
             check_folder_writable(export, EXPORTS)
-        opened = open_whole(session, said_if(incomplete))
+        opened = open_session(session, camera, incomplete)
         used = named_target(target) or session_target(opened)
         sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)
         with progress("find markers", opened.frame_count) as shown:
@@ -107,7 +108,7 @@ def summary(file: CameraFile, target: Target) -> str:
 def _file(session: Session, target_name: str, found: Calibration) -> CameraFile:
     return camera_file(
         found,
-        camera_serial=session.metadata.get("camera_serial", ""),
+        camera_serial=serial_of(session),
         session_ids=(session.metadata.get("session_id", ""),),
         target_name=target_name,
         software_version=importlib.metadata.version("thermostand"),

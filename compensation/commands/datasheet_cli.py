@@ -7,17 +7,7 @@ from typing import Annotated
 
 import typer
 
-from compensation.commands.observed import observed
-from compensation.commands.options import (
-    AcrossGap,
-    Cache,
-    CameraName,
-    Cluster,
-    DetailsOption,
-    Incomplete,
-    TargetOption,
-    Workers,
-)
+from compensation.commands.options import CameraName, DetailsOption, Finding
 from compensation.datasheet.datasheet import datasheet
 from compensation.datasheet.details import load_details
 from compensation.drift.choosing import fit
@@ -43,13 +33,9 @@ def write_datasheet(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.html|pdf|json", help="The file to write.")],
     model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
     details: DetailsOption = None,
-    target: TargetOption = None,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    cache: Cache = True,
-    across_gap: AcrossGap = False,
-    incomplete: Incomplete = False,
     camera: CameraName = None,
+    *,
+    finding: Finding,
 ) -> None:
     """Write a camera's thermal datasheet: px/K and ppm/K, settling, hysteresis, what each form of compensation leaves,
     each with its expanded uncertainty and the budget it comes from.
@@ -62,16 +48,7 @@ def write_datasheet(
         check_writable(out)
         stated = load_details(details)
         given = None if model is None else load_model(model)
-        observations = observed(
-            sessions,
-            target,
-            workers,
-            cluster,
-            cache=cache,
-            across_gap=across_gap,
-            incomplete=incomplete,
-            camera=camera,
-        )
+        observations = finding.observed(sessions, camera)
         sheet = datasheet(observations, given or fit(observations), stated)
         equipment = equipment_of(Session.open(sessions[0]))
         if out.suffix.lower() == ".json":

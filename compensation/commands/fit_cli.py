@@ -9,18 +9,7 @@ import typer
 
 from compensation.centres_table import observations_of_table
 from compensation.commands.budget_cli import budgets_of_sessions
-from compensation.commands.observed import observed
-from compensation.commands.options import (
-    AcrossGap,
-    Cache,
-    CameraName,
-    Cluster,
-    DetailsOption,
-    Incomplete,
-    TargetOption,
-    Workers,
-    named_target,
-)
+from compensation.commands.options import CameraName, DetailsOption, Finding, named_target
 from compensation.datasheet.details import load_details
 from compensation.drift.bump import Bump
 from compensation.drift.choosing import Form, check_request
@@ -70,13 +59,9 @@ def fit(
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
     form: FormOption = None,
     degree: DegreeOption = None,
-    target: TargetOption = None,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    cache: Cache = True,
-    across_gap: AcrossGap = False,
-    incomplete: Incomplete = False,
     camera: CameraName = None,
+    *,
+    finding: Finding,
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
@@ -91,16 +76,7 @@ def fit(
         if any(path.suffix.lower() == ".csv" for path in sessions):
             observations = _of_table(sessions)
         else:
-            observations = observed(
-                sessions,
-                target,
-                workers,
-                cluster,
-                cache=cache,
-                across_gap=across_gap,
-                incomplete=incomplete,
-                camera=camera,
-            )
+            observations = finding.observed(sessions, camera)
         model = fit_model(observations, degree, form)
         evaluation = evaluate(model, observations)
         save_model(model, out)
@@ -138,11 +114,16 @@ def _of_table(paths: list[Path]) -> Observations:
 
 
 def _extras(
-    sessions: list[Path], budget: str | None, target: str | None, validation: Path | None, details: Path | None
+    sessions: list[Path],
+    camera: str | None,
+    budget: str | None,
+    target: str | None,
+    validation: Path | None,
+    details: Path | None,
 ) -> Extras:
     return Extras(
         details=load_details(details),
-        budgets={} if budget is None else budgets_of_sessions(sessions, budget, named_target(target)),
+        budgets={} if budget is None else budgets_of_sessions(sessions, camera, budget, named_target(target)),
         positions=table_positions([Session.open(path).steps() for path in sessions]),
         validation=None if validation is None else load_validation(validation),
         equipment=equipment_of(Session.open(sessions[0])),
@@ -161,13 +142,9 @@ def report(
         Path | None, typer.Option(help="With the result of `compensate validate`: the JSON file beside its page.")
     ] = None,
     details: DetailsOption = None,
-    target: TargetOption = None,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    cache: Cache = True,
-    across_gap: AcrossGap = False,
-    incomplete: Incomplete = False,
     camera: CameraName = None,
+    *,
+    finding: Finding,
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
@@ -177,17 +154,11 @@ def report(
     """
     with one_line_errors():
         check_report_writable(out, model, validation)
-        given, extras = model and load_model(model), _extras(sessions, budget, target, validation, details)
-        observations = observed(
-            sessions,
-            target,
-            workers,
-            cluster,
-            cache=cache,
-            across_gap=across_gap,
-            incomplete=incomplete,
-            camera=camera,
+        given, extras = (
+            model and load_model(model),
+            _extras(sessions, camera, budget, finding.target, validation, details),
         )
+        observations = finding.observed(sessions, camera)
         if given is None:
             used, evaluation, refusal = fitted(observations)
         else:

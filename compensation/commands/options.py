@@ -1,17 +1,24 @@
-"""What the commands of `compensate` share: options, and the target they are given."""
+"""What the commands of `compensate` share: their options, and the sessions, targets and markers these name."""
 
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from compensation.finding.found import finder
+from compensation.observations import Observations, observe
+from compensation.one_camera import take
 from foundation.errors import ConfigError
 from foundation.output import say
+from foundation.progress import progress
 from markers.target import Target, load_target
+from recording.reading.session import Session
+from recording.reading.using import Say, open_whole
 
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
@@ -23,19 +30,43 @@ DetailsOption = Annotated[
     Path | None,
     typer.Option(help="A file that states what no recording knows: lens, certificates, places of sensors, u_air_K."),
 ]
-AcrossGap = Annotated[
-    bool,
-    typer.Option(
-        "--across-gap",
-        help="Use frames from before and after a gap together, though camera minus air has changed in it.",
-    ),
-]
 Incomplete = Annotated[bool, typer.Option("--incomplete", help="Use a session although part of it is missing.")]
-Workers = Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")]
-Cluster = Annotated[
-    str | None, typer.Option("--cluster", help="A Dask scheduler, host:port, whose workers see the same files.")
-]
-Cache = Annotated[bool, typer.Option("--cache/--no-cache", help="Keep the markers found, and reuse those kept.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """How a command finds the markers of the sessions it is given."""
+
+    target: TargetOption = None
+    workers: Annotated[int, typer.Option("--workers", help="Processes that look for markers, side by side.")] = 1
+    cluster: Annotated[
+        str | None, typer.Option("--cluster", help="A Dask scheduler, host:port, whose workers see the same files.")
+    ] = None
+    cache: Annotated[bool, typer.Option("--cache/--no-cache", help="Keep the markers found, and reuse those kept.")] = (
+        True
+    )
+    across_gap: Annotated[
+        bool,
+        typer.Option(
+            "--across-gap",
+            help="Use frames from before and after a gap together, though camera minus air has changed in it.",
+        ),
+    ] = False
+    incomplete: Incomplete = False
+
+    def observed(self, sessions: Sequence[Path], camera: str | None) -> Observations:
+        """The markers of the sessions. Raises as `observe`, and ConfigError for a target that is neither a file nor
+        installed."""
+        wanted, found_by = named_target(self.target), finder(self.workers, self.cluster, use_cache=self.cache)
+        said = said_if(self.incomplete)
+        return observe(sessions, progress, wanted, found_by, across_gap=self.across_gap, incomplete=said, camera=camera)
+
+
+def open_session(path: Path, camera: str | None, incomplete: bool) -> Session:
+    """The session with the frames of one camera; raises as `open_whole` and `take`."""
+    session = open_whole(path, said_if(incomplete))
+    take(session, camera)
+    return session
 
 
 def installed_target(name: str) -> Target:
@@ -54,6 +85,6 @@ def named_target(name: str | None) -> Target | None:
     return None if name is None else installed_target(name)
 
 
-def said_if(incomplete: bool) -> Callable[[str], None] | None:
+def said_if(incomplete: bool) -> Say | None:
     """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
     return (lambda text: say(f"warning: {text}")) if incomplete else None

@@ -10,17 +10,10 @@ import typer
 
 from compensation.budget.geometry import load_geometry
 from compensation.calibration.camera_file import CameraFile
-from compensation.commands.observed import observed
-from compensation.commands.options import (
-    AcrossGap,
-    Cache,
-    Cluster,
-    Incomplete,
-    TargetOption,
-    Workers,
-)
+from compensation.commands.options import Finding
 from compensation.drift.model_file import load_model
 from compensation.observations import Float
+from compensation.one_camera import name_of
 from compensation.reporting.validation_report import validation_page
 from compensation.validation3d.document import as_json
 from compensation.validation3d.positions import validation_frames
@@ -49,14 +42,12 @@ def validate_session(
     lens: Annotated[
         LensModel, typer.Option(help="Which model of the camera file gives the poses.")
     ] = LensModel.PINHOLE,
-    target: TargetOption = None,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    cache: Cache = True,
-    across_gap: AcrossGap = False,
-    incomplete: Incomplete = False,
+    *,
+    finding: Finding,
 ) -> None:
     """How far the target at V0..V3 seems to move with temperature, before and after compensation, beside the paper's.
+
+    Of a session of several cameras it is the one whose serial number the camera file has.
 
     Example: compensate validate sessions/20260101T180000Z-validation --camera camera.json --model model.json
     -o validation.html
@@ -65,11 +56,9 @@ def validate_session(
         beside = _numbers_beside(out)
         file, drift = CameraFile.load(camera), load_model(model)
         geometry = None if budget is None else load_geometry(budget)
-        observations = observed(
-            [session], target, workers, cluster, cache=cache, across_gap=across_gap, incomplete=incomplete
-        )
-        check_same(observations, file, drift)
         opened = Session.open(session)
+        observations = finding.observed([session], name_of(opened, file.camera_serial))
+        check_same(observations, file, drift)
         frames = validation_frames(opened, observations)
 
         def stand_at(distances_mm: Float) -> StandPart | None:
