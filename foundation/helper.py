@@ -1,21 +1,102 @@
-"""The daemon's end of a process that makes calls for it, see helper_process.py."""
+"""A small process that makes calls for a daemon: the daemon's end, the process's, and the messages between the two.
+
+Each line to the daemon is a socket with a thread of its own in the process, which answers one request after the other:
+a call that hangs does not stop those of the other lines. When the daemon has closed its ends, or is dead, each thread
+ends with the request it is at, and then the process. It is for calls that may hang in the kernel, or take long.
+
+A request is a function and its arguments, pickled by reference. What it returns stays there under `keep` and is called
+by its methods' names later; else it goes back, as an exception does.
+"""
 
 from __future__ import annotations
 
 import errno
+import importlib
 import os
+import pickle
 import signal
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from threading import Lock
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock, Thread
 from typing import Any
 
-from foundation.helper_process import Request, receive, send
-
 _END_WITHIN_S = 0.5
+_LENGTH = struct.Struct("<Q")
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """`function(*args)`, or the method of that name of what is kept under `target`. keep: the name for the result."""
+
+    function: Callable[..., object] | str
+    args: tuple[object, ...] = ()
+    target: str = ""
+    keep: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the request returned, or raised."""
+
+    result: object = None
+    error: BaseException | None = None
+
+
+def send(connection: socket.socket, message: Request | Answer) -> None:
+    """One message; OSError when the other end is gone."""
+    data = pickle.dumps(message, protocol=5)
+    connection.sendall(_LENGTH.pack(len(data)))
+    connection.sendall(data)
+
+
+def receive(connection: socket.socket) -> Any:
+    """The next message; None when the other end is gone."""
+    head = _exactly(connection, _LENGTH.size)
+    data = None if head is None else _exactly(connection, _LENGTH.unpack(head)[0])
+    return None if data is None else pickle.loads(data)
+
+
+def _exactly(connection: socket.socket, size_bytes: int) -> bytearray | None:
+    data = bytearray(size_bytes)
+    view, got = memoryview(data), 0
+    while got < size_bytes:
+        try:
+            count = connection.recv_into(view[got:])
+        except OSError:
+            return None
+        if not count:
+            return None
+        got += count
+    return data
+
+
+def answer(request: Request, kept: dict[str, object]) -> Answer:
+    """What comes of the request."""
+    try:
+        if isinstance(request.function, str):
+            return Answer(getattr(kept[request.target], request.function)(*request.args))
+        result = request.function(*request.args)
+        if request.keep:
+            kept[request.keep] = result
+            return Answer()
+        return Answer(result)
+    except BaseException as error:  # noqa: BLE001 - the daemon waits for any error
+        return Answer(error=error)
+
+
+def _serve(connection: socket.socket, kept: dict[str, object]) -> None:
+    while (request := receive(connection)) is not None:
+        found = answer(request, kept)
+        try:
+            send(connection, found)
+        except OSError:
+            return  # the daemon has gone
 
 
 class Line:
@@ -62,13 +143,14 @@ class Line:
 class Helper:
     """The process, from the start on, and its lines. It is in a session of its own, so that Ctrl-C does not end it.
 
-    `module` is run with the daemon's process id and the lines' descriptors.
+    `module` has LEFT_NAME, what the process is called once the daemon has gone, while a call is not at its end (15
+    characters are kept); its `prepare()`, if any, is called first.
     """
 
     def __init__(self, module: str, lines: Sequence[str], ended: str) -> None:
         pairs = [socket.socketpair() for _ in ("life", *lines)]
         numbers = [theirs.fileno() for _, theirs in pairs]
-        command = [sys.executable, "-m", module, str(os.getpid()), *map(str, numbers)]
+        command = [sys.executable, "-m", "foundation.helper", module, str(os.getpid()), *map(str, numbers)]
         try:
             self._process = subprocess.Popen(
                 command,
@@ -120,3 +202,38 @@ class Helper:
 
 def _how(status: int) -> str:
     return f"killed by {signal.Signals(-status).name}" if status < 0 else f"status {status}"
+
+
+def main() -> None:
+    """`python -m foundation.helper MODULE DAEMON FD ...`: serve the daemon at these sockets until it is gone; the first
+    carries nothing, its end is the daemon's. MODULE is imported first: from then on it is in memory."""
+    module = importlib.import_module(sys.argv[1])
+    getattr(module, "prepare", _nothing)()
+    kept: dict[str, object] = {}
+    life, *connections = [socket.socket(fileno=int(number)) for number in sys.argv[3:]]
+    threads = [Thread(target=_serve, args=(each, kept), daemon=True) for each in connections]
+    for thread in threads:
+        thread.start()
+    receive(life)
+    Path("/proc/self/comm").write_text(module.LEFT_NAME)
+    for thread in threads:
+        thread.join()
+    os._exit(0)
+
+
+def go_behind_all_others() -> None:
+    """For `prepare`: everything else on the machine goes before this process."""
+    with suppress(OSError):
+        os.nice(19)
+    with suppress(OSError, AttributeError):  # Linux
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def _nothing() -> None:
+    pass
+
+
+if __name__ == "__main__":
+    import foundation.helper  # under this name its messages are known
+
+    foundation.helper.main()

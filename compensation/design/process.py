@@ -1,20 +1,16 @@
-"""The process that decides for a night: `python -m compensation.design.process DAEMON FD ...`, see
-foundation/helper_process.py. Everything else on the machine goes before it.
-"""
+"""The process that decides for a night, see foundation/helper.py."""
 
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from foundation.errors import StandError
-from foundation.helper_process import serve
+from foundation.helper import go_behind_all_others
 
-_LEFT_NAME = "stand-known-left"  # of a process whose daemon has gone
+LEFT_NAME = "stand-known-left"  # of a process whose daemon has gone
 
 
 def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -48,20 +44,8 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _go_behind_all_others() -> None:
-    with suppress(OSError):
-        os.nice(19)
-    with suppress(OSError, AttributeError):  # Linux
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-
-
-def main() -> None:
-    """Serve until the daemon is gone."""
+def prepare() -> None:
+    """As a process of its own."""
     for library in ("OMP", "OPENBLAS", "NUMBA"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
-    _go_behind_all_others()
-    serve([int(number) for number in sys.argv[2:]], _LEFT_NAME)
-
-
-if __name__ == "__main__":
-    main()
+    go_behind_all_others()

@@ -24,8 +24,7 @@ from foundation.instants import utc_text
 from markers.detection import Detection, DetectionError, Noise, detect, nothing_found
 from markers.target import Target
 from recording.format.damage import naming
-from recording.format.images import decode_image
-from recording.format.png import ImageArray
+from recording.format.images import ImageArray, decode_image
 from recording.format.records import FramePlace, Message, frame_places, read_frame
 from recording.reading.session import Session
 

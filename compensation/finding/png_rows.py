@@ -2,7 +2,7 @@
 markers does.
 
 The pixels are inflated at once by libdeflate and the rows' filters undone in machine code (PNG specification, 9.2).
-What is read, and what is refused, is what recording/format/png.py reads and refuses.
+What is read, and what is refused, is what recording/format/images.py reads and refuses.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from foundation.errors import SessionError
 from markers.compiled import entry
-from recording.format.png import ImageArray, pixel_data
+from recording.format.images import ImageArray, pixel_data
 
 _NONE, _LEFT, _ABOVE, _AVERAGE, _PAETH = range(5)
 

@@ -37,8 +37,7 @@ from recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, fram
 from recording.exporting.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format
 from recording.format import messages
 from recording.format.damage import FileDamaged, naming
-from recording.format.images import decode_image
-from recording.format.png import SIGNATURE, encode_png
+from recording.format.images import SIGNATURE, decode_image, encode_png
 from recording.format.records import Message, telemetry_messages
 from recording.format.utc_offsets import UtcOffsets
 from recording.reading.notes import read_notes

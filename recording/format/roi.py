@@ -2,7 +2,7 @@
 
 What is left out is evidence (dust, glare, a marker that was taken for another), so this is a choice and not the
 default. A partial frame is a PNG of full size whose pixels outside the windows have one value; the windows are noted
-in it (recording/format/png.py) and come back as Frame.windows.
+in it (recording/format/images.py) and come back as Frame.windows.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 
 from foundation.clock import seconds_ns
 from foundation.readings import Frame
-from recording.format.images import encode_image
-from recording.format.png import ImageArray, Windows
+from recording.format.images import ImageArray, Windows, encode_image
 
 FindWindows = Callable[[ImageArray], Windows | None]
 

@@ -43,7 +43,7 @@ from recording.repair.opening import Opening, opening_of, segments_of
 from recording.repair.segment_check import check_segment
 from recording.repair.share_done import ReportShare, ShareDone, no_report
 from recording.writing.locks import lock
-from recording.writing.sink import CHUNK_BYTES
+from recording.writing.segment import CHUNK_BYTES
 
 BEING_RECORDED = "is being recorded"
 COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}

@@ -1,10 +1,16 @@
-"""The daemon's end of the process that touches the disk for it, see disk_process.py."""
+"""The process that touches the disk for a daemon, see foundation/helper.py.
+
+A thread that waits for a disk in the kernel cannot be killed, and keeps its whole process from ending. So a daemon that
+has to leave while the disk hangs leaves this process behind. Until that has ended it holds its locks, which show that a
+process still writes.
+"""
 
 from __future__ import annotations
 
 from foundation.helper import Helper
-from recording.writing.disk_process import MODULE
 
+MODULE = "recording.writing.disk"
+LEFT_NAME = "stand-disk-left"  # of a process whose daemon has gone
 FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE = "frames", "telemetry", "journal", "files"
 _LINES = (FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE)
 

@@ -1,4 +1,4 @@
-"""What the segments of a session's two series have in common."""
+"""What the segments of a session's two series have in common: their topics, metadata, sizes and reserves."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from mcap.writer import CompressionType
 
 from foundation.clock import seconds_ns
+from recording.format import messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.writing.segment import SeriesForm, Topic
 from recording.writing.settings import RecordingSettings
-from recording.writing.writers import TelemetryEncoder
 
 TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it continues when frames or others fill the disk
 
@@ -45,7 +45,7 @@ class SessionForm:
         """Of the telemetry: many small commits, merged when a segment is full."""
         return SeriesForm(
             TELEMETRY,
-            TelemetryEncoder(self.devices).topics(),
+            telemetry_topics(self.devices),
             CompressionType.ZSTD,
             self.metadata,
             self.attachments,
@@ -54,3 +54,13 @@ class SessionForm:
             reserve_bytes=TELEMETRY_RESERVE_BYTES,
             merge_chunks=True,
         )
+
+
+def telemetry_topics(devices: Mapping[str, str]) -> tuple[Topic, ...]:
+    """The topics that these devices (name -> kind) need, and those every session has."""
+    kinds = set(devices.values())
+    names = [kind.topic for name, kind in messages.KINDS.items() if name in kinds]
+    names += [messages.TABLE_POSE] * ("axis" in kinds) + [messages.ORIGINAL] * ("imager" in kinds)
+    names += [messages.CAMERA_META, messages.STEP, messages.EVENT, messages.LOG]
+    on = {name: tuple(each for each, kind in devices.items() if messages.KINDS[kind].topic == name) for name in names}
+    return tuple(Topic(name, messages.CLASSES[name], on[name]) for name in names)

@@ -35,9 +35,8 @@ from recording.writing.forms import SessionForm
 from recording.writing.homes import Beside, Homes, Kept
 from recording.writing.notices import DroppedReadings, Losses, Notice, telemetry_notice
 from recording.writing.settings import USUAL, RecordingSettings, SessionInfo
-from recording.writing.store import RemoteStore, Store
 from recording.writing.waiting import Waiting
-from recording.writing.writers import Fate, ImageWriter, TelemetryEncoder, TelemetryWriter
+from recording.writing.writers import DiskSeries, Fate, ImageWriter, TelemetryEncoder, TelemetryWriter, open_series
 
 NO_IMAGE = np.empty((0, 0), np.uint8)
 FINISH_WITHIN_S, COMPLETE_WITHIN_S = 2.0, 60.0  # real seconds that a disk may take for the end of a run: stopped, whole
@@ -128,7 +127,7 @@ class Recorder:
     @property
     def disk_free_bytes(self) -> int:
         """As it was found at the last commit; does not wait for the disk."""
-        return self._space.free_bytes
+        return self._image_series.space.last.free_bytes
 
     def beside(self, file: Beside) -> None:
         """From now on this file counts as part of the session's folder: `folder_lost` and `refound` know of it."""
@@ -148,24 +147,21 @@ class Recorder:
         """As `start`, off the loop."""
         lane = Lane("record-begin", self._clock, patient=False)
         try:
-            store = await lane.call(self._opened)
+            series = await lane.call(self._opened)
         finally:
             lane.close()
-        self._take(store, earlier())
+        self._take(series, earlier())
 
-    def _opened(self) -> Store | RemoteStore:
-        form, now_ns, tell = self._form, self._clock.now_ns(), self._notices.append
+    def _opened(self) -> tuple[DiskSeries, DiskSeries]:
         try:
-            if self.disk is not None:
-                return RemoteStore(self.disk, self.directory, form, now_ns, tell)
-            return Store(self.directory, form, now_ns, tell)
+            return open_series(self.disk, self.directory, self._form, self._clock.now_ns(), self._notices.append)
         except OSError as error:
             raise SessionError(f"{self.directory}: no session can be recorded here ({error})") from error
 
-    def _take(self, store: Store | RemoteStore, earlier: Iterable[Item]) -> None:
-        self._image_series, self._telemetry_series, self._space = store.frames, store.telemetry, store.space
-        self._image_writer = ImageWriter(store.frames, self._encode, store.space, self._losses)
-        self._telemetry_writer = TelemetryWriter(store.telemetry, self._encoder, store.telemetry_space)
+    def _take(self, series: tuple[DiskSeries, DiskSeries], earlier: Iterable[Item]) -> None:
+        self._image_series, self._telemetry_series = series
+        self._image_writer = ImageWriter(self._image_series, self._encode, self._losses)
+        self._telemetry_writer = TelemetryWriter(self._telemetry_series, self._encoder)
         self._frame_lane = Lane("record-frames", self._clock, patient=False)
         self._telemetry_lane = Lane("record-telemetry", self._clock, patient=False)
         self._begun_ns = self._clock.now_ns()

@@ -1,4 +1,4 @@
-"""The segments of one folder, one after the other."""
+"""The segments of one folder, one after the other, and the two such series of a session."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import re
 from collections import deque
 from collections.abc import Sequence
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
+from foundation.files import sync_folder
 from recording.format.chain import foreign_numbers
-from recording.format.layout import TEMPORARY
+from recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
+from recording.writing.forms import SessionForm
 from recording.writing.home import Home
-from recording.writing.segment import Record, Segment, SeriesForm
-from recording.writing.sink import CommitSink
+from recording.writing.notices import Notice, SpaceWatch
+from recording.writing.segment import CommitSink, Record, Segment, SeriesForm
+
+Item = TypeVar("Item")
 
 
 class Series:
@@ -155,3 +161,63 @@ def next_number(folder: Path) -> int:
     file that was put there under a number far outside does not count."""
     numbers = [int(match[1]) for path in folder.iterdir() if (match := re.match(r"(\d{4,})\.mcap", path.name))]
     return max(set(numbers) - foreign_numbers(numbers), default=-1) + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What a call of a series came to; `error` beside the rest, for troubles are reported also when it failed."""
+
+    result: object
+    error: OSError | None
+    is_open: bool
+    troubles: tuple[str, ...]
+
+
+class SpaceFound(NamedTuple):
+    """What a look at the disk found; see SpaceWatch."""
+
+    frames_stopped: bool = False
+    stop_reason: str = ""
+    free_bytes: int = 0
+    notices: tuple[Notice, ...] = ()
+
+
+class SessionSeries:
+    """Both series of a session, made or continued in `directory`, and the watch over their disk; the telemetry is
+    begun. Blocking; raises OSError. Each series is used from one thread, the watch from both."""
+
+    def __init__(self, directory: Path, form: SessionForm, time_ns: int) -> None:
+        for name in (FRAMES, TELEMETRY):
+            (directory / name).mkdir(parents=True, exist_ok=True)
+        sync_folder(directory)
+        sync_folder(directory.parent)
+        frames, telemetry = Series(directory / FRAMES, form.frames()), Series(directory / TELEMETRY, form.telemetry())
+        self._series = {FRAMES: frames, TELEMETRY: telemetry}
+        self._notices: deque[Notice] = deque()
+        stop, alert = form.settings.stop_frames_below_bytes, form.settings.alert_below_fraction
+        self._space = SpaceWatch(directory, stop, alert, lambda: frames.reserved_bytes, self._notices.append)
+        telemetry.open(time_ns)
+
+    def do(self, name: str, method: str, *args: object) -> Done:
+        """A method of one series."""
+        series, result, failure = self._series[name], None, None
+        try:
+            result = getattr(series, method)(*args)
+        except OSError as error:
+            failure = error
+        return Done(result, failure, series.is_open, _taken(series.troubles))
+
+    def check_space(self) -> SpaceFound:
+        """A look at the disk."""
+        space = self._space
+        space.check()
+        return SpaceFound(space.frames_stopped, space.stop_reason, space.free_bytes, _taken(self._notices))
+
+
+def _taken(waiting: deque[Item]) -> tuple[Item, ...]:
+    """All that waits; more may come, and another thread take some, meanwhile."""
+    taken: list[Item] = []
+    with suppress(IndexError):
+        while True:
+            taken.append(waiting.popleft())
+    return tuple(taken)

@@ -1,87 +1,126 @@
-"""Items and frames as records, and what the recorder's two threads do: put them onto the disk. Each writer is used from
-its own thread; its counts may be read from any."""
+"""Items and frames as records, and what the recorder's two threads do: put them onto the disk, here or by the process
+that touches it. Each writer is used from its own thread; its counts may be read from any."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from enum import Enum
-from typing import Protocol
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality
 from recording.format import messages
 from recording.format.images import CAMERA_IMAGE
 from recording.format.items import Description, UndescribedFrame
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
+from recording.writing.forms import SessionForm
 from recording.writing.home import FolderLost
-from recording.writing.notices import Losses
-from recording.writing.segment import Record, Topic
+from recording.writing.notices import Losses, Notice
+from recording.writing.segment import Record
+from recording.writing.series import Done, SessionSeries, SpaceFound
 
 PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second
 _OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
+_KEPT = "series"  # the name of the SessionSeries in the disk process
 SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; FrameMeta has all 64
 
 
-class SeriesFace(Protocol):
-    """What a writer needs of a series; see Series."""
+class DiskSpace:
+    """What the last look at the disk found, whichever series asked; `tell` takes its notices."""
 
-    troubles: deque[str]
+    def __init__(self, tell: Callable[[Notice], None]) -> None:
+        self.last = SpaceFound()
+        self._tell = tell
 
-    @property
-    def is_open(self) -> bool:
-        """Whether a segment is open."""
-        ...
+    def found(self, space: SpaceFound) -> None:
+        """As of now."""
+        self.last = space
+        for notice in space.notices:
+            self._tell(notice)
+
+
+class DiskSeries:
+    """One series of a session, in the disk process or in this one: a line for each, so that one that hangs leaves the
+    other. Its methods are those of Series. `ask` calls a method of the SessionSeries."""
+
+    def __init__(self, name: str, ask: Callable[..., Any], space: DiskSpace) -> None:
+        self.is_open = False
+        self.troubles: deque[str] = deque()
+        self.space = space
+        self._name = name
+        self._ask = ask
+
+    def check_space(self) -> None:
+        """See SpaceWatch.check."""
+        self.space.found(self._ask("check_space"))
 
     def check(self) -> None:
-        """See Series.check, SpaceWatch.check."""
-        ...
+        """As in Series, like all below."""
+        self._do("check")
 
     def commit(self, records: Sequence[Record], time_ns: int) -> None:
-        """See Series.commit."""
-        ...
+        """All of `records` on the disk."""
+        self._do("commit", list(records), time_ns)
 
     def probe(self, size_bytes: int, time_ns: int) -> None:
-        """See Series.probe."""
-        ...
+        """OSError while the disk would refuse a block."""
+        self._do("probe", size_bytes, time_ns)
 
     def refound(self) -> bool:
-        """See Series.refound."""
-        ...
+        """Whether the folder is back."""
+        return bool(self._do("refound"))
 
     def finish_full(self, time_ns: int) -> None:
-        """See Series.finish_full."""
-        ...
+        """Close a segment that has its size or age."""
+        if self.is_open:
+            self._do("finish_full", time_ns)
 
     def finish(self) -> bool:
-        """See Series.finish."""
-        ...
+        """Close the open segment; False, and a trouble, also when the process has ended."""
+        try:
+            return bool(self._do("finish"))
+        except OSError as error:
+            self.is_open = False
+            self.troubles.append(f"a segment of {self._name} stays unfinished ({error})")
+            return False
 
     def close(self) -> None:
-        """See Series.close."""
-        ...
+        """Let go of the folder; a process that has ended has."""
+        with suppress(OSError):
+            self._do("close")
+
+    def _do(self, method: str, *args: object) -> object:
+        done: Done = self._ask("do", self._name, method, *args)
+        self.is_open = done.is_open
+        self.troubles.extend(done.troubles)
+        if done.error is not None:
+            raise done.error
+        return done.result
 
 
-class SpaceFace(Protocol):
-    """What a writer needs of the watch over the disk; see SpaceWatch."""
+def open_series(
+    disk: Disk | None, directory: Path, form: SessionForm, time_ns: int, tell: Callable[[Notice], None]
+) -> tuple[DiskSeries, DiskSeries]:
+    """Frames and telemetry of a session, made or continued; raises OSError. disk: the process that has them, None: this
+    one."""
+    space = DiskSpace(tell)
+    if disk is None:
+        both = SessionSeries(directory, form, time_ns)
+        asks: list[Callable[..., Any]] = [partial(_called, both)] * 2
+    else:
+        lines = disk.line(FRAMES_LINE), disk.line(TELEMETRY_LINE)
+        lines[1].make(_KEPT, SessionSeries, directory.absolute(), form, time_ns)
+        asks = [partial(line.call, _KEPT) for line in lines]
+    return DiskSeries(FRAMES, asks[0], space), DiskSeries(TELEMETRY, asks[1], space)
 
-    @property
-    def frames_stopped(self) -> bool:
-        """Whether frames may not be written now."""
-        ...
 
-    @property
-    def stop_reason(self) -> str:
-        """Why, as a sentence."""
-        ...
-
-    @property
-    def free_bytes(self) -> int:
-        """When it was looked at last."""
-        ...
-
-    def check(self) -> None:
-        """See Series.check, SpaceWatch.check."""
-        ...
+def _called(series: SessionSeries, method: str, *args: object) -> Any:
+    return getattr(series, method)(*args)
 
 
 class TelemetryEncoder:
@@ -96,19 +135,6 @@ class TelemetryEncoder:
             name: messages.BatchEncoder(name, messages.KINDS[kind]) for name, kind in self._devices.items()
         }
         self._table: dict[str, float] = {}  # unit -> last position of the axis in that unit
-
-    def topics(self) -> tuple[Topic, ...]:
-        """The topics these devices need, and those every session has."""
-        names = [kind.topic for name, kind in messages.KINDS.items() if name in self._devices.values()]
-        if "axis" in self._devices.values():
-            names.append(messages.TABLE_POSE)
-        if "imager" in self._devices.values():
-            names.append(messages.ORIGINAL)
-        names += [messages.CAMERA_META, messages.STEP, messages.EVENT, messages.LOG]
-        return tuple(Topic(name, messages.CLASSES[name], self._devices_on(name)) for name in names)
-
-    def _devices_on(self, topic: str) -> tuple[str, ...]:
-        return tuple(name for name, encoder in self._encoders.items() if encoder.topic == topic)
 
     def check(self, item: Item) -> None:
         """ValueError when the item is a batch of a device that was not declared."""
@@ -164,10 +190,9 @@ class Fate(Enum):
 class ImageWriter:
     """Encodes and commits frames one by one. `done` frames are `saved` or counted as lost."""
 
-    def __init__(self, series: SeriesFace, encode: Callable[[Frame], bytes], space: SpaceFace, losses: Losses) -> None:
+    def __init__(self, series: DiskSeries, encode: Callable[[Frame], bytes], losses: Losses) -> None:
         self._series = series
         self._encode = encode
-        self._space = space
         self._losses = losses
         self._block_bytes = 0  # of the last frame that was offered to the disk
         self.homeless: Frame | None = None  # found its folder gone; it is the first to be saved again
@@ -198,10 +223,10 @@ class ImageWriter:
         try:
             self._series.finish_full(frame.time_ns)
             if not self._series.is_open:
-                self._space.check()
-            if self._space.frames_stopped:
+                self._series.check_space()
+            if (space := self._series.space.last).frames_stopped:
                 self._series.finish()  # for as long as that takes nothing is left open, or reserved
-                return Fate.LOST, self._space.stop_reason
+                return Fate.LOST, space.stop_reason
             data = self._encode(frame)
             self._block_bytes = len(data)
             self._series.commit(
@@ -231,10 +256,9 @@ class ImageWriter:
 class TelemetryWriter:
     """Encodes and commits items; what the disk refuses waits in memory and goes first the next time."""
 
-    def __init__(self, series: SeriesFace, encoder: TelemetryEncoder, space: SpaceFace) -> None:
+    def __init__(self, series: DiskSeries, encoder: TelemetryEncoder) -> None:
         self._series = series
         self._encoder = encoder
-        self._space = space
         self._backlog: list[Record] = []
         self._items_encoded = 0
         self.items_saved = 0
@@ -251,7 +275,7 @@ class TelemetryWriter:
             self._backlog.extend(self._encoder.encode(item))
             self._items_encoded += 1
         try:
-            self._space.check()
+            self._series.check_space()
             self._series.check()
             while portion := self._backlog[:PORTION_RECORDS]:
                 self._series.commit(portion, now_ns)

@@ -1,4 +1,4 @@
-"""The process that runs the notify command for a daemon: `python -m stand.guarding.notify_process DAEMON FD ...`.
+"""The process that runs the notify command for a daemon, see foundation/helper.py.
 
 It is small, and all it needs is loaded when the daemon starts: a daemon that has grown to gigabytes, has no descriptor
 left or waits for a disk does not have to start a program itself. A command under way when the daemon goes is run to its
@@ -10,14 +10,11 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from foundation.helper_process import serve
-
 MODULE = "stand.guarding.notify_process"
-_LEFT_NAME = "stand-tell-left"  # of a process whose daemon has gone
+LEFT_NAME = "stand-tell-left"  # of a process whose daemon has gone
 KILLED_LIMIT_S = 1.0  # real seconds for what was killed to be gone
 
 
@@ -49,14 +46,3 @@ def _killed(process: subprocess.Popen[bytes]) -> str:
     except subprocess.TimeoutExpired:
         return " and could not be killed"
     return ""
-
-
-def main() -> None:
-    """Serve until the daemon is gone."""
-    serve([int(number) for number in sys.argv[2:]], _LEFT_NAME)
-
-
-if __name__ == "__main__":
-    import stand.guarding.notify_process  # under this name it is asked for: from now on it is in memory
-
-    stand.guarding.notify_process.main()

@@ -1,4 +1,4 @@
-"""The process that sends alerts for a daemon: `python -m stand.serving.alerts_process DAEMON FD ...`.
+"""The process that sends alerts for a daemon, see foundation/helper.py.
 
 A receiver that hangs hangs this process's thread, never the daemon. The secrets are read here, for each message anew,
 and nothing that is returned holds any of them.
@@ -9,18 +9,16 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import logging
-import sys
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from threading import Thread
 
 from foundation.errors import ConfigError
-from foundation.helper_process import serve
 from stand.config.alerts import load_secrets
 
 MODULE = "stand.serving.alerts_process"
-_LEFT_NAME = "stand-alert-left"  # of a process whose daemon has gone
+LEFT_NAME = "stand-alert-left"  # of a process whose daemon has gone
 MISSING = "alerts need Apprise: pip install 'thermostand[alerts]'"
 
 
@@ -96,14 +94,3 @@ class _Work:
             self._found = self._call()
         except Exception as error:  # noqa: BLE001 - whatever a receiver's library raises, and its text may hold a secret
             self._found = f"failed ({type(error).__name__})"
-
-
-def main() -> None:
-    """Serve until the daemon is gone."""
-    serve([int(number) for number in sys.argv[2:]], _LEFT_NAME)
-
-
-if __name__ == "__main__":
-    import stand.serving.alerts_process  # under this name it is asked for
-
-    stand.serving.alerts_process.main()

@@ -1,16 +1,11 @@
-"""The process that looks at frames for the page: `python -m stand.serving.preview_process DAEMON FD ...`, see
-foundation/helper_process.py. Everything else on this machine goes before it.
-"""
+"""The process that looks at frames for the page, see foundation/helper.py."""
 
 from __future__ import annotations
 
-import os
-import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from foundation.helper_process import serve
+from foundation.helper import go_behind_all_others
 
 if TYPE_CHECKING:
     from stand.serving.history import Columns, History
@@ -18,7 +13,7 @@ if TYPE_CHECKING:
     from stand.serving.recorded_drift import Recalled, SessionDrift
 
 MODULE = "stand.serving.preview_process"
-_LEFT_NAME = "stand-look-left"  # of a process whose daemon has gone
+LEFT_NAME = "stand-look-left"  # of a process whose daemon has gone
 
 
 def previewer(target_text: str) -> Previewer:
@@ -64,20 +59,6 @@ def recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]:
     return recorded_week(Path(directory), now_ns)
 
 
-def _go_behind_all_others() -> None:
-    with suppress(OSError):
-        os.nice(19)
-    with suppress(OSError, AttributeError):  # Linux
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-
-
-def main() -> None:
-    """Serve until the daemon is gone."""
-    _go_behind_all_others()
-    serve([int(number) for number in sys.argv[2:]], _LEFT_NAME)
-
-
-if __name__ == "__main__":
-    import stand.serving.preview_process  # under this name it is asked for
-
-    stand.serving.preview_process.main()
+def prepare() -> None:
+    """As a process of its own."""
+    go_behind_all_others()

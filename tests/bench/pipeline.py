@@ -25,11 +25,11 @@ from mcap.writer import CompressionType
 from foundation.clock import NS_PER_S
 from foundation.items import Batch, Item, StepMark, StepState
 from foundation.readings import Frame, Reading
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_png
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.messages import timestamp
-from recording.format.png import encode_png
 from recording.reading.session import Session
+from recording.writing.forms import telemetry_topics
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
 from recording.writing.writers import TelemetryEncoder
@@ -137,7 +137,7 @@ def _write(session: Path, photographs: list[bytes], count: int) -> None:
     image_topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),)
     forms = [
         (FRAMES, image_topics, CompressionType.NONE, 1_000_000_000),
-        (TELEMETRY, encoder.topics(), CompressionType.ZSTD, 1_000_000_000),
+        (TELEMETRY, telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000),
     ]
     series: list[Series] = []
     for folder, topics, compression, size in forms:

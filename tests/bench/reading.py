@@ -28,6 +28,7 @@ from recording.format import messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.reading.session import Session
+from recording.writing.forms import telemetry_topics
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
 from recording.writing.writers import TelemetryEncoder
@@ -101,7 +102,7 @@ def _frame(number: int, image: NDArray[np.uint8]) -> Frame:
 
 def _write_telemetry(session: Path, duration_s: int) -> None:
     encoder = TelemetryEncoder(DEVICES)
-    series = _series(session / TELEMETRY, encoder.topics(), CompressionType.ZSTD, 1_000_000_000)
+    series = _series(session / TELEMETRY, telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000)
     image = np.zeros((1, 1), np.uint8)
     for begin in range(0, duration_s, 60):
         records = [

@@ -23,8 +23,7 @@ from foundation.errors import SessionError
 from foundation.image_limit import images_up_to
 from markers.detection import DetectionError
 from markers.image_file import read_image
-from recording.format.images import decode_image
-from recording.format.png import SIGNATURE
+from recording.format.images import SIGNATURE, decode_image
 
 LIMIT_S = 120
 MOST_BYTES = 1_500_000_000

@@ -9,7 +9,7 @@ import pytest
 
 from compensation.finding.png_rows import decode_rows
 from foundation.errors import SessionError
-from recording.format.png import decode_png, encode_png
+from recording.format.images import decode_png, encode_png
 
 FILTERS = {
     "none": cv2.IMWRITE_PNG_FILTER_NONE,

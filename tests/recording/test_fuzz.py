@@ -23,6 +23,7 @@ from recording.reading.overview import overview
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 from recording.repair.verify import verify
+from recording.writing.forms import telemetry_topics
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
 from recording.writing.writers import TelemetryEncoder
@@ -70,7 +71,7 @@ def write_session(directory, encoding):
     halves = ([item for k in seconds for item in items(k)] for seconds in ((0, 1), (2, 3)))
     telemetry = [[record for item in half for record in ENCODER.encode(item)] for half in halves]
     write_series(directory / FRAMES, topics, CompressionType.NONE, images)
-    write_series(directory / TELEMETRY, ENCODER.topics(), CompressionType.ZSTD, telemetry)
+    write_series(directory / TELEMETRY, telemetry_topics({"camera": "camera"}), CompressionType.ZSTD, telemetry)
 
 
 def write_series(folder, topics, compression, commits):

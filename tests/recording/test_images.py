@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from foundation.errors import SessionError
 from foundation.readings import Frame
-from recording.format.images import IMAGE_CLASS, decode_image, encode_image
-from recording.format.png import SIGNATURE, decode_png, encode_png
+from recording.format.images import IMAGE_CLASS, SIGNATURE, decode_image, decode_png, encode_image, encode_png
 
 TIME_NS = 1_767_290_400_123_456_789
 DEPTHS = {"8 bit": ("u1", 255), "10 bit": ("<u2", 1023), "12 bit": ("<u2", 4095), "16 bit, big-endian": (">u2", 65535)}

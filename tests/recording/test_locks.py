@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from recording.writing import locks
-from recording.writing.disk_process import MODULE
+from recording.writing.disk import MODULE
 
 _HOLD = "import fcntl, signal, sys; fcntl.flock(sys.stdin, fcntl.LOCK_EX); print(flush=True); signal.pause()"
 

@@ -20,6 +20,7 @@ from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.records import telemetry_messages
 from recording.reading.session import Session
+from recording.writing.forms import telemetry_topics
 from recording.writing.recorder import Recorder
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
@@ -52,7 +53,7 @@ def write(folder, topics, commits, compression=CompressionType.NONE, attachments
 def write_items(directory, items, devices=DEVICES, **options):
     """A telemetry segment with these items, each in a chunk of its own."""
     encoder = TelemetryEncoder(devices)
-    write(directory / TELEMETRY, encoder.topics(), [list(encoder.encode(item)) for item in items], **options)
+    write(directory / TELEMETRY, telemetry_topics(devices), [list(encoder.encode(item)) for item in items], **options)
 
 
 def write_images(directory, frames):
@@ -313,7 +314,7 @@ def test_wrong_content_under_right_crcs_is_told(tmp_path, change, sentence):
 
 def test_a_step_nested_deeper_than_python_goes_is_told(tmp_path):
     step = messages.CLASSES[messages.STEP](state="done", parameters_json="[" * 200_000).SerializeToString()
-    write(tmp_path / TELEMETRY, TelemetryEncoder({}).topics(), [[Record(messages.STEP, START_NS, step)]])
+    write(tmp_path / TELEMETRY, telemetry_topics({}), [[Record(messages.STEP, START_NS, step)]])
     with pytest.raises(SessionError, match="a recorded step cannot be read"):
         Session.open(tmp_path).steps()
 

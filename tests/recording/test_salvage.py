@@ -17,7 +17,7 @@ from recording.format.records import read_head
 from recording.reading.session import Session
 from recording.repair.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
 from recording.repair.verify import Severity, verify
-from recording.writing.sink import CommitSink
+from recording.writing.segment import CommitSink
 from tests.recording.damage import (
     ATTACHMENTS,
     DAMAGES,

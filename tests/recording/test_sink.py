@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from recording.writing.sink import CommitSink
+from recording.writing.segment import CommitSink
 from tests.recording.disks import ext4, limit_files, mounted, run, tmpfs
 
 MB = 1_000_000

@@ -3,12 +3,10 @@ number of visits; it notes what it was asked."""
 
 import json
 import os
-import sys
 import threading
 from pathlib import Path
 
-from foundation.helper_process import serve
-
+LEFT_NAME = "test-left"
 ANSWERS, ASKED = "answers.json", "asked.jsonl"
 
 
@@ -21,7 +19,3 @@ def decided(session, asked):
     if found == "hang":
         threading.Event().wait(60.0)
     return found
-
-
-if __name__ == "__main__":
-    serve([int(number) for number in sys.argv[2:]], "test-left")

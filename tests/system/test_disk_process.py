@@ -14,7 +14,7 @@ import pytest
 from foundation.errors import SessionError
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
-from recording.writing.disk_process import LEFT_NAME
+from recording.writing.disk import LEFT_NAME
 from stand.running.entries import Ended, read_lines
 from stand.running.journal import Journal
 from tests.recording.disks import ext4, run

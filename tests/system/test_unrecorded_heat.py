@@ -17,7 +17,7 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import StandError, StandTripped
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
-from recording.writing.disk_process import MODULE
+from recording.writing.disk import MODULE
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_real
