@@ -11,6 +11,7 @@ from foundation.errors import ConfigError, StandError
 from foundation.progress import progress
 
 MODEL_NAME, REPORT_NAME = "model.json", "report.html"
+WARNING = "warning: "  # begins a line that says what no temperature explains
 
 
 class NotReported(StandError):
@@ -50,5 +51,5 @@ def _moved(numbers: Path) -> Iterator[str]:
     """What no temperature explains, a line for each: steps of the image, slips, fixings that settle anew."""
     found = json.loads(numbers.read_text())
     for bump in found["bumps"]:
-        yield f"warning: between {bump['after']} and {bump['before']} {bump['text']}; no temperature explains it"
-    yield from (f"warning: {one['text']}" for one in found["unrepeated"] if one["cause"] != "nothing")
+        yield f"{WARNING}between {bump['after']} and {bump['before']} {bump['text']}; no temperature explains it"
+    yield from (f"{WARNING}{one['text']}" for one in found["unrepeated"] if one["cause"] != "nothing")

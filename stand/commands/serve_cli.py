@@ -42,6 +42,7 @@ def serve(
     port: Annotated[int | None, typer.Option(help="Listen by TCP, too; without it the Unix socket only.")] = None,
     host: Annotated[str, typer.Option(help="The address to listen at, with --port.")] = "127.0.0.1",
     secop: Annotated[int | None, typer.Option(help="Serve SECoP on this machine, usually at 10767.")] = None,
+    no_reports: Annotated[bool, typer.Option("--no-reports", help="Report no run when it is complete.")] = False,
 ) -> None:
     """Own the stand until it is told to end: status, devices by hand, and a queue whose runs are its guests.
 
@@ -85,7 +86,7 @@ def serve(
                     finally:
                         hub.unsubscribe(follow)
 
-        asyncio.run(serve_stand(stand, config, texts, directory, front))
+        asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))
 
 
 def _page(viewing: Viewing) -> Callable[[Bridge], Any]:

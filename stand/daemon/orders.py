@@ -48,7 +48,14 @@ class Orders:
     queued: as it was last read. stop: of the run under way. leaving: the daemon ends, and its run is interrupted by it.
     """
 
-    def __init__(self, house: House, directory: Path, config_name: str, texts: dict[str, str]) -> None:
+    def __init__(
+        self,
+        house: House,
+        directory: Path,
+        config_name: str,
+        texts: dict[str, str],
+        recorded: Callable[[Path], None] | None = None,
+    ) -> None:
         self.queued = Queue()
         self.stop: Stop | None = None
         self.leaving = False
@@ -57,6 +64,7 @@ class Orders:
         self._house = house
         self._config_name = config_name
         self._texts = texts
+        self._recorded_whole = recorded
         self._expected_s: dict[int, float] = {}
 
     async def read(self) -> None:
@@ -149,6 +157,8 @@ class Orders:
             self.stop = None
             hub.unsubscribe(watch)
         await asyncio.to_thread(conclude, entry, done, tell, report=False)
+        if self._recorded_whole is not None and any(isinstance(planned.step, Capture) for planned in plan):
+            self._recorded_whole(done)
         return done
 
     def shown(self) -> tuple[QueuedRun, ...]:

@@ -23,6 +23,7 @@ from stand.daemon.desk import DaemonDesk
 from stand.daemon.house_record import HouseRecord
 from stand.daemon.kept import KeptFile, kept_in
 from stand.daemon.orders import Orders
+from stand.daemon.reports import Reports
 from stand.running.claim import claimed
 from stand.running.house import opened
 from stand.running.stop import Stop
@@ -32,9 +33,17 @@ from stand.serving.alerts import alerting
 Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[object]]
 
 
-async def serve(config: StandConfig, config_name: str, texts: dict[str, str], out: Path, front: Front) -> None:
+async def serve(
+    config: StandConfig,
+    config_name: str,
+    texts: dict[str, str],
+    out: Path,
+    front: Front,
+    *,
+    has_reports: bool = False,
+) -> None:
     """Own the stand until SIGINT, SIGTERM, SIGQUIT or SIGHUP. texts: config.yaml, target.yaml, and the record of
-    `stand check` where there is one.
+    `stand check` where there is one. has_reports: whether complete runs with frames are reported.
 
     InUse when it belongs to another daemon or run: then nothing was touched. Raises what opening raises, and
     StandTripped when the stand could not be confirmed safe at the end.
@@ -55,7 +64,9 @@ async def serve(config: StandConfig, config_name: str, texts: dict[str, str], ou
                 own = {name: text for name, text in texts.items() if name in ("config.yaml", ATTACHMENT)}
                 record = HouseRecord(assembly, own, out, clock)
                 keep = KeptFile(out, house.disk.line(FILES_LINE).run, hub, clock)
-                orders = Orders(house, out, config_name, texts)
+                reports = Reports(hub, clock)
+                stack.push_async_callback(reports.close)
+                orders = Orders(house, out, config_name, texts, reports.add if has_reports else None)
                 for segment in await asyncio.to_thread(salvage_unfinished, out):
                     hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
                 if accepted := config.accepted():

@@ -1,5 +1,6 @@
-"""What a daemon counts, keeps for the next start, and tells the service manager."""
+"""What a daemon counts, keeps for the next start, reports, and tells the service manager."""
 
+import asyncio
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from foundation.readings import Reading, bad_reading
 from stand.daemon import systemd
 from stand.daemon.counters import Counters
 from stand.daemon.kept import Kept, KeptFile, Latch, kept_in
+from stand.daemon.reports import Reports
 
 
 def read(hub: Hub, time_s: float, **values: float) -> None:
@@ -101,3 +103,18 @@ def test_without_a_service_manager_nobody_is_told(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)
     systemd.tell(systemd.READY)
     assert systemd.watchdog_s() is None
+
+
+async def test_a_run_that_cannot_be_reported_is_told_and_the_next_has_its_turn(tmp_path: Path):
+    hub, told = Hub(), list[str]()
+    hub.subscribe(lambda item: told.append(f"{item.kind}: {item.text}") if isinstance(item, Event) else None)
+    reports = Reports(hub, WallClock())
+    reports.add(tmp_path / "first")
+    reports.add(tmp_path / "second")
+    async with asyncio.timeout(60):
+        while not told:
+            await asyncio.sleep(0.05)
+    await reports.close()  # the second one is given up
+    (line,) = told
+    assert line.startswith(f"not_reported: {tmp_path / 'first'} is recorded, but not reported: ")
+    assert f"`compensate report {tmp_path / 'first'} -o report.html` tries again" in line

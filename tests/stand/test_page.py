@@ -239,11 +239,13 @@ async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):
         frames = page.get_by_label("frames", exact=True).first
         assert await frames.input_value() == "3600"
         await frames.fill("120")
+        await page.get_by_label("cameras", exact=True).first.fill("lens A, lens B")
         await page.get_by_role("button", name="Add to the queue").click()
         await page.get_by_text("is queued").wait_for()
         run = night.queue[-1]
         order, _ = night.requests[run.key]
         assert '"frames":120' in order.recipe_text
+        assert '"cameras":["lens A","lens B"]' in order.recipe_text
         assert '"held_out_degC":[17,38]' in order.recipe_text
         await page.get_by_label("frames", exact=True).first.fill("-5")
         await page.get_by_role("button", name="Add to the queue").click()
@@ -284,7 +286,7 @@ async def test_runs_are_moved_by_buttons_and_by_dragging_and_removed_after_a_que
 
 async def test_devices_take_orders_only_between_runs(night):
     async with a_page(night.chromium, night.port, "devices") as page:
-        await page.get_by_text("a run owns the stand").first.wait_for()
+        await page.get_by_text("Devices take no orders: a run owns the stand.").wait_for()  # once, for all of them
         assert await page.get_by_role("button", name="Open", exact=True).is_disabled()
         night.is_idle = True
         flap = page.locator("section", has=page.get_by_role("heading", name="flap"))

@@ -40,7 +40,7 @@ class Served:
 
     def __init__(self, config_file: Path, out: Path) -> None:
         self.out = out
-        command = [sys.executable, "-m", "stand.cli", "serve", str(config_file), "--out", str(out)]
+        command = [sys.executable, "-m", "stand.cli", "serve", str(config_file), "--out", str(out), "--no-reports"]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     @property

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
@@ -80,6 +81,9 @@ async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
                     late.append(f"{took_s:.1f} s")
                 await asyncio.sleep(0.1)
             assert fed(manager) >= 3
+            fed(manager)
+            threading.Event().wait(WATCHDOG_S)  # the event loop is blocked: nobody feeds from beside it
+            assert fed(manager) == 0
             monkeypatch.setattr(type(daemon.house.guard), "is_on_time", property(lambda _: False))
             await asyncio.sleep(0.2)
             fed(manager)

@@ -30,14 +30,15 @@ export class Devices {
       fill(this.cards, this.parts.map((part) => part.card));
     }
     devices.forEach((device, index) => this.refuse(this.parts[index], device));
+    this.refused = devices.find((device) => device.refused)?.refused;
     if (this.app.state) this.update(this.app.state);
   }
 
   card(device) {
-    const values = h("dl", { class: "facts" }), refused = h("p", { class: "quiet" });
+    const values = h("dl", { class: "facts" });
     const answer = h("p", { class: "answer", role: "status" });
     const verbs = device.verbs.map((verb) => this.verb(device, verb, answer));
-    return { device, values, refused, verbs, card: h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, words(device.name)), h("small", {}, device.kind)), values, refused, h("div", { class: "verbs" }, verbs), answer) };
+    return { device, values, verbs, card: h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, words(device.name)), device.kind === device.name ? null : h("small", {}, device.kind)), values, h("div", { class: "verbs" }, verbs), answer) };
   }
 
   verb(device, verb, answer) {
@@ -62,31 +63,37 @@ export class Devices {
   }
 
   refuse(part, device) {
-    say(part.refused, device.refused ? `Takes no orders now: ${device.refused}` : "");
-    part.refused.hidden = !device.refused;
     for (const verb of part.verbs) for (const control of verb.elements) control.disabled = Boolean(device.refused);
   }
 
   update(state) {
-    say(this.note, state.run ? "A run owns the stand: what it does is in the plan." : "Every order goes through the stand's own limits and interlocks, and is recorded.");
+    say(this.note, this.refused ? `Devices take no orders: ${this.refused}.` : "Every order goes through the stand's own limits and interlocks, and is recorded.");
     for (const { device, values } of this.parts ?? []) {
-      const rows = device.channels.filter((channel) => state.readings[channel]);
+      const rows = device.channels.filter((channel) => state.readings[channel] && !channel.endsWith("_raw"));
       const key = rows.join();
       if (values.dataset.key !== key) {
         values.dataset.key = key;
-        fill(values, rows.map((channel) => [h("dt", {}, look_of(channel).name), h("dd", {}, "")]));
+        fill(values, rows.map((channel) => [h("dt", {}, name_of(channel)), h("dd", {}, "")]));
       }
       rows.forEach((channel, index) => {
         const reading = state.readings[channel];
-        say(values.children[2 * index + 1], reading.value === null ? `no reading: ${reading.reason}` : `${number(reading.value, Number.isInteger(reading.value) ? 0 : 2)} ${unit_of(reading.unit)}`);
+        say(values.children[2 * index + 1], reading.value === null ? `no reading: ${reading.reason}` : value_of(channel, reading));
       });
     }
     const counters = Object.entries(state.counters);
-    if (counters.length !== this.counters.children.length / 2) fill(this.counters, counters.map(([name]) => [h("dt", {}, words(name)), h("dd", {}, "")]));
+    if (counters.length !== this.counters.children.length / 2) fill(this.counters, counters.map(([name]) => [h("dt", {}, words(name.replace(".", ", "))), h("dd", {}, "")]));
     counters.forEach(([, value], index) => say(this.counters.children[2 * index + 1], number(value, Number.isInteger(value) ? 0 : 1)));
   }
 
   soon() { this.load(); }
   event() {}
   close() { this.closed = true; clearInterval(this.timer); }
+}
+
+// Of a device that has a box of its own, what is read; temperatures are called as in the curves.
+const name_of = (channel) => (channel.startsWith("thermometers.") || channel.startsWith("regulator.") ? look_of(channel).name.replace(/^regulator (?=[a-z])/, "") : words(channel.split(".")[1]));
+
+function value_of(channel, { value, unit }) {
+  const says = channel.startsWith("relays.") ? ["off", "on"] : /\.(running|fault|moving|homed)$/.test(channel) ? ["no", "yes"] : null;
+  return (unit === "1" && says?.[value]) || `${number(value, Number.isInteger(value) ? 0 : 2)} ${unit_of(unit)}`;
 }

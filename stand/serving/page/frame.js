@@ -17,7 +17,7 @@ export class FramePanel {
     this.choice = h("select", { "aria-label": "Camera", hidden: true, onchange: () => { this.camera = this.choice.value; this.time_ns = null; this.soon(); } });
     place.append(h("section", { class: "panel" },
       h("div", { class: "head" }, h("h2", {}, "Last frame"), this.choice, this.caption),
-      h("div", { class: "frame" }, this.canvas), this.facts));
+      this.box = h("div", { class: "frame", hidden: true }, this.canvas), this.facts));
     this.timer = setTimeout(() => this.refresh(), 0);
   }
 
@@ -45,6 +45,7 @@ export class FramePanel {
     this.picture = picture;
     this.time_ns = frame.time_ns;
     this.frame = frame;
+    this.box.hidden = false;
     this.draw();
     this.show();
   }

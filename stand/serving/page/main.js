@@ -48,7 +48,7 @@ function show(state) {
   at("phase").dataset.phase = phase;
   say(at("phase"), PHASE[phase]);
   const { run } = state;
-  say(at("doing"), run ? `${run.recipe}: step ${run.step} of ${run.steps}, ${run.doing}` : state.setpoint_degC === null ? "no run" : `no run; chamber at ${state.setpoint_degC} °C`);
+  say(at("doing"), run ? `${run.recipe}: step ${run.step} of ${run.steps}, ${run.doing}` : phase === "running" ? "a run begins" : state.setpoint_degC === null ? "no run" : `no run; chamber at ${state.setpoint_degC} °C`);
   say(at("eta"), run?.end_ns ? `ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(run)}` : clock(app.now_s()));
   document.title = `${PHASE[phase]} · ${state.stand}`;
   notices.update(state);

@@ -97,13 +97,13 @@ export class Now {
     const state = this.app.state, offset_s = state.utc_offset_ns / 1e9;
     const [from_s, to_s] = this.window_s();
     const units = Object.fromEntries(Object.entries(state.readings).map(([name, reading]) => [name, reading.unit]));
-    const shown = [...temperatures(units), "regulator.mv_heat", "regulator.mv_cool", "relays.compressor", ...this.app.cameras().flatMap((name) => [`${name}.drift_mean`, `${name}.drift_worst`])];
+    const shown = [...temperatures(units), "regulator.mv_heat", "regulator.mv_cool", "regulator.running", "relays.compressor", ...this.app.cameras().flatMap((name) => [`${name}.drift_mean`, `${name}.drift_worst`])];
     const points = Math.max(200, Math.min(1600, Math.round(this.plots.above.place.clientWidth)));
     const at = (s) => Math.max(0, Math.round((s - offset_s) * 1e9));
     const path = `/history?from_ns=${at(from_s)}&to_ns=${at(to_s)}&points=${points}&channels=${encodeURIComponent(shown.join())}`;
     const history = await get(path);
     if (this.closed) return 1000;
-    this.history = history;
+    this.history = in_force(history);
     this.offset_s = offset_s;
     this.drawn = [from_s, to_s];
     this.draw();
@@ -167,19 +167,22 @@ export class Now {
     is_off ? row.setAttribute("data-off", "") : row.removeAttribute("data-off");
     row.dataset.quality = reading.quality;
     row.title = reading.reason;
-    const bad = { bad: "no reading", stale: "old" }[reading.quality];
-    say(value, reading.value === null ? bad ?? "–" : `${number(reading.value, 2)} °C${bad ? ` (${bad})` : ""}`);
+    const state = this.app.state, bad = { bad: "no reading", stale: "old" }[reading.quality];
+    const unasked = channel === "regulator.sp" && state.setpoint_degC === null ? "none"
+      : reading.value === null && !state.camera_on && this.app.cameras().includes(channel.split(".")[0]) ? "off" : "";
+    if (unasked) row.dataset.quality = "good"; // nobody expects one now
+    say(value, unasked || (reading.value === null ? bad ?? "–" : `${number(reading.value, 2)} °C${bad ? ` (${bad})` : ""}`));
     say(trend, channel === "regulator.sp" ? "" : arrow(this.trends[channel]));
   }
 
   update_flags(state) {
     const flags = [
       ["Heater", state.heater_permitted ? "permitted" : "locked", state.heater_permitted],
-      ["Output", state.output_percent === null ? "–" : `${number(state.output_percent, 0)} %`, false],
+      ["Output", output(state.output_percent), false],
       ["Compressor", state.compressor_on ? "running" : "off", state.compressor_on],
       ["Camera", state.camera_on ? "on" : "off", false],
       ["Flap", state.flap || "unknown", state.flap === "open"],
-      ...Object.entries(state.axes).map(([name, position]) => [name, position === null ? "unknown" : `${number(position, 2)} ${name === "rotary" ? "°" : "mm"}`, false]),
+      ...Object.entries(state.axes).map(([name, position]) => [name, position === null ? "unknown" : `${number(position, 2)} ${unit_of(state.readings[`${name}.position`]?.unit ?? "")}`, false]),
       ["Frames saved", state.run ? String(state.run.frames_saved) : "–", false],
       ["Frames lost", state.run ? String(state.run.frames_lost) : "–", Boolean(state.run?.frames_lost)],
       ["Disk free", `${number(state.disk_free_bytes / 1e9, 0)} GB`, state.disk_free_bytes < 20e9],
@@ -217,6 +220,22 @@ export class Now {
     this.frame.close();
     for (const plot of Object.values(this.plots)) plot.destroy();
   }
+}
+
+// A set-point while the regulator is stopped is only what it remembers: no curve, and no part of the scale.
+function in_force(history) {
+  const { "regulator.running": low, ...others } = history.low, high = history.high["regulator.running"] ?? low;
+  const { "regulator.sp": set } = others;
+  if (!high || !set) return { ...history, low: others };
+  const only = (values) => values.map((value, n) => (high[n] === 0 ? null : value));
+  const more = history.high["regulator.sp"] ? { "regulator.sp": only(history.high["regulator.sp"]) } : {};
+  return { ...history, low: { ...others, "regulator.sp": only(set) }, high: { ...history.high, ...more } };
+}
+
+function output(percent) {
+  if (percent === null) return "–";
+  const size = `${number(Math.abs(percent), 0)} %`;
+  return percent > 0 ? `heats, ${size}` : percent < 0 ? `cools, ${size}` : size;
 }
 
 function slope(values, width_s) {

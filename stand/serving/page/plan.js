@@ -77,7 +77,7 @@ export class Plan {
     const first = steps.findIndex((step) => step.standing === "waiting" || step.standing === "under_way");
     const begin = this.all || first < 0 ? hide : Math.max(0, first - SHOWN_DONE);
     const more = begin || this.all ? h("li", { class: "more" }, h("span"), h("span", { class: "index" }), h("button", { type: "button", class: "small", "aria-expanded": String(this.all), onclick: () => { this.all = !this.all; this.show(); } },
-      this.all ? "Hide steps that are done" : `${begin} steps before these`)) : null;
+      this.all ? "Hide steps that are done" : begin === 1 ? "1 step before these" : `${begin} steps before these`)) : null;
     const focused = document.activeElement?.dataset?.key;
     if (this.list.querySelector(".ask")) return; // a question is open
     const shown = steps.slice(begin, begin + MOST_ROWS), rest = steps.length - begin - shown.length;
@@ -110,7 +110,7 @@ export class Plan {
     if (step.ended_ns) return `${step.standing === "skipped" ? "left out" : "done"} ${clock(seconds(step.ended_ns, offset_ns))}`;
     if (step.standing === "done" || step.standing === "skipped") return WORD[step.standing];
     const takes = step.duration_s >= 1 ? duration(step.duration_s) : "";
-    return step.expected_ns ? `${takes ? `${takes}, to ` : "to "}${day_clock(seconds(step.expected_ns, offset_ns))}` : takes;
+    return step.expected_ns ? `${takes ? `${takes}, until ` : "at "}${day_clock(seconds(step.expected_ns, offset_ns))}` : takes;
   }
 
   update(state) {

@@ -1,6 +1,6 @@
 // The queue of runs, and the form that adds one.
 import { command, get, tell } from "./api.js";
-import { ask, day_clock, duration, fill, h, seconds } from "./dom.js";
+import { ask, day_clock, duration, fill, h, seconds, unit_of } from "./dom.js";
 import { RecipeForm } from "./recipe_form.js";
 
 const ENDED = ["done", "failed", "stopped"];
@@ -42,12 +42,18 @@ export class Queue {
     try {
       const [recipes, schema] = await Promise.all([get("/recipes"), get("/recipes/schema")]);
       if (this.closed) return;
-      this.form = new RecipeForm(schema, Object.keys(this.app.state?.axes ?? {}));
+      this.form = new RecipeForm(schema, this.axes());
       this.details.append(this.form.element);
       fill(this.choice, recipes.map(({ name }) => h("option", { value: name }, name)));
       this.choice.value = recipes.some(({ name }) => name === "overnight") ? "overnight" : recipes[0]?.name;
       await this.choose();
     } catch (error) { tell(this.form_answer, error.message, true); }
+  }
+
+  // Name and unit.
+  axes() {
+    const { axes, readings } = this.app.state ?? { axes: {} };
+    return Object.fromEntries(Object.keys(axes).map((name) => [name, unit_of(readings[`${name}.position`]?.unit ?? "")]));
   }
 
   async choose() {
@@ -80,6 +86,7 @@ export class Queue {
     this.start.disabled = false;
     if (run) {
       this.sent = null;
+      this.note.value = "";
       tell(this.form_answer, `run ${run.id} (${run.recipe}) is queued${run.expected_s ? `; it will take ${duration(run.expected_s)}` : ""}`);
     }
   }

@@ -63,8 +63,9 @@ export class RecipeForm {
     if (schema.type === "object" && schema.additionalProperties?.type === "number") return this.position_field(name, given ?? {});
     if (schema.properties) return this.object_field(name, schema, given, required);
     if (schema.type === "array" && this.resolve(schema.items ?? {}).properties) return this.rows_field(name, schema, given ?? [], required);
-    if (is_texts(schema)) return texts_field(name, given ?? [], required);
-    return json_field(name, given ?? null, schema.description ?? "As JSON; empty or null for none");
+    if (schema.type === "array" ? schema.items?.type === "string" : is_texts(schema)) return texts_field(name, given ?? [], required);
+    const words_of = (schema.anyOf ?? []).filter((each) => each.const).map((each) => JSON.stringify(each.const));
+    return json_field(name, given ?? null, schema.description ?? `${words_of.map((each) => `${each}, or `).join("")}more as JSON; empty for none`);
   }
 
   // An object within another: its fields are there when it is asked for.
@@ -101,9 +102,9 @@ export class RecipeForm {
   }
 
   position_field(name, values) {
-    const names = [...new Set([...this.axes, ...Object.keys(values)])];
+    const names = [...new Set([...Object.keys(this.axes), ...Object.keys(values)])];
     const inputs = names.map((axis) => h("input", { type: "number", step: "any", value: values[axis] ?? "", "aria-label": `${words(name)}: ${axis}` }));
-    return field(name, h("span", { class: "row" }, names.flatMap((axis, index) => [h("span", {}, axis), inputs[index]])), "", () => {
+    return field(name, h("span", { class: "row" }, names.map((axis, index) => h("span", {}, `${axis} `, inputs[index], ` ${this.axes[axis] ?? ""}`))), "", () => {
       const found = Object.fromEntries(names.map((axis, index) => [axis, inputs[index].value]).filter(([, text]) => text !== "").map(([axis, text]) => [axis, Number(text)]));
       return Object.keys(found).length ? found : undefined;
     });
@@ -185,7 +186,7 @@ function list_field(name, items, given, required) {
 function texts_field(name, given, required) {
   const input = h("input", { type: "text", value: [given].flat().join(", "), required });
   return field(name, input, "names with commas between them", () => {
-    const texts = input.value.split(/[\s,;]+/).filter(Boolean);
+    const texts = input.value.split(/[,;]/).map((text) => text.trim()).filter(Boolean);
     return texts.length ? texts : undefined;
   });
 }

@@ -14,20 +14,20 @@ export class Sessions {
     this.plots = [];
     this.answer = h("p", { class: "answer", role: "status" });
     this.rows = h("tbody");
-    this.search = h("input", { type: "search", placeholder: "name, recipe, operator, tag", "aria-label": "Search sessions", oninput: () => this.show() });
+    this.search = h("input", { type: "search", placeholder: "search", "aria-label": "Search sessions by name, recipe, operator or tag", oninput: () => this.show() });
     this.compare_button = h("button", { type: "button", disabled: true, onclick: () => this.compare() }, "Show");
     this.comparison = h("section", { class: "panel", hidden: true });
     const head = ["", "session", "recipe", "began", "took", "frames", "size", "run", "files", ""].map((name) => h("th", { scope: "col" }, name || h("span", { class: "unseen" }, "actions")));
     fill(place, h("div", { class: "stack" },
       this.comparison,
       h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Sessions"), this.search, this.compare_button), this.answer,
-        h("div", { class: "scroll" }, h("table", {}, h("thead", {}, h("tr", {}, head)), this.rows)))));
+        h("div", { class: "scroll" }, h("table", { class: "sessions" }, h("thead", {}, h("tr", {}, head)), this.rows)))));
     this.load();
   }
 
   async load() {
     try {
-      this.sessions = (await get("/sessions")).reverse();
+      this.sessions = (await get("/sessions")).sort((one, other) => (begun_ns(other) ?? 0) - (begun_ns(one) ?? 0));
       if (!this.closed) this.show();
     } catch (error) { tell(this.answer, error.message, true); }
   }
@@ -45,7 +45,7 @@ export class Sessions {
     const box = h("input", { type: "checkbox", "aria-label": `Choose ${each.name}`, onchange: () => this.pick(each.name, box.checked) });
     box.checked = this.chosen.includes(each.name);
     const took = each.begin_ns && each.end_ns ? duration((each.end_ns - each.begin_ns) / 1e9) : "–";
-    const path = encodeURIComponent(each.name), actions = h("td", { class: "row" });
+    const path = encodeURIComponent(each.name), actions = h("span", { class: "row" });
     if (each.has_report) actions.append(h("a", { href: `/api/v1/sessions/${path}/report.html`, target: "_blank", rel: "noopener" }, "report"));
     if (["interrupted", "killed", "aborted"].includes(each.run)) actions.append(h("button", { type: "button", class: "small", onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
     actions.append(h("button", { type: "button", class: "small", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
@@ -53,9 +53,9 @@ export class Sessions {
     return h("tr", {}, h("td", {}, box),
       h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)]),
         (each.notes ?? []).map((note) => h("small", { class: "said" }, `${note.by ? `${note.by}: ` : ""}${note.text ?? note}`))),
-      h("td", {}, each.recipe), h("td", {}, each.begin_ns ? day_clock(seconds(each.begin_ns, each.utc_offset_ns ?? 0)) : "–"), h("td", { class: "number" }, took),
+      h("td", {}, each.recipe), h("td", {}, begun_ns(each) ? day_clock(seconds(begun_ns(each))) : "–"), h("td", { class: "number" }, took),
       h("td", { class: "number" }, String(each.frames)), h("td", { class: "number" }, bytes(each.bytes ?? 0)), h("td", {}, each.run),
-      h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files, each.copies ? h("small", { class: "said" }, each.copies.length ? "archived" : "not archived") : null), actions);
+      h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files, each.copies ? h("small", { class: "said" }, each.copies.length ? "archived" : "not archived") : null), h("td", {}, actions));
   }
 
   note(each, place) {
@@ -144,8 +144,15 @@ export class Sessions {
   }
 
   update() {}
-  event(event) { if (event.kind === "run.end") this.load(); }
+  event(event) { if (["run.end", "reported", "not_reported"].includes(event.kind)) this.load(); }
   close() { this.closed = true; this.clear(); }
+}
+
+// Of one whose first segment is still written, by its name.
+function begun_ns(each) {
+  if (each.begin_ns) return each.begin_ns;
+  const at = /^(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)Z/.exec(each.name);
+  return at && Date.parse(`${at[1]}-${at[2]}-${at[3]}T${at[4]}:${at[5]}:${at[6]}Z`) * 1e6;
 }
 
 const hours = (night) => Array.from({ length: night.points }, (_, n) => ((n + 0.5) * night.width_ns) / 3600e9);

@@ -1,0 +1,60 @@
+"""The reports of runs that have come to their end, by a process of its own at the lowest priority: a night can be read
+in the morning, and nothing that guards or records waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from foundation.clock import Clock
+from foundation.errors import StandError
+from foundation.helper import Helper
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.lane import Lane
+from foundation.tasks import cancelled, failure_text
+from stand.serving.preview_process import MODULE, session_report
+
+_REPORT = "report"
+
+
+class Reports:
+    """One after another. What goes wrong is an event `not_reported`, and nothing else."""
+
+    def __init__(self, hub: Hub, clock: Clock) -> None:
+        self._hub = hub
+        self._clock = clock
+        self._turn = asyncio.Lock()
+        self._works: set[asyncio.Task[None]] = set()
+
+    def add(self, session: Path) -> None:
+        """Its report, in the session's folder, when its turn has come; event `reported`."""
+        work = asyncio.create_task(self._make(session))
+        self._works.add(work)
+        work.add_done_callback(self._works.discard)
+
+    async def close(self) -> None:
+        """Give up what is not made."""
+        await cancelled(list(self._works))
+
+    async def _make(self, session: Path) -> None:
+        async with self._turn:
+            lane, helper = Lane("report", self._clock, patient=False), None
+            try:
+                helper = Helper(MODULE, (_REPORT,), "the process that makes reports has ended")
+                for line in await lane.call(helper.line(_REPORT).run, session_report, str(session)):
+                    self._tell("warning", "report", f"{session.name}: {line}")
+                self._tell("info", "reported", f"the report of {session.name} is made; the page has it under Sessions")
+            except (StandError, OSError) as error:
+                self._tell("warning", "not_reported", str(error))
+            except Exception as error:  # noqa: BLE001 - a fit that fails ends nothing
+                remedy = f"`compensate report {session} -o report.html` tries again"
+                self._tell("warning", "not_reported", f"{session.name}: no report: {failure_text(error)}; {remedy}")
+            finally:
+                if helper is not None:
+                    helper.close()
+                lane.close()
+
+    def _tell(self, level: str, kind: str, text: str) -> None:
+        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
