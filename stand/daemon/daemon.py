@@ -33,7 +33,7 @@ from stand.queueing.queue_file import Entry, working
 from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
 from stand.running.house import House
-from stand.running.stop import Interrupted
+from stand.running.stop import STOPPED, Interrupted
 from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 
@@ -41,6 +41,7 @@ from stand.serving.desk import Conflict
 Answering = Callable[[Hub, WallClock], AbstractAsyncContextManager[object]]
 
 _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
+_ENDS = Fault(STOPPED.rule, "the daemon was ended")
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
 _KEEP_EVERY_S, _READ_EVERY_S = 60.0, 5.0
 _EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0  # systemd is asked for more time while the stand is made safe
@@ -96,7 +97,7 @@ class Daemon:
         for hand in self._hands:
             hand.cancel()
         if self.orders.stop is not None:
-            self.orders.stop()
+            self.orders.stop(_ENDS if self.orders.leaving else STOPPED)
         else:
             self._assembly.stand.safety.demand()
         if self._leaving.is_set():
@@ -191,7 +192,7 @@ class Daemon:
         self.orders.leaving = True
         while self.has_guest and not worker.done():
             if self.orders.stop is not None:
-                self.orders.stop()
+                self.orders.stop(_ENDS)
             await asyncio.wait([worker], timeout=_LOOK_S)
 
     async def _work(self) -> None:

@@ -14,9 +14,20 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.lane import Lane
 from foundation.tasks import cancelled, failure_text
-from stand.serving.preview_process import MODULE, session_report
+from stand.serving.preview_process import MODULE
+from stand.session_report import WARNING, report_session
 
 _REPORT = "report"
+
+
+def session_report(path: str) -> list[str]:
+    """Report a session in its folder; what no temperature explains in it, a sentence each. NotReported. In the process
+    that reports."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    lines = report_session(Path(path), Path(path))
+    return [line.removeprefix(WARNING) for line in lines if line.startswith(WARNING)]
 
 
 class Reports:

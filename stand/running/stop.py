@@ -11,7 +11,7 @@ from stand.gate import Gate, Phase, Turn, next_phase
 from stand.stand import Stand
 
 STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
-_BY_OPERATOR = Fault(STOPPED_BY_OPERATOR, "stopped by the operator")
+STOPPED = Fault(STOPPED_BY_OPERATOR, "stopped by the operator")
 
 
 class Interrupted(StandError):
@@ -49,7 +49,7 @@ class Stop:
         if self._stand is not None:
             self._follow(self._stand.gate)
 
-    def __call__(self, fault: Fault = _BY_OPERATOR) -> None:
+    def __call__(self, fault: Fault = STOPPED) -> None:
         """Latch at once, begin to make safe, and return; the run is cancelled when every actuator has been tried."""
         self.fault = self.fault or fault
         if self._stand is not None:

@@ -52,17 +52,6 @@ def run_references(path: str) -> tuple[Recalled, ...]:
     return run_references(path)
 
 
-def session_report(path: str) -> list[str]:
-    """Report a session in its folder; what no temperature explains in it, a sentence each. NotReported."""
-    import cv2
-
-    from stand.session_report import WARNING, report_session
-
-    cv2.setNumThreads(1)
-    lines = report_session(Path(path), Path(path))
-    return [line.removeprefix(WARNING) for line in lines if line.startswith(WARNING)]
-
-
 def recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]:
     """What a daemon before this one has recorded."""
     from stand.serving.recorded_history import recorded_week

@@ -33,7 +33,7 @@ export class Notices {
     this.set("prompt", prompt && `${prompt.step_id} ${prompt.text}`, () => this.prompt(prompt));
     const held = state.run && !fault && !prompt && state.reasons.length ? state.reasons.join() : "";
     this.set("held", held, () => this.held(state));
-    this.set("queue", !state.run && state.queue_halted, () => ({ element: h("section", { class: "notice warning" }, h("h2", {}, "The queue is halted"), h("p", {}, state.queue_halted)) }));
+    this.set("queue", !state.run && state.queue_halted, () => this.halted(state));
   }
 
   lost(text) {
@@ -74,12 +74,18 @@ export class Notices {
     return { element };
   }
 
+  halted(state) {
+    const answer = h("p", { class: "answer", role: "status" });
+    const button = h("button", { type: "button", onclick: () => command(answer, "go on", "POST", "/run/clear") }, "Go on with the queue");
+    return { element: h("section", { class: "notice warning" }, h("h2", {}, "The queue is halted"), h("p", {}, state.queue_halted), h("div", { class: "row" }, button), answer) };
+  }
+
   held(state) {
     const answer = h("p", { class: "answer", role: "status" });
     const is_mine = state.reasons.includes("operator");
     const button = h("button", { type: "button", class: "main", onclick: () => command(answer, "continue", "POST", "/run/continue") }, "Continue");
     return { element: h("section", { class: "notice warning" }, h("h2", {}, "The run is held"),
-      h("p", {}, `${state.reasons.map(reason).join("; ")}. The chamber keeps its set-point; nothing is lost.`), is_mine ? h("div", { class: "row" }, button) : null, answer) };
+      h("p", {}, `${state.reasons.map(reason).join("; ")}. ${state.setpoint_degC === null ? "The chamber is stopped." : "The chamber keeps its set-point."}`), is_mine ? h("div", { class: "row" }, button) : null, answer) };
   }
 }
 

@@ -224,10 +224,9 @@ export class Now {
 
 // A set-point while the regulator is stopped is only what it remembers: no curve, and no part of the scale.
 function in_force(history) {
-  const { "regulator.running": low, ...others } = history.low, high = history.high["regulator.running"] ?? low;
-  const { "regulator.sp": set } = others;
-  if (!high || !set) return { ...history, low: others };
-  const only = (values) => values.map((value, n) => (high[n] === 0 ? null : value));
+  const { "regulator.running": runs, ...others } = history.low, set = others["regulator.sp"];
+  if (!runs || !set) return { ...history, low: others };
+  const only = (values) => values.map((value, n) => (runs[n] === 0 ? null : value));
   const more = history.high["regulator.sp"] ? { "regulator.sp": only(history.high["regulator.sp"]) } : {};
   return { ...history, low: { ...others, "regulator.sp": only(set) }, high: { ...history.high, ...more } };
 }

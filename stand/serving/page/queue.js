@@ -13,7 +13,6 @@ export class Queue {
     this.answer = h("p", { class: "answer", role: "status" });
     this.list = h("ol", { class: "queue", "aria-label": "Runs to be done, the next one first" });
     this.ended = h("ol", { class: "queue" });
-    this.halted = h("p", { class: "level-error" });
     this.form_answer = h("p", { class: "answer", role: "status" });
     this.choice = h("select", { id: "recipe", onchange: () => this.choose() });
     this.attended = h("input", { type: "checkbox", id: "attended" });
@@ -33,7 +32,7 @@ export class Queue {
       h("div", { class: "stack" },
         h("section", { class: "panel" }, h("h2", {}, "Start a run"), form)),
       h("div", { class: "stack" },
-        h("section", { class: "panel" }, h("h2", {}, "To be done"), this.halted, this.list, this.answer),
+        h("section", { class: "panel" }, h("h2", {}, "To be done"), this.list, this.answer),
         h("section", { class: "panel" }, h("h2", {}, "Ended"), this.ended))));
     this.load();
   }
@@ -92,11 +91,10 @@ export class Queue {
   }
 
   update(state) {
-    const runs = state.queue, key = JSON.stringify([runs, state.queue_halted]);
+    const runs = state.queue, key = JSON.stringify(runs);
     if (key === this.shown || this.dragged) return;
     if (this.list.querySelector(".ask")) return;
     this.shown = key;
-    this.halted.textContent = state.queue_halted ? `The queue is halted: ${state.queue_halted}` : "";
     const open = runs.filter((run) => !ENDED.includes(run.state));
     const movable = open.filter((run) => run.state !== "running");
     fill(this.list, open.length ? open.map((run) => this.row(run, movable)) : h("li", {}, h("span"), h("span", { class: "quiet" }, "nothing is queued")));

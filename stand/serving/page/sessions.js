@@ -47,7 +47,7 @@ export class Sessions {
     const took = each.begin_ns && each.end_ns ? duration((each.end_ns - each.begin_ns) / 1e9) : "–";
     const path = encodeURIComponent(each.name), actions = h("span", { class: "row" });
     if (each.has_report) actions.append(h("a", { href: `/api/v1/sessions/${path}/report.html`, target: "_blank", rel: "noopener" }, "report"));
-    if (["interrupted", "killed", "aborted"].includes(each.run)) actions.append(h("button", { type: "button", class: "small", onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
+    if (["interrupted", "killed", "aborted", "stopped"].includes(each.run)) actions.append(h("button", { type: "button", class: "small", onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
     actions.append(h("button", { type: "button", class: "small", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
     const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
     return h("tr", {}, h("td", {}, box),
