@@ -61,6 +61,7 @@ class CameraSettings(Polled):
     (constant self-heating). has_temperature: whether it measures its own temperature; false must be stated, a run needs
     no GOOD one then. boot_s: from its supply being switched on until it answers.
     ambient_degC: the lowest and the highest air that its data sheet allows; no set-point goes outside.
+    ambient_K_per_min: how fast that air may change; no set-point changes faster.
     lens: which one is on it, in words; recorded with each session.
     """
 
@@ -75,6 +76,7 @@ class CameraSettings(Polled):
     has_temperature: bool = True
     boot_s: float = Field(default=8.0, ge=0, le=600)
     ambient_degC: Range | None = None
+    ambient_K_per_min: float | None = Field(default=None, gt=0, le=20)
     lens: Line = ""
     equilibrium: EquilibriumSettings = EquilibriumSettings()
 

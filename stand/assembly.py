@@ -143,7 +143,8 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         state_file = config.recording.directory / "compressor.json"
     self_test_s = config.relays.self_test_s if config.relays is not None else 0.0
     permits = PermitLimits(config.guard.heater_hold_s, self_test_s, config.compressor)
-    chamber = ChamberLimits(config.set_points_degC, permits, config.guard.heater_renew_s, state_file)
+    renew_s = config.guard.heater_renew_s
+    chamber = ChamberLimits(config.set_points_degC, permits, renew_s, state_file, config.set_point_K_per_min)
     boots_s = [camera.boot_s for camera in config.cameras.values()]
     equilibrium = config.camera.equilibrium if config.camera is not None else EquilibriumSettings()
     supply = SupplyLimits(max(boots_s, default=0.0), config.guard.heater_hold_s, equilibrium)

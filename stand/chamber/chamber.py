@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +20,19 @@ from stand.chamber.permits import PermitLimits, Permits
 from stand.interlock import Interlock
 
 _OCCUPIED_AGAIN_S = 5.0
+_STEP_K = 0.5  # of a set-point that is brought to its place no faster than the cameras may follow
 
 
 @dataclass(frozen=True, slots=True)
 class ChamberLimits:
     """The set-points allowed (lowest, highest), how long a permission to heat or cool lives, how often it is renewed
-    (s), and the file that keeps what the compressor did last for the next daemon."""
+    (s), the file that keeps what the compressor did last for the next daemon, and how fast a set-point may change."""
 
     setpoint_degC: tuple[float, float]
     permits: PermitLimits
     renew_s: float
     compressor_file: Path | None = None
+    K_per_min: float = math.inf
 
 
 class Chamber:
@@ -52,31 +55,61 @@ class Chamber:
         self._interlock = interlock
         self._hub = hub
         self._clock = clock
+        self._asked = object()  # the last order; one that is under way ends with the next
         self.compressor_file = CompressorFile(limits.compressor_file, hub, clock)
         compressor = restored(limits.compressor_file, clock.now_ns(), boot_of(clock))
         self.permits = Permits(relays, limits.permits, compressor, self.compressor_file.note, hub, clock)
         self.keeper = Keeper(self.permits, regulator, hub, clock, limits.renew_s, coils_read)
 
     async def start(self, setpoint_degC: float) -> None:
-        """Permit heating and cooling, set the set-point, run the regulator."""
-        await self.set_temperature(setpoint_degC)
+        """Permit heating and cooling, set the set-point, run the regulator; done when the set-point is there."""
+        way_degC = await self._way_to(setpoint_degC)
+        asked = self._asked = object()
+        await self._send(way_degC[0])
         self._interlock.check()  # after every wait: a fault may have closed it meanwhile
         self.permits.grant()
         await self.keeper.beat()
         self._interlock.check()
         await self._regulator.run()
+        await self._walk(way_degC[1:], asked)
 
     async def set_temperature(self, setpoint_degC: float) -> None:
-        """A new set-point; ConfigError outside the limits. While an operator has the regulator autotune this waits
-        until that ends or the guard holds the stand; event `regulator_occupied`."""
+        """A new set-point, done when it is there; ConfigError outside the limits. While an operator has the regulator
+        autotune this waits until that ends or the guard holds the stand; event `regulator_occupied`."""
+        way_degC = await self._way_to(setpoint_degC)
+        asked = self._asked = object()
+        await self._send(way_degC[0])
+        await self._walk(way_degC[1:], asked)
+
+    async def _way_to(self, setpoint_degC: float) -> list[float]:
+        """The set-points from where the air is to this one, no two further apart than _STEP_K where there is a limit to
+        their rate."""
+        low, high = self._limits.setpoint_degC
+        if not low <= setpoint_degC <= high:
+            raise ConfigError(f"chamber set-point {setpoint_degC} degC is outside limits.chamber_degC {low}..{high}")
+        if math.isinf(self._limits.K_per_min):
+            return [setpoint_degC]
+        self._interlock.check()
+        found = {reading.channel: reading.value for reading in await self._regulator.read()}
+        pv_degC, sp_degC = (found.get(f"{self._regulator.name}.{name}", math.nan) for name in ("pv", "sp"))
+        begin_degC = next((each for each in (pv_degC, sp_degC) if not math.isnan(each)), setpoint_degC)
+        steps = max(1, math.ceil(abs(setpoint_degC - begin_degC) / _STEP_K))
+        way_degC = (begin_degC + (setpoint_degC - begin_degC) * step / steps for step in range(1, steps))
+        return [*(min(max(each, low), high) for each in way_degC), setpoint_degC]
+
+    async def _walk(self, way_degC: list[float], asked: object) -> None:
+        """One after another at the rate allowed; another order takes over from it."""
+        for setpoint_degC in way_degC:
+            step_ns = seconds_ns(60.0 * _STEP_K / self._limits.K_per_min)
+            await self._clock.sleep_until(self._clock.now_ns() + step_ns)
+            if asked is not self._asked:
+                return
+            await self._send(setpoint_degC)
+
+    async def _send(self, setpoint_degC: float) -> None:
         is_waiting = False
         while True:
             self._interlock.check()
-            low, high = self._limits.setpoint_degC
-            if not low <= setpoint_degC <= high:
-                raise ConfigError(
-                    f"chamber set-point {setpoint_degC} degC is outside limits.chamber_degC {low}..{high}"
-                )
             try:
                 return await self._regulator.set_temperature(setpoint_degC)
             except Occupied as error:
@@ -88,6 +121,7 @@ class Chamber:
 
     async def stop(self) -> None:
         """Stop the regulator; heating and cooling lose their permission at once."""
+        self._asked = object()
         self.permits.revoke()
         await self._regulator.stop()
         await self.permits.make_safe()

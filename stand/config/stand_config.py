@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.resources
+import math
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -249,6 +250,12 @@ class StandConfig(Document):
         """The lowest and the highest set-point that the stand and all its cameras may be given."""
         ranges = [self.limits.chamber_degC, *(each.ambient_degC for each in self.cameras.values() if each.ambient_degC)]
         return max(low for low, _ in ranges), min(high for _, high in ranges)
+
+    @property
+    def set_point_K_per_min(self) -> float:
+        """How fast the set-point may change for all cameras; inf when none says."""
+        rates = (each.ambient_K_per_min for each in self.cameras.values())
+        return min((rate for rate in rates if rate is not None), default=math.inf)
 
     def accepted(self) -> dict[str, float]:
         """The values outside their safe ranges, which guard.accept names, by their paths."""

@@ -8,16 +8,15 @@ from typing import NoReturn, TypeVar
 from pydantic import JsonValue
 
 from foundation.errors import StandError
-from foundation.items import Event
 from stand.daemon.daemon import Daemon
 from stand.gate import INTERLOCK
-from stand.running.run_desk import NOTE, RunDesk
+from stand.running.run_desk import RunDesk
+from stand.running.said import Said, keep
 from stand.serving.desk import (
     Conflict,
     DeviceState,
     Done,
     FaultState,
-    Missing,
     PlanStep,
     QueuedRun,
     RunRequest,
@@ -144,14 +143,10 @@ class DaemonDesk:
         return self._done("device", text)
 
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
-        """Into the session that is being recorded, the house's between runs."""
-        run, recorder = self._run, self._daemon.record.recorder
-        if run is not None and run.session.name == session:
-            return await run.note(who, session, text, tags)
-        if recorder is None or recorder.directory.name != session:
-            raise Missing("that session is not being recorded; others get notes from `stand session`")
-        data: dict[str, object] = {"who": who.name, "how": who.how, "tags": list(tags)}
-        self._assembly.hub.publish(Event(self._assembly.clock.now_ns(), "info", NOTE, text, data))
+        """Of any session in the daemon's folder."""
+        said, orders = Said(who, text, tags), self._daemon.orders
+        folder = await orders.lane.call(orders.folder_of, session)
+        await keep(said, folder, self._assembly.hub, self._assembly.clock)
         self._tell(who, "note", {"tags": list(tags)})
         return self._done("note", "noted")
 

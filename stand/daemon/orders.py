@@ -10,7 +10,7 @@ import asyncio
 import hashlib
 import importlib.resources
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,9 +21,7 @@ from foundation.hub import Hub
 from foundation.readings import Quality
 from recording.reading.session import Session
 from stand.config.checked import ATTACHMENT
-from stand.config.stand_config import StandConfig
-from stand.estimating.estimate import price
-from stand.estimating.learned import load_learned
+from stand.estimating.night import Night, price_night
 from stand.estimating.room import existing, small_disk
 from stand.queueing import queue
 from stand.queueing.queue import Asked, order_of
@@ -34,6 +32,7 @@ from stand.running.guest import Job
 from stand.running.house import House
 from stand.running.order import Order, check_plan, parse_order
 from stand.running.run import run_in
+from stand.running.said import Said, keep
 from stand.running.settling_watch import load_for
 from stand.running.stop import Interrupted, Stop
 from stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
@@ -88,16 +87,17 @@ class Orders:
     async def submit(self, who: Who, request: RunRequest, key: str) -> Entry:
         """ConfigError for what is wrong with the request, Conflict for what is wrong with the stand."""
         order = await asyncio.to_thread(self._order, request)
-        await asyncio.to_thread(self._check_disk, order)
+        _said(who, request.note, request.tags)
+        night = await asyncio.to_thread(self._night, order)
         self._check_wires(order)
         digest = hashlib.sha256(request.model_dump_json().encode()).hexdigest()[:16]
-        asked = Asked(key, digest, who.name)
+        asked = Asked(key, digest, who.name, request.note, request.tags)
         now_ns = self._house.assembly.clock.now_ns()
         try:
             entry = await self.lane.call(queue.add, self.directory, order, self._config_name, now_ns, asked)
         except SessionError as error:
             raise Conflict(str(error)) from error
-        self._expected_s[entry.id] = sum(step.duration_s for step in price(order.recipe.plan(), order.config))
+        self._expected_s[entry.id] = night.duration_s
         await self.read()
         return entry
 
@@ -137,6 +137,11 @@ class Orders:
         async def recorded(folder: Path) -> None:
             await notes.begun(folder)
             begun()
+            if session is None and (said := _said(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
+                try:
+                    await keep(said, folder, hub, self._house.assembly.clock)
+                except SessionError as error:
+                    tell(f"warning: {error}")
 
         def follow(hub: Hub) -> None:
             hub.subscribe(watch)
@@ -220,11 +225,16 @@ class Orders:
         record = self._texts.get(ATTACHMENT, "")
         return replace(order, config=config, config_text=self._texts["config.yaml"], commissioning_text=record)
 
+    def folder_of(self, session: str) -> Path:
+        """Missing when there is no session of that name here; it waits for the disk."""
+        folder = self.directory / session
+        if not session or "/" in session or "\0" in session or session.startswith(".") or not folder.is_dir():
+            raise Missing("there is no session of that name")
+        return folder
+
     def _recorded(self, session: str) -> Order:
         """What a session was to run; Missing when there is no such session, Conflict when it cannot be resumed."""
-        folder = self.directory / session
-        if not session or "/" in session or session.startswith(".") or not folder.is_dir():
-            raise Missing("there is no session of that name")
+        folder = self.folder_of(session)
         try:
             if is_complete(folder):
                 raise Conflict(f"{session}: its run is complete; there is nothing to resume")
@@ -233,11 +243,12 @@ class Orders:
         except (StandError, LookupError) as error:
             raise error if isinstance(error, Conflict) else Conflict(str(error)) from error
 
-    def _check_disk(self, order: Order) -> None:
-        config: StandConfig = order.config
-        steps = price(order.recipe.plan(), config, load_learned(self.directory))
-        if lack := small_disk(shutil.disk_usage(existing(self.directory)).free, steps, config):
+    def _night(self, order: Order) -> Night:
+        """What the run will take; Conflict when the disk has no room for it."""
+        night = price_night(tuple(order.recipe.plan()), order.config, self.directory)
+        if lack := small_disk(shutil.disk_usage(existing(self.directory)).free, night.steps, order.config):
             raise Conflict(f"{self.directory}: {lack}")
+        return night
 
     def _check_wires(self, order: Order) -> None:
         """What does not answer now, and what else would end the night at its beginning."""
@@ -255,6 +266,11 @@ class Orders:
             lacks.append(missing)
         if lacks:
             raise Conflict(f"this stand cannot run it now: {'; '.join(lacks)}")
+
+
+def _said(who: Who, note: str, tags: Sequence[str]) -> Said | None:
+    """ConfigError for what is no tag."""
+    return Said(who, note, tags) if note.strip() or tags else None
 
 
 def _installed(name: str) -> str:

@@ -152,6 +152,9 @@ def _usual(step: Step, found: Situation, config: StandConfig, chamber: ChamberMo
             return Expectation(
                 f"check home {axis}", _to_home_s(stage, position) + _move_s(stage, 0.0, position), _HOMING_S
             )
+        case StartChamber(chamber_degC) | SetTemperature(chamber_degC):
+            way_s = 60.0 * abs(chamber_degC - found.to_degC) / config.set_point_K_per_min
+            return Expectation(kind_of(step), way_s, 0.0)
         case CoolDown():
             work = kind_of(step) if found.camera_was_on else COOL_DOWN_AS_FOUND
             return Expectation(work, estimate_s(step, _boot_s(config)), 0.0)

@@ -87,7 +87,7 @@ class _Approach:
     def after(self, step: Step, duration_s: float) -> _Approach:
         """When the step is done; a new set-point is taken to find the air at the old one."""
         if isinstance(step, StartChamber | SetTemperature):
-            return _Approach(self.to_degC, step.chamber_degC)
+            return _Approach(self.to_degC, step.chamber_degC, duration_s)
         # A soak that waits for the camera has time enough when its longest is enough.
         lasts_s = longest_s(step) if isinstance(step, SoakUntilSettled) else duration_s
         return replace(self, age_s=self.age_s + lasts_s, captured=self.captured or isinstance(step, Capture))
@@ -140,12 +140,12 @@ def way_back_s(plan: Iterable[PlannedStep], config: StandConfig, learned: Learne
     gap_K = ending.ambient_degC - last_degC
     if not ending.to_ambient or abs(gap_K) <= ending.band_K:
         return 0.0
-    chamber = learned.chamber
+    chamber, way_s = learned.chamber, 60.0 * abs(gap_K) / config.set_point_K_per_min
     if gap_K < 0.0:
-        return min(ending.max_s, chamber.cooling.arrival_s(gap_K, ending.band_K))
+        return min(ending.max_s, max(way_s, chamber.cooling.arrival_s(gap_K, ending.band_K)))
     dew_K = ending.band_K if config.dew is None else ending.ambient_degC - config.dew.lowest_degC(math.nan)
     follows_s = chamber.camera_time_constant_s * max(0.0, math.log(gap_K / max(ending.band_K, dew_K)))
-    return min(ending.max_s, chamber.heating.arrival_s(gap_K, ending.band_K) + follows_s)
+    return min(ending.max_s, max(way_s, chamber.heating.arrival_s(gap_K, ending.band_K)) + follows_s)
 
 
 def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:

@@ -36,6 +36,8 @@ class Asked:
     key: str = ""
     request: str = ""
     added_by: str = ""
+    note: str = ""
+    tags: tuple[str, ...] = ()
 
 
 def add(directory: Path, order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> Entry:
@@ -62,6 +64,8 @@ def add(directory: Path, order: Order, config: str, now_ns: int, asked: Asked = 
             key=asked.key,
             request=asked.request,
             added_by=asked.added_by,
+            note=asked.note,
+            tags=asked.tags,
             attended=order.attended,
         )
         draft.set(next_id=entry.id + 1, entries=(*draft.queue.entries, entry))

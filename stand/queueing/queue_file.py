@@ -53,7 +53,7 @@ class Entry(Document):
     name of its folder in the recording directory, "" before it has one. reason: why it did not come to its end.
     fruitless_starts: how often in a row it was begun or resumed without finishing one more step. key, request: the
     word of who asked for it, so that asking again adds nothing, and what was asked. added_by: who that was. attended:
-    somebody is there to do what the plan prompts for.
+    somebody is there to do what the plan prompts for. note, tags: of its session, once it has one.
     """
 
     id: int = Field(ge=1)
@@ -73,6 +73,8 @@ class Entry(Document):
     request: str = ""
     added_by: str = ""
     attended: bool = False
+    note: str = ""
+    tags: tuple[str, ...] = ()
 
     @property
     def is_open(self) -> bool:

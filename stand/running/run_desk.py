@@ -18,6 +18,7 @@ from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR, Phase
 from stand.running.executor import Executor
 from stand.running.journal import Logbook
+from stand.running.said import Said, keep
 from stand.running.state import RunState
 from stand.running.status import STATES
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
@@ -44,7 +45,6 @@ from stand.serving.seen import seen_state
 
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"
 _ENDING = (Phase.ABORTING, Phase.ENDING, Phase.ENDED)
-NOTE = "note"  # the kind of the event that an operator's note is
 
 
 @dataclass
@@ -195,13 +195,10 @@ class RunDesk:
         raise Conflict("a run has the stand; pause does not change that, `stand stop` ends the run")
 
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
-        """Into the recording of this run."""
+        """Of the session of this run."""
         if session != self.session.name:
             raise Missing(f"the session under way is {self.session.name}; others get notes from `stand session`")
-        if not text and not tags:
-            raise ConfigError("a note needs a text or a tag")
-        data: dict[str, object] = {"who": who.name, "how": who.how, "tags": list(tags)}
-        self.assembly.hub.publish(Event(self.assembly.clock.now_ns(), "info", NOTE, text, data))
+        await keep(Said(who, text, tags), self.session, self.assembly.hub, self.assembly.clock)
         return self._done(who, "note", {"tags": list(tags)}, "noted")
 
     def _done(self, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], text: str) -> Done:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from foundation.errors import StandError
 from foundation.items import Event
 from foundation.readings import Cause, Quality
+from recording.reading.notes import LONGEST_NOTE
 
 COMMAND = "command"  # the kind of the event that each command is
 
@@ -37,7 +38,7 @@ Verb = Literal[
 ]
 # socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. secop: SECoP on this
 # machine. terminal: a signal or key.
-How = Literal["socket", "loopback", "token", "secop", "terminal"]
+How = Literal["socket", "loopback", "token", "secop", "terminal", "queue"]
 When = Literal["now", "step"]
 StepStanding = Literal["waiting", "under_way", "done", "skipped"]
 
@@ -243,7 +244,7 @@ class RunRequest(Value):
     recipe_text: str = Field(default="", max_length=1 << 18)
     attended: bool = False
     tags: tuple[str, ...] = Field(default=(), max_length=32)
-    note: str = Field(default="", max_length=10_000)
+    note: str = Field(default="", max_length=LONGEST_NOTE)
 
 
 class Argument(Value):

@@ -1,6 +1,7 @@
 """Devices in memory for a stand in virtual time: each command takes a second and is noted in `calls`."""
 
 import asyncio
+import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -49,10 +50,12 @@ class Device:
 @dataclass
 class Regulator(Device):
     mv_heat: float = 0.0
+    pv_degC: float = 24.0
 
     async def read(self):
         now_ns = self.clock.now_ns()
-        return tuple(Reading(f"regulator.{name}", self.mv_heat, "%", now_ns) for name in ("mv_heat", "running"))
+        found = {"mv_heat": self.mv_heat, "running": self.mv_heat, "pv": self.pv_degC}
+        return tuple(Reading(f"regulator.{name}", value, "1", now_ns) for name, value in found.items())
 
     async def set_temperature(self, degC: float) -> None:
         await self.act(f"sp {degC:g}")
@@ -156,7 +159,7 @@ class Stage(Device):
 class Rooms:
     """A stand of these devices, and what it published."""
 
-    def __init__(self) -> None:
+    def __init__(self, K_per_min: float = math.inf) -> None:
         self.clock, self.hub = VirtualClock(0), Hub()
         self.calls: list[str] = []
         self.items: list[Item] = []
@@ -172,7 +175,7 @@ class Rooms:
             cameras={"camera": cast("Any", self.camera)},
             **parts,
         )
-        chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, COMPRESSOR_LIMITS), 5.0)
+        chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, COMPRESSOR_LIMITS), 5.0, None, K_per_min)
         self.stand = Stand(devices, chamber, SupplyLimits(2.0, 15.0), self.hub, self.clock)
 
     @property
@@ -192,9 +195,9 @@ class Rooms:
 
 
 @asynccontextmanager
-async def rooms() -> AsyncIterator[Rooms]:
+async def rooms(K_per_min: float = math.inf) -> AsyncIterator[Rooms]:
     """The stand, with its time going on while inside."""
-    here = Rooms()
+    here = Rooms(K_per_min)
     time = asyncio.create_task(here.clock.run())
     try:
         yield here

@@ -75,3 +75,41 @@ async def test_each_beat_shows_the_relays_to_who_watches_the_camera():
         await here.stand.chamber.keeper.beat()
         assert here.kinds == ["device_identity", "camera_supply_off", "camera_equilibrium_lost"]
         assert not here.stand.imaging.supply.is_on
+
+
+def set_points(calls: list[str]) -> list[float]:
+    return [float(call.split()[-1]) for call in calls if " sp " in call]
+
+
+async def test_a_set_point_changes_no_faster_than_the_cameras_may():
+    async with rooms(K_per_min=1.0) as here:
+        began_ns = here.clock.now_ns()
+        await here.stand.chamber.start(26.0)  # the air is at 24 degC
+        assert set_points(here.calls) == [24.5, 25.0, 25.5, 26.0]
+        assert here.calls.index("regulator run") < here.calls.index("regulator sp 25")
+        assert (here.clock.now_ns() - began_ns) / 1e9 >= 3 * 30.0
+        here.regulator.pv_degC = 25.9
+        await here.stand.chamber.set_temperature(26.0)  # it is there
+        assert set_points(here.calls)[4:] == [26.0]
+
+
+@pytest.mark.parametrize("order", ["set_temperature", "stop"])
+async def test_another_order_takes_over_from_a_set_point_on_its_way(order: str):
+    async with rooms(K_per_min=1.0) as here:
+        first = asyncio.create_task(here.stand.chamber.start(60.0))
+        await here.passes(45.0)
+        await (here.stand.chamber.stop() if order == "stop" else here.stand.chamber.set_temperature(23.0))
+        reached = len(here.calls)
+        await here.passes(300.0)
+        assert here.calls[reached:] == []
+        await first
+
+
+async def test_a_set_point_on_its_way_goes_no_further_when_the_stand_trips():
+    async with rooms(K_per_min=1.0) as here:
+        walking = asyncio.create_task(here.stand.chamber.start(60.0))
+        await here.passes(45.0)
+        here.stand.interlock.latch(Fault("air_hot", "the air is too hot"))
+        with pytest.raises(StandTripped, match="the air is too hot"):
+            await walking
+        assert max(set_points(here.calls)) <= 25.5

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from experiments.steps import SetTemperature, Soak, StartChamber, number_steps
 from foundation.clock import seconds_ns
 from foundation.errors import ConfigError
 from foundation.hub import Hub
@@ -13,6 +14,8 @@ from foundation.items import Batch
 from foundation.readings import Reading
 from stand.config.dew import DewConfig, dew_point_degC
 from stand.config.stand_config import load_config, packaged
+from stand.estimating.estimate import price, way_back_s
+from stand.estimating.learned import Learned
 from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
 from stand.running.order import load_order
@@ -71,6 +74,17 @@ def test_no_set_point_is_outside_of_what_a_camera_allows(tmp_path: Path):
     assert load_config(config).set_points_degC[1] == 50
     with pytest.raises(ConfigError, match=r"52\.0 degC is outside cameras.camera.ambient_degC 0\.0\.\.50\.0"):
         load_order("demo", str(config))
+
+
+def test_no_set_point_changes_faster_than_a_camera_allows(tmp_path: Path):
+    back = {"to_ambient": True}
+    slow = load_config(stand(tmp_path, cameras=camera(ambient_K_per_min=0.5), ending=back))
+    assert slow.set_point_K_per_min == 0.5
+    plan = list(number_steps([StartChamber(24.0), SetTemperature(34.0), Soak(60.0)]))
+    assert [step.duration_s for step in price(plan, slow)] == pytest.approx([0.0, 10.0 / 0.5 * 60.0, 60.0])
+    fast = load_config(stand(tmp_path, cameras=camera(), ending=back))
+    assert way_back_s(plan, slow, Learned()) == pytest.approx(11.0 / 0.5 * 60.0)
+    assert way_back_s(plan, fast, Learned()) < 11.0 / 0.5 * 60.0
 
 
 class Night:

@@ -18,6 +18,7 @@ from foundation.clock import WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub
 from foundation.items import Event
+from recording.reading.notes import read_notes
 from recording.reading.session import Session
 from stand.assembly import assemble
 from stand.config.stand_config import load_config, packaged
@@ -70,8 +71,8 @@ class Served:
         assert isinstance(answer, dict)
         return answer
 
-    def submit(self, recipe: str, key: str = "") -> dict[str, object]:
-        return self.post("queue", recipe_text=recipe, key=key)
+    def submit(self, recipe: str, key: str = "", **more: object) -> dict[str, object]:
+        return self.post("queue", recipe_text=recipe, key=key, **more)
 
     def told(self) -> str:
         """What it said, after its end."""
@@ -110,7 +111,9 @@ def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve
     assert not idle.heater_permitted
     served.submit(BRIEF, "one")
     served.submit(BRIEF, "one")  # asked again: the same
-    second = served.submit(BRIEF.replace("name: brief", "name: other"), "two")
+    with pytest.raises(SessionError, match="a tag is one word"):
+        served.submit(BRIEF, "three", tags=["two words"])
+    second = served.submit(BRIEF.replace("name: brief", "name: other"), "two", note="a new lens", tags=["lens-b"])
     running = served.until(lambda state: state.run is not None and bool(state.queue[0].session))
     with pytest.raises(SessionError, match="a run has the stand"):
         served.post("devices/flap/open")
@@ -120,6 +123,11 @@ def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve
     assert [run.recipe for run in done.queue] == ["brief", "other"]
     assert second["id"] == 2
     assert running.queue[0].session.endswith("-brief")
+    served.post(f"sessions/{done.queue[1].session}/notes", text="all well", tags=["good"])
+    said = read_notes(served.out / done.queue[1].session)
+    assert ([note.text for note in said.notes], said.tags) == (["a new lens", "all well"], ("lens-b", "good"))
+    with pytest.raises(SessionError, match="there is no session of that name"):
+        served.post("sessions/no-such/notes", text="x")
     assert not done.heater_permitted
     served.post("devices/flap/open")
     served.until(lambda state: state.flap == "open")

@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
+from recording.reading.notes import LONGEST_NOTE
 from stand.serving.api.access import STOP_PATH
 from stand.serving.api.bridge import Bridge
 from stand.serving.desk import (
@@ -62,7 +63,7 @@ class MoveRequest(_Body):
 class NoteRequest(_Body):
     """A sentence about a session, and tags to find it by."""
 
-    text: str = Field(default="", max_length=10_000)
+    text: str = Field(default="", max_length=LONGEST_NOTE)
     tags: tuple[Annotated[str, Field(max_length=100)], ...] = Field(default=(), max_length=32)
 
 

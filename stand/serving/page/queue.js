@@ -16,7 +16,7 @@ export class Queue {
     this.form_answer = h("p", { class: "answer", role: "status" });
     this.choice = h("select", { id: "recipe", onchange: () => this.choose() });
     this.attended = h("input", { type: "checkbox", id: "attended" });
-    this.note = h("input", { type: "text", id: "note", maxlength: 1000, size: 40 });
+    this.note = h("input", { type: "text", id: "note", maxlength: 4000, size: 40 });
     this.tags = h("input", { type: "text", id: "tags", maxlength: 300, size: 24, placeholder: "lens-a, after-service" });
     this.details = h("details", {}, h("summary", {}, "Look at and change its parameters"));
     this.start = h("button", { type: "submit", class: "main" }, "Add to the queue");

@@ -60,10 +60,10 @@ export class Sessions {
 
   note(each, place) {
     if (place.querySelector("form")) return;
-    const input = h("input", { type: "text", maxlength: 10000, "aria-label": `Note on ${each.name}`, size: 30 });
+    const input = h("input", { type: "text", maxlength: 4000, "aria-label": `Note on ${each.name}`, size: 30 });
     const form = h("form", { class: "row", onsubmit: async (event) => {
       event.preventDefault();
-      if (await command(this.answer, "note", "POST", `/sessions/${encodeURIComponent(each.name)}/notes`, { text: input.value })) form.remove();
+      if (await command(this.answer, "note", "POST", `/sessions/${encodeURIComponent(each.name)}/notes`, { text: input.value })) { form.remove(); this.load(); }
     } }, input, h("button", { type: "submit", class: "small" }, "Keep"));
     place.append(form);
     input.focus();

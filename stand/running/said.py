@@ -1,0 +1,51 @@
+"""What an operator says of a session through a stand's interface: kept in the session's file of notes, and told as an
+event, which is recorded by whatever records then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from foundation.clock import Clock
+from foundation.errors import ConfigError
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.lane import Lane
+from recording.reading.notes import add_note, add_tags, check_tag
+from stand.serving.desk import Who
+
+_NOTE = "note"
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """A sentence, tags, or both; ConfigError for neither, and for what is no tag."""
+
+    who: Who
+    text: str
+    tags: Sequence[str]
+
+    def __post_init__(self) -> None:
+        if not self.text.strip() and not self.tags:
+            raise ConfigError("a note needs a text or a tag")
+        for tag in self.tags:
+            check_tag(tag)
+
+
+async def keep(said: Said, session: Path, hub: Hub, clock: Clock) -> None:
+    """Durable when this returns; SessionError when it is not. No loop waits for the disk, which may hang."""
+    lane = Lane("notes", clock, patient=False)
+    try:
+        await lane.call(_keep, said, session, clock.now_ns())
+    finally:
+        lane.close()
+    who, data = said.who, {"session": session.name, "tags": list(said.tags)}
+    hub.publish(Event(clock.now_ns(), "info", _NOTE, said.text, {"who": who.name, "how": who.how, **data}))
+
+
+def _keep(said: Said, session: Path, now_ns: int) -> None:
+    if said.text.strip():
+        add_note(session, said.text, said.who.name, now_ns)
+    if said.tags:
+        add_tags(session, said.tags, said.who.name, now_ns)
