@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+from pydantic import JsonValue
+
 from foundation.readings import Reading
 
 
@@ -42,6 +44,11 @@ class Fault:
     action: Action = "abort"
     ends_itself: bool = False
     cuts_camera: bool = False
+
+    @property
+    def data(self) -> dict[str, JsonValue]:
+        """What a program needs to know of it besides its words."""
+        return {"action": self.action, "ends_itself": self.ends_itself}
 
 
 def value_of(readings: Readings, channel: str) -> float:

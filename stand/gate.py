@@ -19,7 +19,7 @@ STOPPING = "stopping"  # the run is being ended; cleared when it is over
 # The same in words, for people.
 IN_WORDS = {
     OPERATOR: "an operator's pause",
-    INTERLOCK: "a rule of the guard, until an operator clears it",
+    INTERLOCK: "a rule of the guard",
     CAMERA_LOST: "a camera that does not answer",
     DISK_LOW: "a disk that takes no frames",
     NOT_RECORDED: "a disk that takes no telemetry",

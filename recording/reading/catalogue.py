@@ -121,12 +121,16 @@ def entry_of(seen: Glance, contents: str = "") -> Entry:
     )
 
 
-def catalogue(folder: Path, report: Callable[[int], Report] | None = None) -> list[Entry]:
+Memory = dict[Path, tuple[str, Entry]]  # a digest of the files, and what was made of them
+
+
+def catalogue(folder: Path, report: Callable[[int], Report] | None = None, memory: Memory | None = None) -> list[Entry]:
     """The sessions in `folder`, the oldest first. `report`: called with how many must be looked at, gives what is told
-    of the progress. Blocking; OSError when the folder cannot be read."""
+    of the progress. memory: takes what is new in place of the index, for who must not wait for a disk that hangs.
+    Blocking; OSError when the folder cannot be read."""
     found = {path: files for path in _folders(folder) if (files := _files(path)) is not None}
     digests = {path: _digest(files) for path, files in found.items()}
-    with closing(_Index(folder)) as index:
+    with closing(_Index(folder, memory)) as index:
         known = {path: entry for path in found if (entry := index.get(path, digests[path])) is not None}
         new = [path for path in found if path not in known]
         tell = report(len(new)) if report is not None and new else None
@@ -194,8 +198,9 @@ def _digest(values: object) -> str:
 class _Index:
     """The file; every trouble with it means that nothing is known."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, memory: Memory | None) -> None:
         self._path = folder / INDEX_NAME
+        self._memory = memory
         self._version = f"{_VERSION} {installed_version()}"
         self._rows: dict[bytes, tuple[str, str]] = {}
         self._new: dict[bytes, tuple[str, str]] = {}
@@ -206,6 +211,8 @@ class _Index:
 
     def get(self, path: Path, files: str) -> Entry | None:
         """What was entered of these files; None when nothing was."""
+        if self._memory is not None and (seen := self._memory.get(path)) is not None and seen[0] == files:
+            return seen[1]
         found = self._rows.get(os.fsencode(path.name))
         if found is None or found[0] != files:
             return None
@@ -216,10 +223,17 @@ class _Index:
 
     def put(self, path: Path, files: str, entry: Entry) -> None:
         """Enter it, with the others, at the end."""
+        if self._memory is not None:
+            self._memory[path] = files, entry
+            return
         self._new[os.fsencode(path.name)] = (files, _encoded(entry))
 
     def keep(self, found: Mapping[Path, object]) -> None:
         """Forget all others."""
+        if self._memory is not None:
+            for path in self._memory.keys() - found.keys():
+                del self._memory[path]
+            return
         self._gone = set(self._rows) - {os.fsencode(path.name) for path in found}
 
     def close(self) -> None:
@@ -248,7 +262,8 @@ class _Index:
 
     def _read(self) -> dict[bytes, tuple[str, str]]:
         """Name -> digest of the files, entry; sqlite3.Error when it is no index."""
-        with closing(self._opened()) as opened:
+        with closing(sqlite3.connect(f"{self._path.absolute().as_uri()}?mode=ro", _BUSY_S, uri=True)) as opened:
+            opened.execute("PRAGMA trusted_schema = OFF")
             tables = opened.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
             if tables != [(_SCHEMA,)]:
                 return {}

@@ -12,7 +12,8 @@ from foundation.helper import Helper
 MODULE = "recording.writing.disk"
 LEFT_NAME = "stand-disk-left"  # of a process whose daemon has gone
 FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE = "frames", "telemetry", "journal", "files"
-_LINES = (FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE)
+QUEUE_LINE = "queue"  # which another program may have locked
+_LINES = (FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE, QUEUE_LINE)
 
 
 class Disk(Helper):

@@ -33,16 +33,19 @@ class Keeper:
     clock: Clock
     renew_s: float
     coils_read: Callable[[Mapping[str, bool]], None]
+    _told: str = ""  # why the permits were not renewed
 
     async def run(self) -> None:
-        """Keep until cancelled."""
+        """Keep until cancelled. What keeps it from that is an event when it begins, and when it is another."""
         due_ns = self.clock.now_ns()
         while True:
             try:
                 await self.beat()
+                self._told = ""
             except DeviceError as error:
-                text = f"heating and cooling permits not renewed: {error}"
-                self._tell("permit_not_renewed", text)
+                if self._told != str(error):
+                    self._told = str(error)
+                    self._tell("permit_not_renewed", f"heating and cooling permits not renewed: {error}")
             period_s = self.renew_s if self.permits.granted else min(self.renew_s, _SUPERVISED_S)
             due_ns = max(due_ns + seconds_ns(period_s), self.clock.now_ns())
             await self.clock.sleep_until(due_ns)

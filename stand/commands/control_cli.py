@@ -21,9 +21,10 @@ from foundation.output import output, show
 from foundation.usage import one_line
 from stand.commands.reached import on_stand
 from stand.commands.session_text import size
-from stand.gate import INTERLOCK, OPERATOR
+from stand.gate import INTERLOCK, OPERATOR, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import RunStatus, StandState
+from stand.watching.remedies import next_command
 
 app = App()
 
@@ -167,8 +168,18 @@ def _show(server: Server, state: StandState) -> None:
     run = {} if state.run is None else state.run.model_dump(mode="json")
     data = {**run, "session": run.get("session") or server.name, "stand": state.model_dump(mode="json")}
     lines = idle_lines(server.name, state) if state.run is None else status_lines(str(data["session"]), state.run)
+    lines = [*lines, *(_row("next", text) for text in _next(state))]
     asked = [] if state.prompt is None else [_row("asks", f"{state.prompt.text}; `stand continue` when it is done")]
     show(data, [*lines, *asked])
+
+
+def _next(state: StandState) -> Iterator[str]:
+    """What ends what holds the stand."""
+    if state.fault is not None:
+        ended = {} if state.run is not None else {"action": "hold"}  # a run that has tripped is over: to be cleared
+        yield next_command(f"guard.{state.fault.rule}", {**state.fault.data, **ended})
+    for reason in sorted({*state.reasons, *(() if state.run is None else state.run.reasons)} - {INTERLOCK, STOPPING}):
+        yield next_command("held", {"reason": reason})
 
 
 def _show_plan(server: Server) -> None:

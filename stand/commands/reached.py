@@ -85,4 +85,8 @@ def _running(directory: Path | None, config: str, *, anywhere: bool) -> Path:
         return sessions[0]
     if inventory(root):
         raise SessionError(f"{root}: no daemon is running this session")
-    raise SessionError(f"{root}: no daemon is running a session there")
+    others = ", ".join(map(str, running_sessions()))
+    raise SessionError(
+        f"{root}: no daemon is running a session there"
+        + (f"; there is one elsewhere, name it: {others}" if others else "")
+    )

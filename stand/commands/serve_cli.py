@@ -31,6 +31,7 @@ from stand.serving.api.interface import Interface
 from stand.serving.api.server import serve as serve_clients
 from stand.serving.secop.door import door_at
 from stand.serving.viewing import Viewing
+from stand.watching.remedies import next_command
 
 app = App()
 
@@ -78,7 +79,7 @@ def serve(
 
                     def follow(item: Item) -> None:
                         if isinstance(item, Event) and _is_told(item, wanted):
-                            tell(item.text)
+                            tell(_line(item))
 
                     hub.subscribe(follow)
                     try:
@@ -100,6 +101,10 @@ def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
 
 def _tell(line: str) -> None:
     typer.echo(one_line(line), err=True)
+
+
+def _line(event: Event) -> str:
+    return event.text if event.level == "info" else f"{event.text}; {next_command(event.kind, event.data)}"
 
 
 def _is_told(event: Event, wanted: Output) -> bool:

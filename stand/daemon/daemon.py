@@ -64,6 +64,7 @@ class Daemon:
         self._clock = assembly.clock
         self._kept, self._keep = kept, keep
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
+        self._is_given_up = False  # an operator does not want to wait for the confirmation that the stand is safe
         self._hands: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
         self._others: set[asyncio.Task[None]] = set()
         self._extending: list[asyncio.Task[None]] = []
@@ -101,7 +102,7 @@ class Daemon:
         else:
             self._assembly.stand.safety.demand()
         if self._leaving.is_set():
-            self._assembly.stand.safety.give_up()
+            self._is_given_up = self._assembly.stand.safety.give_up()
 
     def note(self) -> None:
         """Counters and fault are kept for the next start."""
@@ -188,17 +189,22 @@ class Daemon:
         await self._leaving.wait()
 
     async def _end_guest(self, worker: asyncio.Task[None]) -> None:
-        """The run has made the stand safe, and completed its session, before anything else ends."""
+        """The run has made the stand safe, and completed its session, before anything else ends. One that has not
+        begun, or waits for a disk after its end, is not waited for."""
         self.orders.leaving = True
-        while self.has_guest and not worker.done():
-            if self.orders.stop is not None:
+        while self.orders.stop is not None and not worker.done():
+            if self.orders.stop.fault is None:  # once: another stop says that nobody wants to wait any more
                 self.orders.stop(_ENDS)
             await asyncio.wait([worker], timeout=_LOOK_S)
+        if self.has_guest:
+            await asyncio.wait([worker], timeout=FINISH_WITHIN_S)
+        if self._is_given_up:
+            self._assembly.stand.safety.give_up()  # forgotten with the run
 
     async def _work(self) -> None:
         """The queue, whenever there is something in it and nothing is halted."""
         await self._adopt_camera()
-        lane, directory = self.orders.lane, self.orders.directory
+        disk, directory = self.orders.disk, self.orders.directory
         while True:
             await self._wake.wait()
             self._wake.clear()
@@ -208,7 +214,7 @@ class Daemon:
             if not any(entry.is_open for entry in queued.entries):
                 continue
             try:
-                await drain(directory, self._run_one, self._clock, self._say, lane)
+                await drain(directory, self._run_one, self._clock, self._say, disk)
                 self._tell("info", "queue_empty", "all that was queued is done")
             except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
                 self._say(f"the queue is halted: {failure_text(error)}")
@@ -240,7 +246,8 @@ class Daemon:
                 self._tell("error", RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
             raise
         finally:
-            await self._record_house()
+            if not self.orders.leaving:
+                await self._record_house()
             self.has_guest = False
             self.note()
             systemd.tell("STATUS=idle")
@@ -280,9 +287,10 @@ class Daemon:
                 with suppress(SessionError):
                     await self.orders.read()  # `stand queue add` writes it, too
                 self.wake()
-            if not self.has_guest and self._is_midnight():
+            may_begin = not (self.has_guest or self.orders.leaving)
+            if may_begin and self._is_midnight():
                 await self._turn_day()
-            if not self.has_guest and self._needs_record():
+            if may_begin and self._needs_record():
                 self.house.unrecorded()
                 await self._end_record()
                 await self._record_house()

@@ -145,7 +145,7 @@ class DaemonDesk:
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
         """Of any session in the daemon's folder."""
         said, orders = Said(who, text, tags), self._daemon.orders
-        folder = await orders.lane.call(orders.folder_of, session)
+        folder = await orders.reading.call(orders.folder_of, session)
         await keep(said, folder, self._assembly.hub, self._assembly.clock)
         self._tell(who, "note", {"tags": list(tags)})
         return self._done("note", "noted")
@@ -160,7 +160,7 @@ class DaemonDesk:
         fault = house.latched
         if fault is None:
             return None
-        return FaultState(rule=fault.rule, text=fault.text, since_ns=house.fault_ns, data={"action": fault.action})
+        return FaultState(rule=fault.rule, text=fault.text, since_ns=house.fault_ns, data=fault.data)
 
     def _of_run(
         self, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], call: Callable[[RunDesk], Result]

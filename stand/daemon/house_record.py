@@ -20,6 +20,7 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub, Subscriber
 from foundation.items import Event, Item
+from foundation.lane import Lane
 from foundation.tasks import cancelled
 from recording.reading.contents import RUN_END
 from recording.reading.run_word import Run
@@ -64,6 +65,7 @@ class HouseRecord:
         self._cut_off: list[_Recording] = []  # they take nothing any more, and are not complete yet
         self._day = ""
         self._turn = asyncio.Lock()
+        self._lane = Lane("house-record", clock, patient=False)  # for a disk that may hang
 
     @property
     def recorder(self) -> Recorder | None:
@@ -79,7 +81,7 @@ class HouseRecord:
         both, and `complete` completes it. SessionError when the disk refuses; that of the day before then goes on."""
         async with self._turn:
             day = self._today()
-            info = self._info(await asyncio.to_thread(self._place, day))
+            info = self._info(await self._lane.call(self._place, day))
             directory = self._out / info.session_id
             tap, disk = _Tap(self._assembly.hub), Disk()
             recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk)

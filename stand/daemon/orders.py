@@ -1,7 +1,7 @@
 """The queue of a daemon: what may be queued, what is in it, and how one of it is run on the open stand.
 
-A night is checked when it is queued: recipe, limits, devices that answer, room on the disk. All of the queue's file is
-read and written in a thread of its own.
+A night is checked when it is queued: recipe, limits, devices that answer, room on the disk. All that
+touches the disk is done in a thread of its own, which keeps no daemon from leaving.
 """
 
 from __future__ import annotations
@@ -18,16 +18,19 @@ from pathlib import Path
 from experiments.steps import Capture
 from foundation.errors import ConfigError, SessionError, StandError
 from foundation.hub import Hub
+from foundation.lane import Lane
 from foundation.readings import Quality
 from recording.reading.session import Session
+from recording.writing.disk import Disk
 from stand.config.checked import ATTACHMENT
 from stand.estimating.night import Night, price_night
 from stand.estimating.room import existing, small_disk
 from stand.queueing import queue
 from stand.queueing.queue import Asked, order_of
+from stand.queueing.queue_disk import QueueDisk
 from stand.queueing.queue_file import Entry, Queue, State
 from stand.queueing.queue_run import Watch, conclude, interruption_of, is_complete
-from stand.queueing.queue_work import Notes, Stopped, queue_lane
+from stand.queueing.queue_work import Notes, Stopped
 from stand.running.guest import Job
 from stand.running.house import House
 from stand.running.order import Order, check_plan, parse_order
@@ -50,6 +53,7 @@ class Orders:
     def __init__(
         self,
         house: House,
+        disk: Disk,
         directory: Path,
         config_name: str,
         texts: dict[str, str],
@@ -59,7 +63,8 @@ class Orders:
         self.stop: Stop | None = None
         self.leaving = False
         self.directory = directory
-        self.lane = queue_lane()
+        self.disk = QueueDisk(disk, house.assembly.clock)  # the queue is written by the disk's process
+        self.reading = Lane("orders", house.assembly.clock, patient=False)
         self._house = house
         self._config_name = config_name
         self._texts = texts
@@ -68,7 +73,7 @@ class Orders:
 
     async def read(self) -> None:
         """Know the queue as it is on the disk."""
-        self.queued = await self.lane.call(queue.queued, self.directory)
+        self.queued = await self.disk.call(queue.queued, self.directory)
 
     async def ready(self) -> None:
         """What a daemon that was killed had under way is not resumed by itself: somebody has to ask for it."""
@@ -76,25 +81,26 @@ class Orders:
         first = next((entry for entry in self.queued.entries if entry.is_open), None)
         if first is not None and first.state is State.INTERRUPTED:
             reason = f"run {first.id} ({first.recipe}) was interrupted: {first.reason}; resume it, or take it out"
-            await self.lane.call(queue.halt, self.directory, reason)
+            await self.disk.call(queue.halt, self.directory, reason)
             await self.read()
 
     async def clear(self) -> None:
         """The queue may continue."""
-        await self.lane.call(queue.clear, self.directory)
+        await self.disk.call(queue.clear, self.directory)
         await self.read()
 
     async def submit(self, who: Who, request: RunRequest, key: str) -> Entry:
         """ConfigError for what is wrong with the request, Conflict for what is wrong with the stand."""
-        order = await asyncio.to_thread(self._order, request)
+        order = await self.reading.call(self._order, request)
         _said(who, request.note, request.tags)
-        night = await asyncio.to_thread(self._night, order)
+        night = await self.reading.call(self._night, order)
         self._check_wires(order)
         digest = hashlib.sha256(request.model_dump_json().encode()).hexdigest()[:16]
         asked = Asked(key, digest, who.name, request.note, request.tags)
         now_ns = self._house.assembly.clock.now_ns()
         try:
-            entry = await self.lane.call(queue.add, self.directory, order, self._config_name, now_ns, asked)
+            wanted = queue.entry_of(order, self._config_name, now_ns, asked)
+            entry: Entry = await self.disk.call(queue.append, self.directory, wanted)
         except SessionError as error:
             raise Conflict(str(error)) from error
         self._expected_s[entry.id] = night.duration_s
@@ -115,9 +121,10 @@ class Orders:
 
     async def resume(self, session: str) -> Entry:
         """Its run is the next one."""
-        order = await asyncio.to_thread(self._recorded, session)
+        order = await self.reading.call(self._recorded, session)
         now_ns = self._house.assembly.clock.now_ns()
-        entry = await self.lane.call(queue.put_first, self.directory, order, self._config_name, session, now_ns)
+        wanted = queue.entry_of(order, self._config_name, now_ns)
+        entry: Entry = await self.disk.call(queue.put_first, self.directory, wanted, session)
         await self.read()
         return entry
 
@@ -126,11 +133,13 @@ class Orders:
         without the house's. Raises as a run does, Stopped when an operator has stopped it: who presses stop does not
         want the next one to begin."""
         session = self.directory / entry.session if entry.session else None
-        if session is not None and await asyncio.to_thread(is_complete, session):
+        if session is not None and await self.reading.call(is_complete, session):
             return session  # killed between its end and the note of it
-        order = await asyncio.to_thread(self._order_of, entry)
+        order = await self.reading.call(self._order_of, entry)
         config = order.config
-        before = None if session is None else await asyncio.to_thread(interruption_of, session, config, clear=True)
+        before = (
+            None if session is None else await self.reading.call(partial(interruption_of, session, config, clear=True))
+        )
         watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
         hub = self._house.assembly.hub
 
@@ -161,7 +170,7 @@ class Orders:
         finally:
             self.stop = None
             hub.unsubscribe(watch)
-        await asyncio.to_thread(conclude, entry, done, tell, report=False)
+        await self.reading.call(partial(conclude, entry, done, tell, report=False))
         if self._recorded_whole is not None and any(isinstance(planned.step, Capture) for planned in plan):
             self._recorded_whole(done)
         return done
@@ -191,7 +200,7 @@ class Orders:
 
     async def _changed(self, change: Callable[..., object], *arguments: object) -> None:
         try:
-            await self.lane.call(partial(change, self.directory, *arguments))
+            await self.disk.call(change, self.directory, *arguments)
         except SessionError as error:
             raise Conflict(str(error)) from error
         await self.read()

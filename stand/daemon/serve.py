@@ -66,7 +66,7 @@ async def serve(
                 keep = KeptFile(out, house.disk.line(FILES_LINE).run, hub, clock)
                 reports = Reports(hub, clock)
                 stack.push_async_callback(reports.close)
-                orders = Orders(house, out, config_name, texts, reports.add if has_reports else None)
+                orders = Orders(house, house.disk, out, config_name, texts, reports.add if has_reports else None)
                 for segment in await asyncio.to_thread(salvage_unfinished, out):
                     hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
                 if accepted := config.accepted():

@@ -56,6 +56,7 @@ class Guard:
     _fresh_after_ns: int = 0
     _late_ns: int | None = None  # of the last look that came late
     _endings_ns: list[int] = field(default_factory=list[int])
+    _is_excusing: bool = False  # the last look passed over an objection because of a look that came late
     _warned: set[int] = field(default_factory=set[int])  # watches whose warning stands
     _telling: set[asyncio.Task[None]] = field(default_factory=set[asyncio.Task[None]])
 
@@ -134,7 +135,7 @@ class Guard:
         elif self.held is not None and self.held.ends_itself:
             if lasting is not None:
                 self._begin_hold(lasting)
-            elif not faults and self.safety.is_confirmed:
+            elif not faults and not self._is_excusing and self.safety.is_confirmed:
                 self._end_hold(self.held)
 
     def _begin_hold(self, fault: Fault) -> None:
@@ -179,10 +180,11 @@ class Guard:
         """Those that trip; those that only warn are published when they begin. Every rule is asked: some remember."""
         now_ns = self.clock.now_ns()
         faults: list[Fault] = []
+        self._is_excusing = False
         for index, watch in enumerate(self.watches):
             fault = watch.check(self.hub, now_ns)
-            if self._late_ns is not None and now_ns - self._late_ns < seconds_ns(watch.after_gap_s):
-                fault = None
+            if fault and self._late_ns is not None and now_ns - self._late_ns < seconds_ns(watch.after_gap_s):
+                fault, self._is_excusing = None, True
             if watch.action != "warn":
                 if fault is not None:
                     faults.append(fault)
@@ -199,7 +201,7 @@ class Guard:
         self.safety.demand()
         if fault.cuts_camera and self.cut_camera is not None:
             self.cut_camera()
-        data: dict[str, object] = {"rule": fault.rule, "action": fault.action}
+        data: dict[str, object] = {"rule": fault.rule, **fault.data}
         self.hub.publish(Event(self.clock.now_ns(), "error", f"guard.{fault.rule}", fault.text, data))
         self._notify(fault.text)
 

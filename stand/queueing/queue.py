@@ -8,15 +8,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from foundation.errors import SessionError, StandTripped
-from stand.estimating.estimate import price
 from stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
-from stand.running.order import Order, parse_order, with_register_maps
+
+if TYPE_CHECKING:
+    from stand.running.order import Order
 
 
 def order_of(entry: Entry) -> Order:
     """What an entry asks for; ConfigError when this version of the program refuses it."""
+    # The process that touches the disk for a daemon loads this module, and needs none of that.
+    from stand.estimating.estimate import price
+    from stand.running.order import parse_order, with_register_maps
+
     texts = {"config.yaml": entry.config_text, "recipe.yaml": entry.recipe_text, "target.yaml": entry.target_text}
     names = {"config.yaml": entry.config, "recipe.yaml": entry.recipe, "target.yaml": "its target"}
     order = parse_order(texts, {key: f"run {entry.id} of the queue: {name}" for key, name in names.items()})
@@ -40,34 +46,44 @@ class Asked:
     tags: tuple[str, ...] = ()
 
 
-def add(directory: Path, order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> Entry:
-    """Queue a run behind all others; `config` is the name of its configuration, for messages. With the key of an
-    earlier run: that one. SessionError when the request of that key was another."""
+def entry_of(order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> Entry:
+    """What is to be queued; `config` is the name of its configuration, for messages. Its number is given later."""
+    return Entry(
+        id=1,
+        recipe=order.recipe.name,
+        config=config,
+        config_text=order.config_text,
+        recipe_text=order.recipe_text,
+        target_text=order.target_text,
+        added_ns=now_ns,
+        key=asked.key,
+        request=asked.request,
+        added_by=asked.added_by,
+        note=asked.note,
+        tags=asked.tags,
+        attended=order.attended,
+    )
+
+
+def add(directory: Path, order: Order, config: str, now_ns: int) -> Entry:
+    """Queue a run behind all others; as `entry_of` and `append`."""
+    return append(directory, entry_of(order, config, now_ns))
+
+
+def append(directory: Path, entry: Entry) -> Entry:
+    """Queue it behind all others, with a number of its own. With the key of an earlier run: that one. SessionError
+    when the request of that key was another."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SessionError(f"{directory}: cannot be made ({error.strerror})") from error
     with changing(directory) as draft:
-        earlier = next((each for each in draft.queue.entries if asked.key and each.key == asked.key), None)
+        earlier = next((each for each in draft.queue.entries if entry.key and each.key == entry.key), None)
         if earlier is not None:
-            if earlier.request != asked.request:
+            if earlier.request != entry.request:
                 raise SessionError(f"run {earlier.id} was asked for with this key, and it is another one")
             return earlier
-        entry = Entry(
-            id=draft.queue.next_id,
-            recipe=order.recipe.name,
-            config=config,
-            config_text=order.config_text,
-            recipe_text=order.recipe_text,
-            target_text=order.target_text,
-            added_ns=now_ns,
-            key=asked.key,
-            request=asked.request,
-            added_by=asked.added_by,
-            note=asked.note,
-            tags=asked.tags,
-            attended=order.attended,
-        )
+        entry = entry.model_copy(update={"id": draft.queue.next_id})
         draft.set(next_id=entry.id + 1, entries=(*draft.queue.entries, entry))
     return entry
 
@@ -149,27 +165,18 @@ def halt(directory: Path, reason: str) -> None:
         draft.set(halted=draft.queue.halted or reason)
 
 
-def put_first(directory: Path, order: Order, config: str, session: str, now_ns: int) -> Entry:
-    """Resume the run of that session next: an entry that has it is interrupted again, else there is a new one. What
-    halted the queue is cleared: an operator has asked for this."""
+def put_first(directory: Path, entry: Entry, session: str) -> Entry:
+    """Resume the run of that session next: an entry that has it is interrupted again, else `entry` is. What halted the
+    queue is cleared: an operator has asked for this."""
     with changing(directory) as draft:
         found = next((each for each in reversed(draft.queue.entries) if each.session == session), None)
-        number = draft.queue.next_id if found is None else found.id
-        entry = Entry(
-            id=number,
-            recipe=order.recipe.name,
-            config=config,
-            config_text=order.config_text,
-            recipe_text=order.recipe_text,
-            target_text=order.target_text,
-            added_ns=now_ns if found is None else found.added_ns,
-            state=State.INTERRUPTED,
-            began_ns=now_ns if found is None else found.began_ns,
-            session=session,
-        )
-        rest = [each for each in draft.queue.entries if each.id != number]
+        known = {"id": draft.queue.next_id, "began_ns": entry.added_ns}
+        if found is not None:
+            known = {"id": found.id, "added_ns": found.added_ns, "began_ns": found.began_ns}
+        entry = entry.model_copy(update={**known, "state": State.INTERRUPTED, "session": session})
+        rest = [each for each in draft.queue.entries if each.id != entry.id]
         ended, waiting = [e for e in rest if not e.is_open], [e for e in rest if e.is_open]
-        draft.set(next_id=max(draft.queue.next_id, number + 1), entries=(*ended, entry, *waiting), halted="")
+        draft.set(next_id=max(draft.queue.next_id, entry.id + 1), entries=(*ended, entry, *waiting), halted="")
     return entry
 
 

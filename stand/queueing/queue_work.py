@@ -10,12 +10,14 @@ from pathlib import Path
 
 from foundation.clock import Now, WallClock
 from foundation.errors import DeviceError, InUse, SessionError, StandError, StandTripped
-from foundation.lane import Lane
+from recording.writing.disk import Disk
 from stand.queueing.queue import finish, note_session, note_step, queued, take
+from stand.queueing.queue_disk import QueueDisk
 from stand.queueing.queue_file import Entry, State, working
 from stand.running.stop import Interrupted
 
 MOST_FRUITLESS_STARTS = 3
+_NOTED_WITHIN_S = 3.0  # real seconds that a disk may take for the note of a run's end; it is written later, then
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,23 +46,20 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
     MOST_FRUITLESS_STARTS times in a row before one more step was done is marked as failed, or it would keep all others
     from their turn.
     """
-    lane = queue_lane()
+    disk = Disk()
+    calls = QueueDisk(disk, WallClock())
     try:
         with working(directory):
-            await drain(directory, run_one, clock, tell, lane)
+            await drain(directory, run_one, clock, tell, calls)
     finally:
-        lane.close()
+        calls.close()
+        disk.close()
 
 
-def queue_lane() -> Lane:
-    """The thread that reads and writes the queue while runs are guarded: no loop waits for its disk."""
-    return Lane("queue", WallClock(), patient=False)
-
-
-async def drain(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], lane: Lane) -> None:
+async def drain(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: QueueDisk) -> None:
     """As `work`, for whoever is `working` on the queue already."""
-    while (entry := await lane.call(take, directory, clock.now_ns())) is not None:
-        run = _Run(directory, entry, clock, tell, lane)
+    while (entry := await disk.call(take, directory, clock.now_ns())) is not None:
+        run = _Run(directory, entry, clock, tell, disk)
         if entry.fruitless_starts >= MOST_FRUITLESS_STARTS:
             await run.set_aside()
         else:
@@ -80,14 +79,14 @@ class Halt(StandError):
 
 
 class _Run:
-    def __init__(self, directory: Path, entry: Entry, clock: Now, tell: Callable[[str], None], lane: Lane) -> None:
+    def __init__(self, directory: Path, entry: Entry, clock: Now, tell: Callable[[str], None], disk: QueueDisk) -> None:
         self._directory = directory
         self._entry = entry
         self._clock = clock
         self._tell = tell
         self._name = f"run {entry.id} ({entry.recipe})"
         self._has_stepped = False
-        self._lane = lane
+        self._disk = disk
         self._notes: list[asyncio.Task[None]] = []
 
     async def set_aside(self) -> None:
@@ -126,7 +125,7 @@ class _Run:
 
     async def _has_session(self) -> bool:
         await self._noted()
-        found = await self._lane.call(queued, self._directory)
+        found = await self._disk.call(queued, self._directory)
         return any(entry.id == self._entry.id and entry.session for entry in found.entries)
 
     async def _note_session(self, session: Path) -> None:
@@ -141,7 +140,7 @@ class _Run:
     async def _written(self, function: Callable[..., None], *arguments: object) -> None:
         """A queue that cannot be written is no reason to end a run that goes well."""
         try:
-            await self._lane.call(function, self._directory, self._entry.id, *arguments)
+            await self._disk.call(function, self._directory, self._entry.id, *arguments)
         except SessionError as error:
             self._tell(f"{self._name} cannot be noted: {error}")
 
@@ -149,7 +148,15 @@ class _Run:
         await asyncio.gather(*self._notes)
 
     async def _end(self, state: State, reason: str = "", *, halt: bool = False) -> None:
-        await self._noted()
+        """Noted when the disk takes that in time: one that hangs keeps nobody from leaving."""
+        told = f"{self._name} {state}" + (f": {reason}" if reason else "")
         now_ns = self._clock.now_ns()
-        await self._lane.call(partial(finish, self._directory, self._entry.id, state, now_ns, reason, halt=halt))
-        self._tell(f"{self._name} {state}" + (f": {reason}" if reason else ""))
+        try:
+            async with asyncio.timeout(_NOTED_WITHIN_S):
+                await self._noted()
+                await self._disk.call(
+                    partial(finish, self._directory, self._entry.id, state, now_ns, reason, halt=halt)
+                )
+        except TimeoutError:
+            told += "; the disk has not answered, so the queue does not know it yet"
+        self._tell(told)

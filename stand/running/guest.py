@@ -16,6 +16,7 @@ from foundation.errors import StandError, StandTripped
 from foundation.hub import Hub
 from foundation.instants import utc_text
 from foundation.items import Event, Item
+from foundation.lane import Lane
 from foundation.tasks import cause_of, failure_text, watched
 from markers.target import Target
 from recording.reading.contents import RUN_END
@@ -194,8 +195,9 @@ class Guest:
         """The published state of the run, from before its first step on."""
         assembly, recorder, state, before = self._assembly, self.recorder, self.log.state, self.job.before
         kept = state if before is None else before.kept
-        with assembly.clock.hold():  # nothing moves yet: the disk may take its time
-            night = await asyncio.to_thread(price_night, state.plan, self.job.order.config, recorder.directory.parent)
+        lane = Lane("night", assembly.clock, patient=False)  # nothing moves yet: the disk may take its time
+        leaving.callback(lane.close)
+        night = await lane.call(price_night, state.plan, self.job.order.config, recorder.directory.parent)
         gate, clock, house = assembly.stand.gate, assembly.clock, self._house
         name = self.job.order.recipe.name
         board = StatusBoard(name, night, kept, gate, self.stop, lambda: house.latched, recorder, clock)

@@ -121,7 +121,12 @@ class Journal:
         self._take((entry,))
         task = create_task(self._committed())
         self._notes.add(task)
-        task.add_done_callback(self._notes.discard)
+        task.add_done_callback(self._noted)
+
+    def _noted(self, task: Task[None]) -> None:
+        self._notes.discard(task)
+        if not task.cancelled():
+            task.exception()  # of a disk that was given up is told by whoever has given it up
 
     def _take(self, entries: Iterable[Written]) -> None:
         if self._lane is None:

@@ -223,7 +223,7 @@ class RunDesk:
             return None
         if self._fault is None or self._fault[0] != fault:
             self._fault = fault, self.assembly.clock.now_ns()
-        return FaultState(rule=fault.rule, text=fault.text, since_ns=self._fault[1], data={"action": fault.action})
+        return FaultState(rule=fault.rule, text=fault.text, since_ns=self._fault[1], data=fault.data)
 
     def _plan_step(
         self, state: RunState, planned: PlannedStep, began_ns: Mapping[str, int], ended_ns: Mapping[str, int]

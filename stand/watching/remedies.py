@@ -30,6 +30,8 @@ _OF_KIND = {
     "plan_changed": "`stand status --plan` shows the plan",
     "run_failed": "`stand queue list` shows the queue",
 }
+_BY_ITSELF = "it continues by itself when that is over"
+_TRIPPED = "once the cause is removed, `stand clear` where a daemon has the stand, else `stand resume DIR --clear`"
 _ELSE = "`stand status` shows how it stands"
 
 
@@ -40,8 +42,8 @@ def next_command(kind: str, data: Mapping[str, object]) -> str:
     if kind.startswith("guard."):
         action = data.get("action")
         if action == "hold":
-            return _OF_REASON[INTERLOCK]
-        return "`stand resume DIR --clear` once the cause is removed" if action == "abort" else _ELSE
+            return _BY_ITSELF if data.get("ends_itself") else _OF_REASON[INTERLOCK]
+        return _TRIPPED if action == "abort" else _ELSE
     if kind == "run.end":
         return "`stand resume DIR` continues it" if data.get("status") != "complete" else _ELSE
     return _OF_KIND.get(kind, _ELSE)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from recording.reading import catalogue as module
-from recording.reading.catalogue import INDEX_NAME, catalogue, look_at
+from recording.reading.catalogue import INDEX_NAME, Memory, catalogue, look_at
 from recording.reading.notes import add_note, add_tags
 from tests.recording.recorded import START_NS
 from tests.recording.runs import record_run
@@ -54,6 +54,17 @@ def listed(folder: Path, looks: list[str]) -> list[str]:
 def test_a_session_is_looked_at_once(folder: Path, looks: list[str]):
     assert listed(folder, looks) == ["a", "b", "c"]
     assert listed(folder, looks) == []
+
+
+def test_who_must_not_write_remembers_instead(folder: Path, looks: list[str]):
+    memory = Memory()
+    for expected in (["a", "b", "c"], []):
+        looks.clear()
+        assert [entry.path.name for entry in catalogue(folder, memory=memory)] == ["a", "b", "c"]
+        assert sorted(looks) == expected
+    assert not (folder / INDEX_NAME).exists()
+    shutil.rmtree(folder / "b")
+    assert len(catalogue(folder, memory=memory)) == len(memory) == 2
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,9 @@ import asyncio
 
 import pytest
 
-from foundation.errors import ConfigError, DeviceFault, Occupied, StandTripped
+from foundation.clock import seconds_ns
+from foundation.errors import ConfigError, DeviceFault, Occupied, StandTripped, Unreachable
+from foundation.tasks import cancelled
 from stand.chamber.permits import HEATER
 from stand.fault import Fault
 from stand.gate import INTERLOCK
@@ -113,3 +115,14 @@ async def test_a_set_point_on_its_way_goes_no_further_when_the_stand_trips():
         with pytest.raises(StandTripped, match="the air is too hot"):
             await walking
         assert max(set_points(here.calls)) <= 25.5
+
+
+async def test_permits_that_are_not_renewed_are_told_once_for_each_reason():
+    async with rooms() as here:
+        keeper, clock = here.stand.chamber.keeper, here.clock
+        here.stand.chamber.permits.grant()
+        here.relays.failures = [Unreachable("relays", why) for why in ("gone", "gone", "another")]
+        keeping = asyncio.create_task(keeper.run())
+        await clock.sleep_until(clock.now_ns() + seconds_ns(10 * keeper.renew_s))
+        await cancelled([keeping])
+        assert here.kinds.count("permit_not_renewed") == 2

@@ -71,6 +71,8 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
         "frames        120 saved, 1 lost",
         "disk          12.3 GB free",
         "last warning  a line\\nand another",
+        "next          it continues when there is room: `stand session archive` copies what is finished elsewhere",
+        "next          `stand continue` ends the pause",
     ]
     assert RunStatus.model_validate(told) == STATUS.model_copy(update={"session": str(path)})
 

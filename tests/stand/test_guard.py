@@ -245,6 +245,21 @@ async def test_after_a_late_look_what_is_not_renewed_in_time_trips_and_other_rul
         assert bool(bench.log) == log
 
 
+async def test_a_hold_does_not_end_because_its_cause_is_passed_over_after_a_late_look():
+    """A disk that hangs, and a process that was stopped meanwhile."""
+    bench = Bench("hold")
+    bench.guard.watches[0].ends_itself, bench.guard.watches[0].after_gap_s = True, 5.0
+    bench.objecting = {0}
+    await bench.run_for(3)
+    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(60))
+    await bench.run_for(10)
+    assert bench.guard.held is not None
+    assert bench.log == ["hold rule0", "revoke", "safe"]
+    bench.objecting = set()
+    await bench.run_for(2)
+    assert bench.log[3:] == ["release"]
+
+
 async def test_a_hold_that_ends_by_itself_ends_when_the_stand_is_safe_and_nothing_is_wrong_three_times_an_hour():
     bench = Bench("hold")
     bench.guard.watches[0].ends_itself = True

@@ -1,6 +1,7 @@
 """The queue is worked with runs that do as they are told."""
 
 import asyncio
+import fcntl
 import signal
 import subprocess
 import sys
@@ -154,6 +155,25 @@ async def test_a_queue_that_cannot_be_noted_in_does_not_end_a_run(tmp_path: Path
     await work(tmp_path, run, FollowedClock(7), runs.lines.append)
     assert any("cannot be noted" in line for line in runs.lines)
     assert runs.entries() == [("done", "night", "")]
+
+
+async def test_a_queue_that_cannot_be_reached_keeps_nobody_from_leaving(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Its lock stands for a disk that hangs."""
+    monkeypatch.setattr("stand.queueing.queue_work._NOTED_WITHIN_S", 0.1)
+    runs = Runs(tmp_path, None)
+    with (tmp_path / ".queue.lock").open("w") as lock:
+
+        async def run(entry: Entry, notes: Notes) -> Path:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            notes.step_done()
+            raise Interrupted("stopped; the stand is safe")
+
+        with pytest.raises(Interrupted):
+            await work(tmp_path, run, FollowedClock(7), runs.lines.append)
+    assert runs.lines[-1].endswith("the disk has not answered, so the queue does not know it yet")
+    assert runs.entries()[0][0] == "interrupted"
 
 
 async def test_a_second_worker_is_refused(tmp_path: Path):

@@ -108,6 +108,8 @@ def test_each_warning_says_what_to_type(follow: tuple[Follow, list[Moment], list
         ("held", {"reason": "interlock"}, "`stand clear`"),
         ("guard.stuck", {"action": "hold"}, "`stand clear`"),
         ("guard.stuck", {"action": "abort"}, "`stand resume DIR --clear`"),
+        ("guard.stuck", {"action": "abort"}, "`stand clear` where a daemon has the stand"),
+        ("guard.not_recorded", {"action": "hold", "ends_itself": True}, "by itself"),
         ("prompt", {}, "`stand continue`"),
         ("disk_nearly_full", {}, "`stand session archive`"),
         ("of a later version", {}, "`stand status`"),

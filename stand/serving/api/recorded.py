@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from foundation.errors import SessionError
 from recording.format.inventory import inventory
-from recording.reading.catalogue import Entry, catalogue, look_at
+from recording.reading.catalogue import Entry, Memory, catalogue, look_at
 from stand.config.recipe import Recipe
 from stand.config.stand_config import packaged
 from stand.serving.api.bridge import Bridge, NoAnswer
@@ -100,7 +100,7 @@ def session_in(folder: Path, name: str) -> Path:
 
 def recorded(_: Bridge, folder: Path) -> APIRouter:
     """The routes."""
-    router, disk = APIRouter(prefix="/api/v1"), Disk()
+    router, disk, memory = APIRouter(prefix="/api/v1"), Disk(), Memory()
 
     @router.get("/recipes", response_model=list[RecipeEntry])
     async def recipes() -> list[RecipeEntry]:
@@ -115,7 +115,7 @@ def recorded(_: Bridge, folder: Path) -> APIRouter:
     @router.get("/sessions", response_model=list[SessionEntry])
     async def sessions() -> list[SessionEntry]:
         """The recorded sessions, the oldest first."""
-        return await disk.ask(lambda: _sessions(folder))
+        return await disk.ask(lambda: _sessions(folder, memory))
 
     @router.get("/sessions/{name}", response_model=SessionEntry)
     async def session(name: SessionName) -> SessionEntry:
@@ -139,9 +139,10 @@ def _recipes() -> list[RecipeEntry]:
     return [RecipeEntry(name=path.stem, text=path.read_text("utf-8")) for path in sorted(here.glob("*.yaml"))]
 
 
-def _sessions(folder: Path) -> list[SessionEntry]:
+def _sessions(folder: Path, memory: Memory) -> list[SessionEntry]:
+    """A thread that writes to a disk that hangs would keep the process from ending: nothing is written."""
     try:
-        return [_entry(seen) for seen in catalogue(folder)]
+        return [_entry(seen) for seen in catalogue(folder, memory=memory)]
     except (OSError, SessionError):  # no such folder
         return []
 

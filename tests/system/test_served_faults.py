@@ -1,0 +1,72 @@
+"""Faults of a served stand that has a run, over real wires and signals: two at once."""
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from foundation.errors import SessionError
+from stand.running.order import Order
+from stand.serving.desk import StandState
+from tests.recording.disks import ext4, run
+from tests.system.conftest import require_aravis
+from tests.system.test_daemon import Served, is_idle
+from tests.system.test_unrecorded_heat import FAST, SOAK
+
+LEAVES_WITHIN_S = 20.0  # 5 s where nothing else keeps the machine busy
+STOPPED_S = 1.5  # 6 periods of the guard
+
+
+@pytest.fixture
+def served(tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]) -> Iterator[Served]:
+    require_aravis()
+    with ext4(tmp_path / "disk", 6 << 30) as disk:
+        ordered = order(SOAK, **FAST)
+        simulator(ordered.config, False)
+        served = Served(tmp_path / "config.yaml", disk / "out")
+        try:
+            yield served
+        finally:
+            subprocess.run(["fsfreeze", "-u", disk], check=False, capture_output=True)
+            served.process.kill()
+            served.process.communicate()
+
+
+def suppressed(work: Callable[[], object]) -> None:
+    with suppress(SessionError):
+        work()
+
+
+def test_a_hung_disk_holds_the_stand_over_a_stop_of_the_process_and_keeps_nobody_from_leaving(served: Served):
+    """While somebody asks for the queue and the sessions, which lie on that disk."""
+    served.until(is_idle)
+    served.submit(SOAK)
+    served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
+    run("fsfreeze", "-f", served.out.parent)
+
+    def is_held(state: StandState) -> bool:
+        return state.fault is not None and state.fault.rule == "not_recorded"
+
+    held = served.until(is_held)
+    assert held.fault is not None
+    assert held.fault.data["ends_itself"]
+    served.until(lambda state: state.readings["relays.heater_enable"].value == 0)
+    os.kill(served.process.pid, signal.SIGSTOP)
+    time.sleep(STOPPED_S)  # noqa: TID251 - a process that is stopped for real
+    os.kill(served.process.pid, signal.SIGCONT)
+    assert is_held(served.state())
+    for work in (lambda: served.server.request("GET", "/api/v1/sessions"), lambda: served.submit(SOAK)):
+        threading.Thread(target=suppressed, args=(work,), daemon=True).start()
+    assert is_held(served.state())
+    served.process.send_signal(signal.SIGTERM)
+    began_s = time.monotonic()
+    served.process.wait(LEAVES_WITHIN_S)
+    assert time.monotonic() - began_s < LEAVES_WITHIN_S
+    assert served.process.returncode == 0
+    assert "Traceback" not in served.told()
