@@ -11,16 +11,26 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.extending import register_jitable
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz"}}
+_OPTIONS: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz"},
+    "no_cfunc_wrapper": True,
+}
 """Sums may be taken in the order that suits the processor, the same each time. NaN and infinity keep their meaning."""
 
 
 def compiled(function: Function) -> Function:
-    """A part of an `entry`, compiled into it."""
-    return cast(Function, numba.njit(**_OPTIONS)(function))
+    """A part of an `entry`, compiled into it; called from Python it is the plain function.
+
+    Write loops over scalars: numpy's functions, sums of arrays and copies into slices take long to compile, with all
+    that they are made of, down to their error messages.
+    """
+    return register_jitable(**_OPTIONS)(function)
 
 
 def entry(function: Function) -> Function:
@@ -33,7 +43,7 @@ def entry(function: Function) -> Function:
     try:
         return cast(Function, numba.njit(cache=True, **_OPTIONS)(function))
     except RuntimeError:  # no locator available: nothing on this machine can be written to
-        return compiled(function)
+        return cast(Function, numba.njit(**_OPTIONS)(function))
 
 
 def digest(*modules: ModuleType) -> str:

@@ -5,6 +5,7 @@ Gauss-Newton with the weights of the noise model, one marker after the other, in
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntFlag
@@ -131,23 +132,27 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
         work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
         belief = no_belief()
         every = max(1, len(scale) // SAMPLED_MARKERS)
-        scatter[:] = np.nan
+        scatter[:] = math.nan
         for n in range(len(scale)):
             p = parameters[n].copy()
             outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
             flags[n] = _BORDER * outcome.cut + _SATURATED * (outcome.burnt > _SATURATED_PART * outcome.seen)
             if outcome.status == SETTLED:
-                parameters[n] = p
                 unscaled = inverse(work)
-                covariance[n] = unscaled * outcome.variance
-                quality[n, 0] = np.sqrt(outcome.variance)
+                for i in range(PARAMETERS):
+                    parameters[n, i] = p[i]
+                    for j in range(PARAMETERS):
+                        covariance[n, i, j] = unscaled[i, j] * outcome.variance
+                quality[n, 0] = math.sqrt(outcome.variance)
                 quality[n, 1], quality[n, 2] = misfits(pixels, p)
                 if n % every == 0:
                     clusters = clusters_of(mean_radius(p, scale[n]))
-                    scatter[n] = centre_scatter(pixels, p, scale[n], noise, unscaled, clusters)
-                    scatter[n, 1] *= outcome.variance
+                    robust, independent = centre_scatter(pixels, p, scale[n], noise, unscaled, clusters)
+                    for axis in range(2):
+                        scatter[n, 0, axis] = robust[axis]
+                        scatter[n, 1, axis] = independent[axis] * outcome.variance
             else:
-                covariance[n], quality[n] = np.nan, np.nan
+                covariance[n], quality[n] = math.nan, math.nan
                 flags[n] += _TOO_FEW * (outcome.status == TOO_FEW) + _DIVERGED * (outcome.status == DIVERGED)
 
     return fit_all

@@ -104,13 +104,15 @@ def _core_equations(
     squares, weights = 0.0, 0.0
     for first in range(0, count, _BLOCK):
         size = min(_BLOCK, count - first)
-        for row in range(4):
-            rows[_PIXEL + row, :size] = table[row, first : first + size]
+        for row in (U, V, VALUE, SHARE):
+            for k in range(size):
+                rows[_PIXEL + row, k] = table[row, first + k]
         more = _derivatives(block, size, p, scale, noise)
         squares += more[0]
         weights += more[1]
         for row in (RESIDUAL, RISE):
-            table[row, first : first + size] = rows[_PIXEL + row, :size]
+            for k in range(size):
+                table[row, first + k] = rows[_PIXEL + row, k]
         for i in range(0, PARAMETERS, 3):
             for j in range(i, PARAMETERS, 3):
                 _add_products(rows, i, j, size, normal)

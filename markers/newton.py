@@ -27,7 +27,7 @@ from markers.edge_model import (
     normal_equations,
 )
 from markers.pixels import SHARE, VALUE, Bytes, Gathered, Limits, Pixels, U, V, gather
-from markers.sectors import SECTORS, Bools, set_aside
+from markers.sectors import SECTORS, Bools, all_kept, number_of, set_aside
 
 LEAST_BAND_PX = 3.5
 CORE_SIGMA = 5.0
@@ -79,7 +79,7 @@ class Belief(NamedTuple):
 @compiled
 def no_belief() -> Belief:
     """All sectors count, and any shape is as likely as any other."""
-    return Belief(np.ones(SECTORS, np.bool_), np.zeros(4), np.zeros(4))
+    return Belief(all_kept(), np.zeros(4), np.zeros(4))
 
 
 @compiled
@@ -98,10 +98,10 @@ def settle(
     """Fit `p` (12,) to the image in place. The pixels are gathered again when the outline has left them or turned out
     more blurred than it was thought to be, which also makes the result independent of the start."""
     start, gathered_at = p.copy(), p.copy()
-    far = bool(np.isnan(p[B0]))
+    far = math.isnan(p[B0])
     gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
     gatherings = 1
-    variance = np.nan
+    variance = math.nan
     if far:
         set_start_levels(pixels, p, scale)
     fixed = mean_radius(p, scale) < _SLOPES_FROM_PX
@@ -109,27 +109,28 @@ def settle(
     for _ in range(_STEPS):
         squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right)
         if weights < _PIXELS_PER_PARAMETER * free:
-            return Outcome(TOO_FEW, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+            return Outcome(TOO_FEW, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         add_belief(work, p, belief)
         if fixed:
             hold_slopes(work)
         variance = squares / (weights - free)
         step = limited(newton_step(work), p, scale)
-        p += step
+        for i in range(PARAMETERS):
+            p[i] += step[i]
         if not possible(p, noise) or strayed(start, p, scale, 1.5):
-            return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+            return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         far = math.hypot(step[CX], step[CY]) > _FAR_PX
         if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale, band_sigma):
             gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
-            gathered_at[:] = p
+            gathered_at = p.copy()
             gatherings += 1
             if gathered.seen < 0:
-                return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+                return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         # g'd is what the step gains: less than a pixel's share once all twelve have settled.
-        elif math.hypot(step[CX], step[CY]) < _CONVERGED_PX and np.sum(work.right * step) < variance:
+        elif math.hypot(step[CX], step[CY]) < _CONVERGED_PX and gain(work, step) < variance:
             break
     if strayed(start, p, scale, 1.0):
-        return Outcome(DIVERGED, np.nan, gathered.seen, gathered.burnt, gathered.cut)
+        return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
     return Outcome(SETTLED, variance, gathered.seen, gathered.burnt, gathered.cut)
 
 
@@ -139,7 +140,7 @@ def look(
 ) -> Gathered:
     """Gather the pixels round the outline of `p`, without those of sectors that are not kept."""
     gathered = gather(image, p[:2], p[M11:SIGMA], scale, limits, ceiling, pixels)
-    if not belief.kept.all():
+    if number_of(belief.kept) < SECTORS:
         set_aside(pixels, p, belief.kept)
     return gathered
 
@@ -178,7 +179,8 @@ def long_axis(p: Float, scale: float) -> float:
 @compiled
 def set_start_levels(pixels: Pixels, p: Float, scale: float) -> None:
     """Set the levels to the means on either side of the outline."""
-    sums, counts = np.zeros(2), np.full(2, 1e-12)
+    sums, counts = np.zeros(2), np.zeros(2)
+    counts[:] = 1e-12
     for region in range(3):
         table = pixels.table[region]
         for slot in range(pixels.counts[region]):
@@ -187,16 +189,15 @@ def set_start_levels(pixels: Pixels, p: Float, scale: float) -> None:
             sums[side] += table[SHARE, slot] * table[VALUE, slot]
             counts[side] += table[SHARE, slot]
     p[B0:] = 0
-    p[F0], p[B0] = sums / counts
+    p[F0], p[B0] = sums[0] / counts[0], sums[1] / counts[1]
 
 
 @compiled
 def hold_slopes(work: Work) -> None:
     """Make the slopes of the levels stay as they are."""
     for i in (BX, BY, FX, FY):
-        work.normal[i, :] = 0
-        work.normal[:, i] = 0
-        work.normal[i, i] = 1
+        for j in range(PARAMETERS):
+            work.normal[i, j] = work.normal[j, i] = 1.0 * (i == j)
         work.right[i] = 0
 
 
@@ -210,11 +211,21 @@ def newton_step(work: Work) -> Float:
 
 
 @compiled
+def gain(work: Work, step: Float) -> float:
+    """What a step takes from the sum of squared residuals."""
+    total = 0.0
+    for i in range(PARAMETERS):
+        total += work.right[i] * step[i]
+    return total
+
+
+@compiled
 def inverse(work: Work) -> Float:
     """The inverse of J'WJ (12, 12)."""
     factor, size = _cholesky(work.normal)
-    columns = np.eye(PARAMETERS)
+    columns = np.zeros((PARAMETERS, PARAMETERS))
     for i in range(PARAMETERS):
+        columns[i, i] = 1
         _solve(factor, size, columns[i])
     return columns
 
@@ -255,8 +266,10 @@ def _solve(factor: Float, size: Float, right: Float) -> None:
 def limited(step: Float, p: Float, scale: float) -> Float:
     """The step, shortened where it would throw the centre or the outline too far, or the blur."""
     far = math.hypot(step[CX], step[CY]) / min(_GREATEST_STEP_PX, 0.5 * scale)
-    bent = np.abs(step[M11:SIGMA]).max() / (_GREATEST_BEND * 0.5 * (p[M11] + p[M22]))
-    step = step / max(1.0, far, bent)
+    bend = max(abs(step[M11]), abs(step[M12]), abs(step[M22]))
+    shorten = max(1.0, far, bend / (_GREATEST_BEND * 0.5 * (p[M11] + p[M22])))
+    for i in range(PARAMETERS):
+        step[i] /= shorten
     step[SIGMA] = min(max(step[SIGMA], -0.4 * p[SIGMA]), 0.5 * p[SIGMA])
     return step
 
@@ -266,7 +279,10 @@ def possible(p: Float, noise: Variance) -> bool:
     """Whether the parameters are those of an ellipse with an edge that stands out of the noise."""
     edge = abs(p[B0] - p[F0]) > _LEAST_CONTRAST_SIGMA * math.sqrt(noise[0] + noise[1] * max(p[B0], 0.0))
     ellipse = p[M11] > 0 and p[M11] * p[M22] > p[M12] * p[M12]
-    return bool(np.isfinite(p).all() and ellipse and edge and p[SIGMA] >= _LEAST_SIGMA_PX)
+    finite = True
+    for value in p:
+        finite = finite and math.isfinite(value)
+    return finite and ellipse and edge and p[SIGMA] >= _LEAST_SIGMA_PX
 
 
 @compiled

@@ -111,9 +111,10 @@ def gather(
                 seen += 1
                 side[outside] += 1
                 burnt[outside] += value >= ceiling
-    if burnt.sum() > 0:
-        _set_burnt_aside(pixels, centre, shape, scale, ceiling, burnt > CLIPPED_PART * side)
-    return Gathered(seen, burnt.sum(), cut)
+    if burnt[0] + burnt[1] > 0:
+        clipped = burnt[0] > CLIPPED_PART * side[0], burnt[1] > CLIPPED_PART * side[1]
+        _set_burnt_aside(pixels, centre, shape, scale, ceiling, clipped)
+    return Gathered(seen, burnt[0] + burnt[1], cut)
 
 
 @compiled
@@ -129,7 +130,7 @@ def _columns(cx: float, shape: Float, scale: float, y: float, F: float) -> tuple
 
 @compiled
 def _set_burnt_aside(
-    pixels: Pixels, centre: Float, shape: Float, scale: float, ceiling: int, clipped: NDArray[np.bool_]
+    pixels: Pixels, centre: Float, shape: Float, scale: float, ceiling: int, clipped: tuple[bool, bool]
 ) -> None:
     """Give saturated pixels the share 0, but for those on a side of the outline that is `clipped`."""
     for region in range(3):

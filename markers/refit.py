@@ -21,7 +21,7 @@ from markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Varianc
 from markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
 from markers.noise import Image, Noise, full_scale_DN
 from markers.pixels import Bytes, Pixels, bytes_of, empty_pixels
-from markers.sectors import SECTORS, Bools, sector_misfits
+from markers.sectors import SECTORS, Bools, all_kept, number_of, sector_misfits
 
 _LEAST_SECTORS = 13
 """35 %: with fewer the centre hangs on the shape that the other markers have."""
@@ -63,13 +63,30 @@ def refit_edges(
 def drop_strangers(kept: Bools, misfits: Float, greatest: float) -> None:
     """Drop what stands out before anything is fitted: a sheet over a third of the disc tilts both planes so much that
     good sectors look as bad as covered ones. Levels that the other markers get wrong are wrong everywhere."""
-    kept &= misfits <= max(greatest, _STRANGE * np.median(misfits))
+    limit = max(greatest, _STRANGE * _median(misfits))
+    for place in range(SECTORS):
+        kept[place] = kept[place] and misfits[place] <= limit
+
+
+@compiled
+def _median(values: Float) -> float:
+    """Of an even number of values."""
+    ordered = values.copy()
+    for i in range(1, len(ordered)):
+        for j in range(i, 0, -1):
+            low, high = min(ordered[j - 1], ordered[j]), max(ordered[j - 1], ordered[j])
+            ordered[j - 1], ordered[j] = low, high
+    middle = len(ordered) // 2
+    return 0.5 * (ordered[middle - 1] + ordered[middle])
 
 
 @compiled
 def drop_worst(kept: Bools, misfits: Float, greatest: float) -> bool:
     """Whether there were sectors to drop: the worst one above `greatest`, and those nearly as bad."""
-    worst = np.max(misfits * kept)
+    worst = 0.0
+    for place in range(SECTORS):
+        if kept[place]:
+            worst = max(worst, misfits[place])
     if worst <= greatest:
         return False
     for place in range(SECTORS):
@@ -107,13 +124,13 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
         work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
         for n in range(len(scale)):
             p = parameters[n].copy()
-            covariance[n], chi[n] = np.nan, np.nan
-            belief = Belief(np.ones(SECTORS, np.bool_), p[M11 : SIGMA + 1].copy(), weight[n])
+            covariance[n], chi[n] = math.nan, math.nan
+            belief = Belief(all_kept(), p[M11 : SIGMA + 1].copy(), weight[n])
             look(image, p, scale[n], band(p, scale[n], reach[n], False, band_sigma), ceiling, pixels, belief)
             normal_equations(pixels, p, scale[n], noise, work.normal, work.right)
             drop_strangers(belief.kept, sector_misfits(pixels, p), greatest)
             searching = True
-            while searching and belief.kept.sum() >= _LEAST_SECTORS:
+            while searching and number_of(belief.kept) >= _LEAST_SECTORS:
                 outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
                 if outcome.status != SETTLED:
                     break
@@ -122,13 +139,17 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
                 continue
             before = p[:2].copy()
             drop_neighbours(belief.kept)
-            if belief.kept.sum() < _LEAST_SECTORS:
+            if number_of(belief.kept) < _LEAST_SECTORS:
                 continue
             outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
             if outcome.status == SETTLED:
-                moved = p[:2] - before
-                parameters[n] = p
-                covariance[n] = inverse(work)[:2, :2] * max(outcome.variance, 1.0) + np.outer(moved, moved)
+                unscaled = inverse(work)
+                for i in range(PARAMETERS):
+                    parameters[n, i] = p[i]
+                for i in range(2):
+                    for j in range(2):
+                        moved = (p[i] - before[i]) * (p[j] - before[j])
+                        covariance[n, i, j] = unscaled[i, j] * max(outcome.variance, 1.0) + moved
                 chi[n] = math.sqrt(outcome.variance)
 
     return refit_all

@@ -68,7 +68,9 @@ def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inve
         _add_level(pixels.table[region], pixels.counts[region], p, scale, noise, inverse, first, moved, part)
     variances = np.zeros((2, 2))
     for axis in range(2):
-        whole = part[axis].sum()
+        whole = 0.0
+        for cluster in range(clusters):
+            whole += part[axis, cluster]
         for cluster in range(clusters):
             variances[0, axis] += moved[axis, cluster] ** 2
             variances[1, axis] += part[axis, cluster] * (1 - part[axis, cluster] / whole)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from markers.compiled import compiled
 from markers.edge_model import CX, CY, Float
-from markers.pixels import CORE, RESIDUAL, RISE, SHARE, Pixels, U, V
+from markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, Pixels, U, V
 
 Bools = NDArray[np.bool_]
 
@@ -25,6 +25,23 @@ def sector(p: Float, u: float, v: float) -> int:
     if y >= 0:
         return part if x >= 0 else 2 * _QUADRANT - 1 - part
     return SECTORS - 1 - part if x >= 0 else 2 * _QUADRANT + part
+
+
+@compiled
+def all_kept() -> Bools:
+    """All sectors (36,)."""
+    kept = np.empty(SECTORS, np.bool_)
+    kept[:] = True
+    return kept
+
+
+@compiled
+def number_of(kept: Bools) -> int:
+    """How many sectors are kept."""
+    number = 0
+    for place in range(SECTORS):
+        number += kept[place]
+    return number
 
 
 @compiled
@@ -49,7 +66,10 @@ def deviations(pixels: Pixels, p: Float) -> Float:
             slope = table[RISE, k] if region == CORE else 1.0
             moment[region, place] += table[SHARE, k] * slope * table[RESIDUAL, k]
             weight[region, place] += table[SHARE, k] * slope * slope
-    return np.where(weight > 0, moment, np.nan) / np.sqrt(weight)
+        for place in range(SECTORS):
+            seen = weight[region, place] > 0
+            moment[region, place] = moment[region, place] / math.sqrt(weight[region, place]) if seen else math.nan
+    return moment
 
 
 @compiled
@@ -57,8 +77,8 @@ def misfits(pixels: Pixels, p: Float) -> tuple[float, float]:
     """Root mean square over the sectors of the worse of their outlines and their two levels, and of the worse level; 1
     when the noise explains them. Something that hides a part of the marker, or shines on it, shows here long before it
     shows in the residuals of all pixels together."""
-    outline, ground, disc = [_mean(row * row) for row in deviations(pixels, p)]
-    levels = max(ground, disc)
+    found = deviations(pixels, p)
+    outline, levels = _mean_square(found[CORE]), max(_mean_square(found[GROUND]), _mean_square(found[DISC]))
     return math.sqrt(max(outline, levels)), math.sqrt(levels)
 
 
@@ -73,18 +93,22 @@ def sector_misfits(pixels: Pixels, p: Float) -> Float:
             place = sector(p, table[U, k], table[V, k])
             squares[place] += table[SHARE, k] * table[RESIDUAL, k] * table[RESIDUAL, k]
             count[place] += table[SHARE, k]
-    misfits = np.zeros(SECTORS)
-    for row in np.abs(deviations(pixels, p)):
-        misfits = np.fmax(misfits, row)
-    return np.fmax(misfits, (squares - count) / np.sqrt(2 * count))
+    found, misfits = deviations(pixels, p), np.zeros(SECTORS)
+    for place in range(SECTORS):
+        if count[place] > 0:
+            misfits[place] = max(0.0, (squares[place] - count[place]) / math.sqrt(2 * count[place]))
+        for region in range(3):
+            if abs(found[region, place]) > misfits[place]:  # not where it is NaN
+                misfits[place] = abs(found[region, place])
+    return misfits
 
 
 @compiled
-def _mean(values: Float) -> float:
+def _mean_square(values: Float) -> float:
     """Of those that are not NaN, 1 when all are."""
     total, count = 0.0, 0
     for value in values:
-        if not np.isnan(value):
-            total += value
+        if not math.isnan(value):
+            total += value * value
             count += 1
     return total / count if count > 0 else 1.0
