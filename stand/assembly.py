@@ -12,11 +12,13 @@ import usb.backend
 from drivers.devices.cameras import make_camera
 from drivers.devices.climate_chamber import ClimateChamber
 from drivers.devices.flap import Flap
+from drivers.devices.heat_pulses import HeatPulses
 from drivers.devices.inputs import Inputs
 from drivers.devices.no_relays import NoRelays
 from drivers.devices.protocols import Controller, Sensor, Switches
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays, RelaysSettings
+from drivers.devices.software_regulator import SoftwareRegulator, SoftwareRegulatorSettings
 from drivers.devices.stage import Axis
 from drivers.devices.thermal_imager import ThermalImager
 from drivers.devices.thermometers import Thermometers
@@ -58,9 +60,14 @@ class Assembly:
     def pollers(self) -> tuple[Poller, ...]:
         """One per device, in the order in which they are read when several are due at one instant."""
         config, devices = self.config, self.devices
-        timed: list[tuple[Sensor, float]] = [
+        first: list[tuple[Sensor, float]] = [
             (devices.regulator, config.controller.poll_s),
             (devices.thermometers, config.thermometer_module.poll_s),
+        ]
+        if isinstance(devices.regulator, SoftwareRegulator):  # which shows what the thermometers have read
+            first.reverse()
+        timed: list[tuple[Sensor, float]] = [
+            *first,
             (devices.relays, config.relays.poll_s if config.relays is not None else _NO_BOARD_POLL_S),
             *(
                 ((devices.inputs, config.inputs.poll_s),)
@@ -125,7 +132,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     if missing := notifier.missing():
         raise ConfigError(missing)
     bus = Bus("bus", config.bus, clock)
-    regulator, relays, thermometers = bus_units(config, bus, clock)
+    regulator, relays, thermometers = bus_units(config, bus, hub, clock)
     devices = Devices(
         regulator=regulator,
         relays=relays,
@@ -148,25 +155,41 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     boots_s = [camera.boot_s for camera in config.cameras.values()]
     equilibrium = config.camera.equilibrium if config.camera is not None else EquilibriumSettings()
     supply = SupplyLimits(max(boots_s, default=0.0), config.guard.heater_hold_s, equilibrium)
-    return Assembly(config, hub, clock, bus, devices, Stand(devices, chamber, supply, hub, clock), notifier)
+    stand = Stand(devices, chamber, supply, hub, clock)
+    if isinstance(regulator, SoftwareRegulator):
+        regulator.permitted = lambda: stand.chamber.permits.gives
+    return Assembly(config, hub, clock, bus, devices, stand, notifier)
 
 
-def bus_units(config: StandConfig, bus: Bus, clock: Clock) -> tuple[Controller, Switches, Thermometers]:
+def bus_units(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> tuple[Controller, Switches, Thermometers]:
     """Regulator or climate chamber, relays, thermometers; ConfigError when a register map is missing or wrong, or that
     of another kind of unit."""
 
     module = register_map("thermometer_module", config.thermometer_module)
+    relays = _switches(config.relays, bus, clock)
     return (
-        _controller(config, bus, clock),
-        _switches(config.relays, bus, clock),
+        _controller(config, bus, relays, hub, clock),
+        relays,
         Thermometers("thermometers", bus, module, config.thermometers, clock),
     )
 
 
-def _controller(config: StandConfig, bus: Bus, clock: Clock) -> Controller:
-    if isinstance(config.controller, OnBus):
-        return Regulator("regulator", bus, register_map("regulator", config.controller), clock)
-    return ClimateChamber("regulator", config.controller, config.limits.chamber_degC, clock)
+def _controller(config: StandConfig, bus: Bus, relays: Switches, hub: Hub, clock: Clock) -> Controller:
+    settings = config.controller
+    if isinstance(settings, OnBus):
+        return Regulator("regulator", bus, register_map("regulator", settings), clock)
+    if isinstance(settings, SoftwareRegulatorSettings):
+        return SoftwareRegulator(
+            "regulator",
+            settings,
+            HeatPulses(relays, settings.pulses, clock),
+            lambda: hub.known(f"thermometers.{settings.thermometer}"),
+            config.limits.chamber_degC,
+            config.guard.stale_after_s,
+            clock,
+            hub.publish,
+        )
+    return ClimateChamber("regulator", settings, config.limits.chamber_degC, clock)
 
 
 def _switches(relays: RelaysSettings | None, bus: Bus, clock: Clock) -> Switches:

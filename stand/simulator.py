@@ -48,7 +48,7 @@ def laboratory_of(
         "chamber_seed": simulation.chamber_seed,
         "faults": list(simulation.faults),
         "bus": address_of(config.bus.address),
-        "regulator_unit": config.regulator.unit if config.regulator is not None else None,
+        "regulator_unit": config.regulator_unit.unit if config.regulator_unit is not None else None,
         "chamber": _chamber_of(config, address_of),
         "relays_unit": config.relays.unit if config.relays is not None else None,
         "relay_channels": dict(config.relays.channels) if config.relays is not None else {},

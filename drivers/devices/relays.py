@@ -19,14 +19,16 @@ COIL_ON = 0xFF00
 COIL_OFF = 0x0000
 MAX_PULSE_COUNTS = 0x7FFF
 CAMERA_POWER = "camera_power"  # stays on by default: a warm camera is hours of work, and harmless
+HEAT = "heat"  # the output of a software regulator, in pulses
 
 
-RelayName = Literal["heater_enable", "compressor", "camera_power"]
+RelayName = Literal["heater_enable", "compressor", "camera_power", "heat"]
 
 
 class RelaysSettings(OnBus):
-    """The relay board: which relay does what (0 is the first); camera_power is that of all cameras. self_test_s: of the
-    timed-on with which the board's timer is tested, once at the start of each run; the test takes 2.2 times as long."""
+    """The relay board: which relay does what (0 is the first); camera_power is that of all cameras, heat the output of
+    a software regulator. self_test_s: of the timed-on with which the board's timer is tested, once at the start of each
+    run; the test takes 2.2 times as long."""
 
     channels: dict[RelayName, Annotated[int, Field(ge=0, le=31)]]
     poll_s: PollPeriod_s = 5.0

@@ -255,10 +255,10 @@ class Laboratory:
         if spec.chamber is not None:
             self._chamber = self._climate_chamber(spec.chamber)
             self._listen("regulator", spec.chamber.address, self._chamber.engine)
-        plant.on_step.append(self._conduct)  # after the regulator's
         if spec.relays_unit is not None:
             self._relays = FakeRelays(plant, clock, spec.relays_unit, spec.relay_channels)
             units.append(self._relays)
+        plant.on_step.append(self._conduct)  # after the regulator's and the relays'
         self.thermometers = FakeThermometers(
             plant, clock, spec.thermometers_unit, spec.thermometer_channels, seed=spec.seed
         )

@@ -23,7 +23,7 @@ from drivers.sim.modbus import (
     writes_bits,
     writes_one,
 )
-from foundation.clock import NS_PER_S, Now
+from foundation.clock import NS_PER_S, Now, seconds_ns
 
 RELAYS = 8
 ALL_RELAYS = 0x00FF
@@ -39,6 +39,7 @@ class Contacts(Timeline, Protocol):
     """What the relays switch in the plant."""
 
     heater_enabled: bool
+    heater_on_fraction: float
     compressor_on: bool
 
     @property
@@ -61,11 +62,18 @@ class Relay:
         """Its state at a time after the command."""
         return self.closed if self.until_ns is None or time_ns < self.until_ns else not self.closed
 
+    def closed_share(self, time_ns: int, dt_ns: int) -> float:
+        """Of the dt_ns from a time after the command on."""
+        if self.until_ns is None:
+            return float(self.closed)
+        share = min(1.0, max(0.0, (self.until_ns - time_ns) / dt_ns))
+        return share if self.closed else 1.0 - share
+
 
 class FakeRelays:
     """The board as unit `unit`; `channels` says which relay, counted from 0, switches which contact of the plant:
-    heater_enable, compressor, camera_power. All relays are open at power-up. closed_inputs: of the eight digital inputs
-    that some of these boards have, None for one without.
+    heater_enable, compressor, camera_power, heat (the SSR of a stand without a controller). All relays are open at
+    power-up. closed_inputs: of the eight digital inputs that some of these boards have, None for one without.
 
     Faults: silent; lost_writes (acknowledged, not done); welded (names of contacts that stay closed regardless of
     the coil); rearms False (a repeated timed-on does not start its time again); times False (a timed-on stays on).
@@ -76,6 +84,7 @@ class FakeRelays:
             "heater_enable": self._enable_heater,
             "compressor": self._run_compressor,
             "camera_power": self._power_camera,
+            "heat": self._heat,
         }
         if not channels.keys() <= switches.keys() or not set(channels.values()) <= set(range(RELAYS)):
             raise ValueError(f"relay channels {dict(channels)}: expected {', '.join(switches)} -> 0..{RELAYS - 1}")
@@ -100,7 +109,7 @@ class FakeRelays:
             0x06: writes_one(self._write_register),
             0x0F: writes_bits(self._write_coils),
         }
-        plant.on_step.append(lambda time_ns, _: self._switch(time_ns))
+        plant.on_step.append(self._on_step)
 
     def handle(self, pdu: bytes) -> bytes | None:
         """The reply to a request."""
@@ -185,6 +194,13 @@ class FakeRelays:
             self._plant.advance(self._now_ns)
             yield
 
+    def _on_step(self, time_ns: int, dt_s: float) -> None:
+        self._switch(time_ns)
+        if "heat" in self._channels:  # pulses end within a step
+            relay = self._relays[self._channels["heat"]]
+            share = relay.closed_share(time_ns, seconds_ns(dt_s))
+            self._plant.heater_on_fraction = 1.0 if "heat" in self.welded else share
+
     def _switch(self, time_ns: int) -> None:
         for channel in self._channels:
             self._switches[channel](self._conducts(channel, time_ns))
@@ -197,6 +213,9 @@ class FakeRelays:
 
     def _run_compressor(self, closed: bool) -> None:
         self._plant.compressor_on = closed
+
+    def _heat(self, closed: bool) -> None:
+        self._plant.heater_on_fraction = float(closed)
 
     def _power_camera(self, closed: bool) -> None:
         self._plant.camera_powered = closed

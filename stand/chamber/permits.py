@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from drivers.devices.protocols import Switches
+from drivers.devices.relays import HEAT
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault
 from foundation.hub import Hub
@@ -22,6 +23,7 @@ from stand.chamber.compressor import CompressorState, decide
 from stand.config.stand_config import CompressorConfig
 
 HEATER, COMPRESSOR = "heater_enable", "compressor"
+WATCHED = (HEATER, COMPRESSOR, HEAT)  # must be off without permission
 _EARLY_S = 1.0  # a relay that is off so shortly before its time may just have dropped by itself
 
 # The self-test of the dead-man, in units of self_test_s / 3: armed, armed again, must be on, must be off.
@@ -77,6 +79,11 @@ class Permits:
         """Whether heat and cold are permitted."""
         return self.permission is Permission.GRANTED
 
+    @property
+    def gives(self) -> bool:
+        """Whether heat may be given now: permitted, and the guard finds all well."""
+        return self.granted and self.allowed()
+
     def grant(self) -> None:
         """Permit heat and cold; `arm` switches."""
         self.permission, self.intrusions = Permission.GRANTED, 0
@@ -98,7 +105,7 @@ class Permits:
     async def withdraw_left_on(self) -> None:
         """Before anything else: what another daemon or a hand left on is switched off, event `left_on`. A
         compressor that ran until now begins its rest now."""
-        left_on = {name for name, on in (await self._coils()).items() if on} & {HEATER, COMPRESSOR}
+        left_on = {name for name, on in (await self._coils()).items() if on} & set(WATCHED)
         await self._relays.make_safe()
         for channel in sorted(left_on):
             self._tell("left_on", f"{self.name}.{channel} was on; switched off", channel)
@@ -115,9 +122,9 @@ class Permits:
                 self._compare(coils)
             if self.granted and coils[COMPRESSOR] and not self._compressor.running:
                 await self._intruded(COMPRESSOR)
-            if self.granted and self.allowed():
+            if self.gives:
                 await self._hold_on(HEATER)
-            if self.granted and self.allowed():  # still, after the wait
+            if self.gives:  # still, after the wait
                 await self._arm_compressor(mv_heat, mv_cool)
             return coils
 
@@ -127,8 +134,8 @@ class Permits:
         async with self._comparing:
             was_withdrawn = self.permission is Permission.WITHDRAWN
             coils = await self._coils()
-            for channel in (HEATER, COMPRESSOR):
-                if coils[channel] and was_withdrawn and self.permission is Permission.WITHDRAWN:
+            for channel in WATCHED:
+                if coils.get(channel) and was_withdrawn and self.permission is Permission.WITHDRAWN:
                     await self._intruded(channel)
             return coils
 

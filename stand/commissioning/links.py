@@ -10,12 +10,13 @@ from dataclasses import asdict, is_dataclass
 from typing import Any, cast
 
 from drivers.devices.protocols import Camera, Device, Sensor
-from drivers.devices.relays import CAMERA_POWER
+from drivers.devices.relays import CAMERA_POWER, HEAT
+from drivers.devices.software_regulator import SoftwareRegulatorSettings
 from drivers.settings import OnBus
 from foundation.errors import DeviceError, StandError, Unreachable
 from foundation.readings import Quality, Reading
 from stand.assembly import Assembly, register_map
-from stand.chamber.permits import COMPRESSOR, HEATER
+from stand.chamber.permits import WATCHED
 from stand.commissioning import advice
 from stand.commissioning.finding import Add, Finding
 from stand.commissioning.points import unverified_points
@@ -48,7 +49,12 @@ class Links:
     async def regulator(self) -> None:
         """What holds the chamber's temperature."""
         assembly, regulator = self._assembly, self._assembly.devices.regulator
-        unit = assembly.config.regulator
+        unit, settings = assembly.config.regulator_unit, assembly.config.regulator
+        if isinstance(settings, SoftwareRegulatorSettings):
+            self.opened.add(regulator.name)
+            text = f"this program itself: it measures thermometers.{settings.thermometer} and heats by relays.{HEAT}"
+            self._add(Finding(regulator.name, "link", "ok", text, data=settings.model_dump(mode="json")))
+            return
         if unit is None:
             readings = await self._device(regulator, advice.for_chamber)
         else:
@@ -80,7 +86,7 @@ class Links:
             return
         readings = await self._unit(relays, unit)
         await self._points(relays.name, "relays", unit)
-        for channel in (HEATER, COMPRESSOR):
+        for channel in WATCHED:
             if readings.get(f"{relays.name}.{channel}") == 1:
                 text = f"{channel} is on, though no program has this stand"
                 self._warn(relays.name, text, "switch it off at the board, or with `stand check --moves`")

@@ -12,13 +12,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal, Self, cast
 
-from pydantic import AfterValidator, AwareDatetime, Field, model_validator
+from pydantic import AfterValidator, AwareDatetime, Discriminator, Field, Tag, model_validator
 
 from drivers.devices.cameras import AnyCameraSettings
 from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
 from drivers.devices.flap import FlapSettings
 from drivers.devices.inputs import InputsSettings
-from drivers.devices.relays import RelaysSettings
+from drivers.devices.pid import split
+from drivers.devices.relays import HEAT, RelaysSettings
+from drivers.devices.software_regulator import SoftwareRegulatorSettings
 from drivers.devices.stage import AxisSettings
 from drivers.devices.thermal_imager import ThermalImagerSettings
 from drivers.devices.thermometers import ThermometerSettings
@@ -49,6 +51,21 @@ def _of_this_century(start: datetime) -> datetime:
     return start
 
 
+def _kind_of(regulator: object) -> str:
+    """A unit on the bus has no kind."""
+    if isinstance(regulator, dict):
+        return str(cast("dict[str, object]", regulator).get("kind", "on_bus"))
+    return "software" if isinstance(regulator, SoftwareRegulatorSettings) else "on_bus"
+
+
+RegulatorSettings = Annotated[
+    Annotated[OnBus, Tag("on_bus")] | Annotated[SoftwareRegulatorSettings, Tag("software")],
+    Discriminator(
+        _kind_of,
+        custom_error_type="kind",
+        custom_error_message="must have kind: software, or no kind and the registers of a unit on the bus",
+    ),
+]
 Folder = Literal["", "registers", "recipes", "targets"]
 MAPPED = ("regulator", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
@@ -134,14 +151,14 @@ class SimulationConfig(Document):
 
 
 class StandConfig(Document):
-    """The whole file. What holds the chamber's temperature is a regulator with a relay board that enables its heat, or
-    a climate_chamber with a controller of its own, which needs none."""
+    """The whole file. What holds the chamber's temperature is a regulator, a unit on the bus or (kind: software) ours,
+    with a relay board that enables its heat, or a climate_chamber with a controller of its own, which needs none."""
 
     name: Line = Field(min_length=1)
     operator: Line = ""
     target: str
     bus: BusSettings
-    regulator: OnBus | None = None
+    regulator: RegulatorSettings | None = None
     climate_chamber: ClimateChamberSettings | None = None
     relays: RelaysSettings | None = None
     thermometer_module: OnBus
@@ -187,12 +204,34 @@ class StandConfig(Document):
             yield "a stand has either a regulator or a climate_chamber, which holds the chamber's temperature"
         if self.regulator is not None and self.relays is None:
             yield "relays is missing: a board has to enable the regulator's heat; only a climate_chamber needs none"
+        if isinstance(self.regulator, SoftwareRegulatorSettings):
+            yield from self._unfit_software(self.regulator)
+        elif self.relays is not None and HEAT in self.relays.channels:
+            yield f"relays.channels has {HEAT}, which is the output of a regulator of kind: software, and this is none"
+
+    def _unfit_software(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
+        if self.relays is not None and HEAT not in self.relays.channels:
+            yield f"relays.channels lacks {HEAT}, the relay by which a regulator of kind: software heats"
+        if regulator.thermometer not in self.thermometers:
+            yield f"regulator.thermometer: there is no thermometer {regulator.thermometer}"
+        if regulator.sample_s < self.thermometer_module.poll_s:
+            yield "regulator.sample_s is shorter than thermometer_module.poll_s: between two readings nothing is new"
+        if regulator.pulses.cycle_s > self.guard.heater_hold_s:
+            yield "regulator.pulses.cycle_s is longer than guard.heater_hold_s, within which heat ends by itself"
+        law, compressor = regulator.law, self.compressor
+        _, coldest_percent = split(law.lowest_percent, law.dead_band_percent)
+        if law.lowest_percent < 0 and coldest_percent <= compressor.start_above_cool_percent:
+            yield (
+                f"regulator.law.lowest_percent {law.lowest_percent:g} never starts the compressor, which waits for "
+                f"more than {compressor.start_above_cool_percent:g} %; take 0 for a chamber that only heats"
+            )
 
     def _unfit_devices(self) -> Iterator[str]:
-        units = [each.unit for each in (self.regulator, self.relays, self.thermometer_module) if each is not None]
+        regulator = self.regulator_unit
+        units = [each.unit for each in (regulator, self.relays, self.thermometer_module) if each is not None]
         if len(set(units)) < len(units):
             yield f"regulator, relays and thermometer_module need different units on one bus, not {units}"
-        others = [each.unit for each in (self.regulator, self.thermometer_module) if each is not None]
+        others = [each.unit for each in (regulator, self.thermometer_module) if each is not None]
         if self.inputs is not None and self.inputs.unit in others:
             yield "inputs.unit is that of the regulator or the thermometers; take the relay board's, or another"
         addresses = [self.bus.address, *(axis.address for axis in self.axes.values())]
@@ -262,7 +301,12 @@ class StandConfig(Document):
         return outside(self, self.thermometers)
 
     @property
-    def controller(self) -> OnBus | ChamberUnitSettings:
+    def regulator_unit(self) -> OnBus | None:
+        """The regulator that is a unit on the bus."""
+        return self.regulator if isinstance(self.regulator, OnBus) else None
+
+    @property
+    def controller(self) -> OnBus | SoftwareRegulatorSettings | ChamberUnitSettings:
         """What holds the chamber's temperature."""
         if self.regulator is not None:
             return self.regulator
@@ -279,8 +323,8 @@ class StandConfig(Document):
 def load_config(path: Path) -> StandConfig:
     """The configuration file, checked. Register maps that lie beside it are named by their whole path."""
     config = load_document(path, StandConfig)
-    named: dict[str, OnBus | None] = {name: getattr(config, name) for name in (*MAPPED, "inputs")}
-    units = {name: unit for name, unit in named.items() if unit is not None}
+    named: dict[str, object] = {name: getattr(config, name) for name in (*MAPPED, "inputs")}
+    units = {name: unit for name, unit in named.items() if isinstance(unit, OnBus)}
     return config.model_copy(
         update={
             name: unit.model_copy(update={"registers": _beside(path, unit.registers)}) for name, unit in units.items()

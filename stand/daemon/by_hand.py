@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from pydantic import JsonValue
 
+from drivers.devices.software_regulator import SoftwareRegulator
 from experiments.steps import MoveTo, SetTemperature, Step, number_steps
 from foundation.errors import ConfigError, DeviceError
 from foundation.items import Batch
@@ -80,10 +81,14 @@ class ByHand:
     def _of_regulator(self) -> tuple[_Verb, ...]:
         low, high = self._assembly.config.limits.chamber_degC
         setpoint = Argument(name="setpoint_degC", unit="degC", minimum=low, maximum=high)
-        return (
+        verbs = (
             _Verb(DeviceVerb(verb="set", text="heat or cool to a set-point", arguments=(setpoint,)), self._set),
             _Verb(DeviceVerb(verb="stop", text="stop heating and cooling"), _simply(self._stand.chamber.stop)),
         )
+        if not isinstance(self._stand.devices.regulator, SoftwareRegulator):
+            return verbs
+        text = "find the constants of its law about a set-point, once that is held"
+        return (*verbs, _Verb(DeviceVerb(verb="autotune", text=text, arguments=(setpoint,)), self._autotune))
 
     def _of_flap(self) -> tuple[_Verb, ...]:
         imaging = self._stand.imaging
@@ -117,6 +122,11 @@ class ByHand:
         self._heat()
         chamber = self._stand.chamber
         return chamber.set_temperature(setpoint_degC) if chamber.permits.granted else chamber.start(setpoint_degC)
+
+    async def _autotune(self, name: str, arguments: Arguments) -> None:
+        await self._set(name, arguments)
+        if isinstance(regulator := self._stand.devices.regulator, SoftwareRegulator):
+            await regulator.autotune()
 
     def _move(self, axis: str, arguments: Arguments) -> Work:
         position = _number(arguments, "position")

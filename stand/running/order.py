@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from drivers.settings import OnBus
 from drivers.wires.bus import Bus
 from experiments.sequence import checked
 from experiments.steps import PlannedStep
@@ -12,6 +13,7 @@ from experiments.written import PlanError, Written
 from foundation.clock import WallClock
 from foundation.documents import parse_document, read_document
 from foundation.errors import ConfigError
+from foundation.hub import Hub
 from markers.target import Target
 from stand.assembly import bus_units, inputs_of
 from stand.config.checked import ATTACHMENT, load_checked
@@ -71,7 +73,7 @@ def with_register_maps(order: Order) -> Order:
     texts = register_texts(order.config)
     clock = WallClock()
     bus = Bus("bus", order.config.bus, clock)
-    bus_units(order.config, bus, clock)
+    bus_units(order.config, bus, Hub(), clock)
     inputs_of(order.config, bus, clock)
     return replace(order, register_texts=texts)
 
@@ -82,7 +84,7 @@ def register_texts(config: StandConfig) -> dict[str, str]:
     return {
         _REGISTERS.format(name): read_document(packaged("registers", unit.registers, key=f"{name}.registers"))
         for name, unit in units.items()
-        if unit is not None
+        if isinstance(unit, OnBus)
     }
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.settings import CameraSettings
+from drivers.settings import CameraSettings, OnBus
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig, load_config, packaged
 
@@ -88,7 +88,7 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
     maps = {
         name: getattr(recorded, name).model_copy(update={"registers": getattr(simulated, name).registers})
         for name in ("regulator", "relays", "thermometer_module")
-        if getattr(recorded, name) is not None and getattr(simulated, name) is not None
+        if isinstance(getattr(recorded, name), OnBus) and isinstance(getattr(simulated, name), OnBus)
     }
     if recorded.inputs is not None:
         maps["inputs"] = recorded.inputs.model_copy(update={"registers": "waveshare-inputs"})

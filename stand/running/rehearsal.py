@@ -30,7 +30,7 @@ def rehearsed(order: Order) -> Order:
         raise ConfigError(f"{config.name}: the simulated laboratory has no axis {strange[0]}, only {known}")
     update: dict[str, Any] = {
         "bus": there.bus,
-        "regulator": config.regulator and _at(config.regulator, "omron-e5cc"),
+        "regulator": _at(config.regulator_unit, "omron-e5cc") if config.regulator_unit else config.regulator,
         "relays": config.relays and _at(config.relays, "waveshare-relay"),
         "climate_chamber": config.climate_chamber and config.climate_chamber.model_copy(update={"address": _CHAMBER}),
         "thermometer_module": _at(config.thermometer_module, there.thermometer_module.registers),

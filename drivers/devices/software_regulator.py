@@ -1,0 +1,253 @@
+"""A regulator of our own, for a stand without a controller: the PID runs here, the heat goes out in pulses of a relay.
+
+What keeps it safe does not rely on it: each pulse ends by the relay board's own timer, the enable relay in series is
+held by the guard's permission alone, and the compressor's keeper takes our output as no more than a demand.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.devices import pid, relay_tuning
+from drivers.devices.heat_pulses import HeatPulses, PulsesSettings
+from drivers.devices.pid import Law
+from drivers.devices.relay_tuning import Found, Tuning, TuningSettings
+from drivers.settings import DeviceName, Polled
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.errors import DeviceError, DeviceFault, Occupied, Refused
+from foundation.items import Event, Item
+from foundation.readings import Quality, Reading, bad_reading
+from foundation.tasks import cancelled, failure_text
+
+_REST_K, _REST_S = 0.5, 600.0  # how near, and for how long, the set-point is held before it is tuned about
+
+
+class SoftwareRegulatorSettings(Polled):
+    """Our own regulator. thermometer: the one whose temperature is controlled. sample_s: between its steps, of which
+    each needs a new reading. law: `stand device regulator autotune` finds its constants."""
+
+    kind: Literal["software"]
+    thermometer: DeviceName = "air"
+    sample_s: float = Field(default=2.0, ge=0.2, le=60)
+    law: Law = Law()
+    pulses: PulsesSettings = PulsesSettings()
+    autotune: TuningSettings = TuningSettings()
+
+
+class SoftwareRegulator:
+    """The calls and channels of a regulator.
+
+    measured: the latest reading of its thermometer. Without one that is GOOD and no older than stale_s, and while
+    nothing is `permitted`, the output is 0 and the integral stays. publish: takes events.
+    """
+
+    identity = None
+
+    def __init__(
+        self,
+        name: str,
+        settings: SoftwareRegulatorSettings,
+        heat: HeatPulses,
+        measured: Callable[[], Reading | None],
+        allowed_degC: tuple[float, float],
+        stale_s: float,
+        clock: Clock,
+        publish: Callable[[Item], None],
+    ) -> None:
+        self.name = name
+        self.permitted: Callable[[], bool] = lambda: False
+        self._settings = settings
+        self._heat = heat
+        self._measured = measured
+        self._allowed_degC = allowed_degC
+        self._stale_s = stale_s
+        self._clock = clock
+        self._publish = publish
+        self._task: asyncio.Task[None] | None = None
+        self._sp_degC: float | None = None
+        self._output_percent = 0.0
+        self._state: pid.State | None = None
+        self._stepped_ns = 0  # time of the reading that the last step was made with; 0: none since a gap
+        self._rests_ns: int | None = None  # since when the set-point is held
+        self._tuning: Tuning | None = None
+        self._trouble = ""
+
+    async def open(self) -> None:
+        """Nothing to connect to: thermometer and relay are devices of their own."""
+
+    async def close(self) -> None:
+        """Give no more pulses; the last one ends by itself."""
+        await self._end()
+
+    async def read(self) -> tuple[Reading, ...]:
+        """pv, sp (degC; BAD before one was given), mv_heat, mv_cool (%), running, fault."""
+        now_ns, sp = self._clock.now_ns(), f"{self.name}.sp"
+        _, reason = self._pv(now_ns)
+        if self._task is not None and self._task.done() and not self._task.cancelled():
+            error = self._task.exception()
+            self._trouble = f"control has ended: {failure_text(error)}" if error is not None else self._trouble
+        running = self._task is not None and not self._task.done()
+        faults = [text for text in (self._trouble, reason if running else "") if text]
+        heat, cool = pid.split(self._output_percent if running else 0.0, self._settings.law.dead_band_percent)
+        return (
+            self._shown(now_ns),
+            bad_reading(sp, "degC", now_ns, "none was given yet")
+            if self._sp_degC is None
+            else Reading(sp, self._sp_degC, "degC", now_ns),
+            Reading(f"{self.name}.mv_heat", heat, "%", now_ns),
+            Reading(f"{self.name}.mv_cool", cool, "%", now_ns),
+            Reading(f"{self.name}.running", float(running), "1", now_ns),
+            Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason="; ".join(faults)),
+        )
+
+    async def set_temperature(self, degC: float) -> None:
+        """Take a set-point. Refused outside what is allowed, Occupied while it tunes itself."""
+        low_degC, high_degC = self._allowed_degC
+        if not low_degC <= degC <= high_degC:
+            raise Refused(self.name, f"{degC:g} degC is outside {low_degC:g}..{high_degC:g} degC")
+        if self._tuning is not None:
+            raise Occupied(self.name, "autotuning is active; its set-point stays")
+        if degC != self._sp_degC:
+            self._sp_degC, self._rests_ns = degC, None
+
+    async def run(self) -> None:
+        """Start control; Refused without a set-point."""
+        if self._sp_degC is None:
+            raise Refused(self.name, "no set-point was given yet")
+        if self._task is None or self._task.done():
+            self._trouble, self._state, self._rests_ns = "", None, None
+            self._task = asyncio.create_task(self._control())
+
+    async def stop(self) -> None:
+        """Stop control; the heat's relay is off, confirmed."""
+        await self._end()
+        await self._heat.off()
+        self._trouble = ""
+
+    async def make_safe(self) -> None:
+        """Stopped, confirmed."""
+        await self.stop()
+
+    async def autotune(self) -> Law:
+        """Wait until the set-point is held, find the ultimate point about it, and go on with the law as it is. The law
+        that was found is event `autotuned`; DeviceFault when none was."""
+        if self._tuning is not None:
+            raise Occupied(self.name, "autotuning is active already")
+        await self._rested()
+        sp_degC, output_percent = self._sp_degC or 0.0, self._output_percent
+        try:
+            point = await self._cycled(relay_tuning.begin(sp_degC, output_percent, self._clock.now_ns()))
+        finally:
+            self._tuning = None
+            pv, _ = self._pv(self._clock.now_ns())
+            self._state = None if pv is None else pid.start(self._settings.law, pv.value, output_percent)
+        law = relay_tuning.tuned(self._settings.law, point)
+        data: dict[str, object] = {"set_point_degC": sp_degC, **asdict(point), "law": law.model_dump(mode="json")}
+        text = f"{self.name} is tuned at {sp_degC:g} degC; in the stand's file: {relay_tuning.as_yaml(law)}"
+        self._publish(Event(self._clock.now_ns(), "info", "autotuned", text, data))
+        return law
+
+    async def _rested(self) -> None:
+        """Until the set-point has been held for a while."""
+        since_ns = self._clock.now_ns()
+        while self._rests_ns is None or self._clock.now_ns() - self._rests_ns < seconds_ns(_REST_S):
+            self._check_controls()
+            if self._clock.now_ns() - since_ns > seconds_ns(self._settings.autotune.limit_s):
+                text = f"not tuned: its set-point was not held within {_REST_K:g} K for {_REST_S:g} s"
+                raise DeviceFault(self.name, text)
+            await self._pause()
+
+    async def _cycled(self, tuning: Tuning) -> Found:
+        """What the limit cycle shows, once it is even."""
+        while (point := relay_tuning.found(tuning, self._settings.autotune)) is None:
+            self._check_controls()
+            if tuning.failure:
+                raise DeviceFault(self.name, f"not tuned: {tuning.failure}")
+            self._tuning = tuning
+            await self._pause()
+            tuning = self._tuning
+        return point
+
+    # The task of control.
+
+    async def _control(self) -> None:
+        due_ns = self._clock.now_ns()
+        try:
+            while True:
+                try:
+                    await self._tick()
+                    self._trouble = ""
+                except DeviceError as error:
+                    self._trouble = str(error)
+                due_ns = max(due_ns + seconds_ns(self._settings.sample_s), self._clock.now_ns())
+                await self._clock.sleep_until(due_ns)
+        finally:
+            self._output_percent, self._stepped_ns = 0.0, 0
+
+    async def _tick(self) -> None:
+        now_ns = self._clock.now_ns()
+        pv, _ = self._pv(now_ns)
+        was_high = self._tuning is not None and self._tuning.is_high
+        if pv is None or not self.permitted():
+            self._output_percent, self._stepped_ns, self._rests_ns = 0.0, 0, None
+        elif pv.time_ns != self._stepped_ns:
+            self._output_percent = self._step(pv, now_ns)
+        heat, _ = pid.split(self._output_percent, self._settings.law.dead_band_percent)
+        turned = self._tuning is not None and self._tuning.is_high != was_high
+        await self._heat.give(heat, at_once=turned or pv is None or self._stepped_ns == 0)
+
+    def _step(self, pv: Reading, now_ns: int) -> float:
+        """The output after this reading."""
+        law, sp_degC = self._settings.law, self._sp_degC or 0.0
+        if self._tuning is not None:
+            self._stepped_ns = pv.time_ns
+            self._tuning = relay_tuning.step(self._tuning, pv.value, now_ns, self._settings.autotune, law)
+            return relay_tuning.output_percent(self._tuning, self._settings.autotune, law)
+        if abs(pv.value - sp_degC) > _REST_K:
+            self._rests_ns = None
+        else:
+            self._rests_ns = self._rests_ns or now_ns
+        h_s = (pv.time_ns - self._stepped_ns) / NS_PER_S if self._stepped_ns else self._settings.sample_s
+        if self._state is None:
+            self._state = pid.start(law, pv.value, 0.0)
+        elif not self._stepped_ns:
+            self._state = pid.continued(law, self._state, pv.value)
+        self._stepped_ns = pv.time_ns
+        output_percent, self._state = pid.step(law, self._state, sp_degC, pv.value, h_s)
+        return output_percent
+
+    async def _end(self) -> None:
+        task, self._task = self._task, None
+        if task is not None:
+            await cancelled([task])
+
+    def _pv(self, now_ns: int) -> tuple[Reading | None, str]:
+        """A reading that may be acted upon, or why there is none."""
+        reading, channel = self._measured(), f"thermometers.{self._settings.thermometer}"
+        if reading is None:
+            return None, f"{channel} was not read yet"
+        if reading.quality is not Quality.GOOD:
+            return None, f"{channel} is {reading.quality}: {reading.reason}"
+        if now_ns - reading.time_ns > seconds_ns(self._stale_s):
+            return None, f"{channel} is {(now_ns - reading.time_ns) / NS_PER_S:.0f} s old"
+        return reading, ""
+
+    def _check_controls(self) -> None:
+        """DeviceFault when there is nothing to be tuned any more."""
+        if self._task is None or self._task.done() or not self.permitted():
+            raise DeviceFault(self.name, "not tuned: control was stopped")
+
+    async def _pause(self) -> None:
+        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._settings.sample_s))
+
+    def _shown(self, now_ns: int) -> Reading:
+        """pv: what the thermometer has given, as it was given, old or not."""
+        reading, channel = self._measured(), f"{self.name}.pv"
+        if reading is None:
+            return bad_reading(channel, "degC", now_ns, f"thermometers.{self._settings.thermometer} was not read yet")
+        return replace(reading, channel=channel)

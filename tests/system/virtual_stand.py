@@ -1,0 +1,105 @@
+"""A stand on its wires in virtual time, guarded and kept, without a run: regulator, relays, thermometers, chamber."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from foundation.clock import VirtualClock, seconds_ns
+from foundation.hub import Hub
+from foundation.items import Batch, Event, Item
+from stand.assembly import Assembly, assemble
+from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.running.house import House, opened
+from stand.running.stop import Stop
+from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
+from tests.sections import change
+
+
+@dataclass
+class VirtualStand:
+    """The open stand, what was polled (channel -> instants in s since the begin, values), and its events."""
+
+    assembly: Assembly
+    house: House
+    control: ControlSocket
+    clock: VirtualClock
+    begin_ns: int
+    series: dict[str, list[tuple[float, float]]] = field(default_factory=dict[str, list[tuple[float, float]]])
+    events: list[Event] = field(default_factory=list[Event])
+
+    def receive(self, item: Item) -> None:
+        if isinstance(item, Event):
+            self.events.append(item)
+        elif isinstance(item, Batch):
+            for reading in item.readings:
+                time_s = (reading.time_ns - self.begin_ns) / 1e9
+                self.series.setdefault(reading.channel, []).append((time_s, reading.value))
+
+    @property
+    def time_s(self) -> float:
+        return (self.clock.now_ns() - self.begin_ns) / 1e9
+
+    async def wait(self, duration_s: float) -> None:
+        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+
+    async def hold(self, set_point_degC: float, duration_s: float) -> None:
+        """Go to a set-point and stay there."""
+        chamber = self.assembly.stand.chamber
+        go = chamber.set_temperature if chamber.permits.granted else chamber.start
+        await go(set_point_degC)
+        await self.wait(duration_s)
+
+    async def break_(self, name: str, value: object) -> None:
+        """Inject a fault of the simulated laboratory."""
+        with self.clock.hold():  # its socket moves time, too
+            await self.control.request({"do": "fault", "name": name, "value": value})
+
+    async def true(self, name: str) -> float:
+        """Of the plant."""
+        with self.clock.hold():
+            return float(str((await self.control.request({"do": "state"}))[name]))
+
+    def trips(self) -> list[str]:
+        """What the guard has objected to."""
+        return [event.kind.removeprefix("guard.") for event in self.events if event.kind.startswith("guard.")]
+
+
+def bare_config(name: str, folder: Path, sections: Mapping[str, dict[str, object]] | None = None) -> StandConfig:
+    """An installed stand's file without stages and cameras; `sections` replaces entries."""
+    data = yaml.safe_load(packaged("", name).read_text())
+    data |= {"axes": {}, "cameras": {}}
+    change(data, dict(sections or {}))
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return load_config(path)
+
+
+@asynccontextmanager
+async def virtual_stand(config: StandConfig) -> AsyncGenerator[VirtualStand]:
+    """With a simulated laboratory of its own, at free addresses."""
+    assert config.simulation is not None
+    begin_ns = seconds_ns(config.simulation.start.timestamp())
+    async with Stop(has_signals=False) as stop, AsyncExitStack() as stack:
+        simulator = await asyncio.to_thread(Simulator, laboratory_of(config, virtual=True, seed=None, is_anywhere=True))
+        stack.push_async_callback(asyncio.to_thread, simulator.stop)
+        control = ControlSocket(simulator.addresses["control"])
+        stack.push_async_callback(control.close)
+        await control.open()
+        clock = VirtualClock(begin_ns, control.advance)
+        assembly = assemble(relocated(config, simulator.addresses), Hub(), clock)
+        house = await stack.enter_async_context(opened(assembly, clock.run, stop, is_for_one=True))
+        stand = VirtualStand(assembly, house, control, clock, begin_ns)
+        assembly.hub.subscribe(stand.receive)
+        house.prepare()
+        await house.read_once()
+        house.start()
+        try:
+            yield stand
+        finally:
+            await house.close()
