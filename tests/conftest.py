@@ -1,5 +1,6 @@
 """What all tests share: the stock camera, and how they are dealt out to the workers of pytest-xdist."""
 
+import gc
 import signal
 from collections.abc import Iterator
 from pathlib import Path, PurePath
@@ -29,11 +30,20 @@ _TOGETHER = {
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Ctrl-C and a closed terminal are for the programs that the tests start, too when the tests themselves run in the
+    """Whatever collecting makes is kept: the garbage collector need not look through it, then or later.
+
+    Ctrl-C and a closed terminal are for the programs that the tests start, too when the tests themselves run in the
     background of a shell or under nohup, which have them ignore these signals and pass that on."""
     for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, usual)
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """The garbage of the tests is collected, as of any program."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -67,6 +77,14 @@ def _forked_laboratories() -> Iterator[None]:
         patch.setattr(simulator, "subprocess", laboratories)
         yield
     laboratories.close()
+
+
+@pytest.fixture(scope="session")
+def compiled_fit(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The machine code that finds markers is there: processes that begin together would each make the same."""
+    from tests.compensation.conftest import compile_fit
+
+    compile_fit(tmp_path_factory.getbasetemp().parent / "compiling")
 
 
 @pytest.fixture(scope="session")

@@ -100,12 +100,16 @@ async def record(
     await recorder.finish()
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Machine code is made once: workers that begin together would each make the same for half a minute."""
-    with (tmp_path_factory.getbasetemp().parent / "compiling").open("w") as file:
+def compile_fit(lock: Path) -> None:
+    """Find markers, one of them under glare: all that is compiled for it is then kept."""
+    with lock.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         detect(photo(GLARE[0]), parse_document(TARGET_YAML, Target, "target.yaml"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled(compiled_fit: None) -> None:
+    """Any of these tests may find markers."""
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -249,7 +249,7 @@ class NightDesk(ADesk):
         """Of the image, as the camera is warmer than at the beginning."""
         return 0.021 * (self._camera - 37.5) * (1 + 0.02 * math.sin(t_s))
 
-    def live_through(self, viewing: Viewing, period_s: float = 10.0) -> None:
+    def live_through(self, viewing: Viewing, period_s: float = 30.0) -> None:
         """The night until now, into the history only."""
         t_s, history = 0.0, viewing.history
         while t_s < self.now_s():

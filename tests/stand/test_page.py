@@ -295,10 +295,11 @@ async def test_devices_take_orders_only_between_runs(night):
         assert night.orders[-1][2] == {"name": "flap", "verb": "open", "arguments": {}}
 
 
+@pytest.mark.usefixtures("compiled_fit")
 async def test_markers_and_drift_of_the_last_frame_are_shown(night):
     async with a_page(night.chromium, night.port, "camera") as page:
         night.hub.publish(frame_of(target_image(0, 0), night.clock.now_ns()))
-        await page.get_by_text("54 of 54").wait_for(timeout=120_000)  # the first of a process compiles
+        await page.get_by_text("54 of 54").wait_for()
         night.hub.publish(frame_of(target_image(0.3, 0), night.clock.now_ns()))
         await page.get_by_text("worst marker").wait_for()
         async with asyncio.timeout(60):

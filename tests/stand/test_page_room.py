@@ -6,20 +6,38 @@ import shutil
 import urllib.error
 import urllib.parse
 import urllib.request
+from contextlib import asynccontextmanager
 
 import pytest
+import pytest_asyncio
 
 from foundation.items import Batch, Event, StepMark, StepState
 from stand.serving.page_room import PAGE
 from tests.recording.recorded import half_second, record
 from tests.stand.page_desk import TARGET, a_night, frame_of, free_port, target_image
 
+pytestmark = pytest.mark.asyncio(loop_scope="module")
 
-@pytest.fixture
-async def night(tmp_path):
+
+@asynccontextmanager
+async def served_night(folder):
     port = free_port()
-    async with a_night(tmp_path / "sessions", port) as desk:
-        desk.port, desk.folder = port, tmp_path / "sessions"
+    async with a_night(folder, port) as desk:
+        desk.port, desk.folder = port, folder
+        yield desk
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def night(tmp_path_factory):
+    """For tests that only read it, and add recorded nights of their own names."""
+    async with served_night(tmp_path_factory.mktemp("night") / "sessions") as desk:
+        yield desk
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def own_night(tmp_path, compiled_fit):
+    """For tests that look at frames."""
+    async with served_night(tmp_path / "sessions") as desk:
         yield desk
 
 
@@ -81,21 +99,21 @@ async def test_what_is_no_time_is_told_in_a_sentence(night, query):
     assert json.loads(data)["error"]
 
 
-async def test_before_the_first_frame_there_is_none_and_then_there_is(night):
-    assert (await ask(night, "/api/v1/frame"))[0] == 204
-    assert (await ask(night, "/api/v1/frame.jpg"))[0] == 204
-    time_ns = night.clock.now_ns()
-    night.hub.publish(frame_of(target_image(0, 0), time_ns))
+async def test_before_the_first_frame_there_is_none_and_then_there_is(own_night):
+    assert (await ask(own_night, "/api/v1/frame"))[0] == 204
+    assert (await ask(own_night, "/api/v1/frame.jpg"))[0] == 204
+    time_ns = own_night.clock.now_ns()
+    own_night.hub.publish(frame_of(target_image(0, 0), time_ns))
     async with asyncio.timeout(120):
-        while (await ask(night, "/api/v1/frame"))[0] == 204:
+        while (await ask(own_night, "/api/v1/frame"))[0] == 204:
             await asyncio.sleep(0.2)
-    status, _, data = await ask(night, "/api/v1/frame?camera=camera")
+    status, _, data = await ask(own_night, "/api/v1/frame?camera=camera")
     found = json.loads(data)
     assert (status, found["time_ns"], len(found["markers"]), found["mean_px"]) == (200, time_ns, 54, 0.0)
-    status, headers, picture = await ask(night, "/api/v1/frame.jpg")
+    status, headers, picture = await ask(own_night, "/api/v1/frame.jpg")
     assert (status, headers["content-type"], picture[:2]) == (200, "image/jpeg", b"\xff\xd8")
     assert headers["cache-control"] == "no-store"
-    assert (await ask(night, "/api/v1/frame?camera=other"))[0] == 404
+    assert (await ask(own_night, "/api/v1/frame?camera=other"))[0] == 404
 
 
 async def test_a_recipe_is_given_as_a_document(night):
@@ -118,6 +136,7 @@ async def test_a_recorded_night_gives_its_curves(night):
     assert status in (404, 409)
 
 
+@pytest.mark.usefixtures("compiled_fit")
 async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
     """Eight frames to fit after a reference; the target moves by 0.2 px a frame."""
 
@@ -137,34 +156,35 @@ async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
     assert found["points"][0]["time_ns"] < found["points"][-1]["time_ns"]
 
 
-async def test_a_process_that_ends_is_a_warning_and_the_curves_go_on(night):
+async def test_a_process_that_ends_is_a_warning_and_the_curves_go_on(own_night):
     events = []
-    night.hub.subscribe(lambda item: isinstance(item, Event) and events.append(item))
-    night.hub.publish(frame_of(target_image(0, 0), night.clock.now_ns()))
+    own_night.hub.subscribe(lambda item: isinstance(item, Event) and events.append(item))
+    own_night.hub.publish(frame_of(target_image(0, 0), own_night.clock.now_ns()))
     async with asyncio.timeout(120):
-        while (await ask(night, "/api/v1/frame"))[0] == 204:
+        while (await ask(own_night, "/api/v1/frame"))[0] == 204:
             await asyncio.sleep(0.2)
-    night.viewing._helper._process.kill()
-    night.hub.publish(frame_of(target_image(0, 0), night.clock.now_ns()))
+    own_night.viewing._helper._process.kill()
+    own_night.hub.publish(frame_of(target_image(0, 0), own_night.clock.now_ns()))
     async with asyncio.timeout(30):
         while not [event for event in events if event.kind == "preview"]:
             await asyncio.sleep(0.05)
     (told,) = [event for event in events if event.kind == "preview"]
     assert told.level == "warning"
     assert "killed by SIGKILL" in told.text or "has ended" in told.text
-    assert (await ask(night, f"/api/v1/history?from_ns={night.began_ns}&to_ns={night.clock.now_ns()}"))[0] == 200
-    assert (await ask(night, "/api/v1/frame"))[0] == 200  # the last one stays
+    curves = f"/api/v1/history?from_ns={own_night.began_ns}&to_ns={own_night.clock.now_ns()}"
+    assert (await ask(own_night, curves))[0] == 200
+    assert (await ask(own_night, "/api/v1/frame"))[0] == 200  # the last one stays
 
 
-async def test_frames_are_skipped_and_never_queued(night):
+async def test_frames_are_skipped_and_never_queued(own_night):
     """A hundred at once: the newest is what is looked at."""
-    time_ns = night.clock.now_ns()
+    time_ns = own_night.clock.now_ns()
     for index in range(100):
-        night.hub.publish(frame_of(target_image(0, 0, (612, 512)), time_ns + index))
+        own_night.hub.publish(frame_of(target_image(0, 0, (612, 512)), time_ns + index))
     async with asyncio.timeout(120):
-        while (answer := await ask(night, "/api/v1/frame"))[0] == 204:
+        while (answer := await ask(own_night, "/api/v1/frame"))[0] == 204:
             await asyncio.sleep(0.2)
         while (found := json.loads(answer[2]))["time_ns"] != time_ns + 99:
-            answer = await ask(night, "/api/v1/frame")
+            answer = await ask(own_night, "/api/v1/frame")
             await asyncio.sleep(0.1)
     assert found["skipped"] >= 97
