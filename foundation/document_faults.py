@@ -60,7 +60,7 @@ _WITH_UNIT = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:e[-+]?\d+)?)\s*([a-zA-Z°%]*)\s
 
 def sentences(where: str, error: ValidationError, model: type[BaseModel], root: yaml.Node | None) -> str:
     """All faults of a document of this model, in one line; `root`: the YAML they are in."""
-    faults = _causes([{**fault, "loc": _written(fault["loc"], root)} for fault in error.errors()])
+    faults = _causes([{**fault, "loc": _written(fault, root)} for fault in error.errors()])
     more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
     listed: set[tuple[int | str, ...]] = set()  # places whose keys were listed
     told: list[str] = []
@@ -157,15 +157,16 @@ def _found(root: yaml.Node | None, place: Place) -> tuple[int | None, yaml.Node 
     return line, node
 
 
-def _written(place: tuple[int | str, ...], root: yaml.Node | None) -> tuple[int | str, ...]:
-    """The place as the document has it: without the tags of unions, which stand between a key and those below it."""
+def _written(fault: ErrorDetails, root: yaml.Node | None) -> tuple[int | str, ...]:
+    """Its place as the document has it: without the tags of unions, which stand between a key and those below it."""
     kept, node = list[int | str](), root
-    for number, part in enumerate(place):
+    for number, part in enumerate(fault["loc"]):
         line, inner = _found(node, (part,))
-        is_last = number == len(place) - 1
-        may_be_missing = isinstance(node, yaml.MappingNode) and is_last
-        if not isinstance(part, str) or line is not None or node is None or part == "[key]" or may_be_missing:
-            kept.append(part)
+        is_last = number == len(fault["loc"]) - 1
+        is_between = isinstance(node, yaml.MappingNode) if not is_last else fault["type"] == "model_type"
+        if number and node is not None and line is None and is_between:
+            continue
+        kept.append(part)
         node = inner
     return tuple(kept)
 

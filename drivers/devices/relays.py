@@ -60,6 +60,8 @@ class Relays:
         for channel, point in self._points.items():
             if point not in register_map.points:
                 raise ConfigError(f"{name}.{channel}: register map {register_map.model} has no {point}")
+            if channel == HEAT and register_map.points[point].pulse is None:
+                raise ConfigError(f"{name}.{channel}: register map {register_map.model} knows no timed-on of {point}")
 
     @property
     def identity(self) -> Identity | None:

@@ -27,5 +27,6 @@ def test_each_recipe_and_each_stand_is_listed_by_the_name_that_commands_take():
     assert any(line.startswith("thermal-cycle ") and "Two cycles over 10..52 degC" in line for line in lines)
     for each in json.loads(ask(stand, "recipes", "--json")):
         assert str(packaged("recipes", each["name"])) == each["path"]
-    assert [line.split()[0] for line in ask(stand, "configs").splitlines()] == ["laboratory", "simulated"]
+    names = [line.split()[0] for line in ask(stand, "configs").splitlines()]
+    assert names == ["laboratory", "simulated", "software-regulator"]
     assert json.loads(ask(stand, "configs", "--json"))[1]["text"] == "simulated-stand"
