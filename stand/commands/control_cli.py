@@ -214,7 +214,8 @@ def idle_lines(name: str, state: StandState) -> Iterator[str]:
             yield _row("temperatures", f"{channel} {'BAD' if reading.value is None else f'{reading.value:.2f} degC'}")
     waiting = sum(run.state in ("waiting", "interrupted") for run in state.queue)
     yield _row("queue", f"{waiting} to be run" + (f"; halted: {state.queue_halted}" if state.queue_halted else ""))
-    yield _row("disk", f"{size(state.disk_free_bytes)} free")
+    if state.disk_free_bytes:  # 0 when nobody records, and it is not known
+        yield _row("disk", f"{size(state.disk_free_bytes)} free")
 
 
 def status_lines(session: Path | str, found: RunStatus) -> Iterator[str]:

@@ -11,6 +11,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.readings import Quality
 from stand.fault import Action, Fault, Readings, value_of
 
+_CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to clear that
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
 
 
@@ -48,10 +49,12 @@ class Watch:
 
 def over_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False) -> Rule:
     """`channel` reads above `max_degC`; a BAD or missing value is another rule's business. cuts_camera: it is the
-    camera itself that is too warm."""
+    camera itself that is too warm, and what it read last counts no more when it has been off for a while."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        value_degC = value_of(readings, channel)
+        value_degC, reading = value_of(readings, channel), readings.known(channel)
+        if cuts_camera and reading is not None and now_ns - reading.time_ns > seconds_ns(_CAMERA_KNOWN_S):
+            return None
         if value_degC > max_degC:
             text = f"{channel} is {value_degC:.2f} degC, above the limit of {max_degC} degC"
             return Fault("over_temperature", text, cuts_camera=cuts_camera)

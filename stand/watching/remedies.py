@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
 
 _ROOM = "it continues when there is room: `stand session archive` copies what is finished elsewhere"
+_DISK = "it continues when the disk takes what waits; `stand status` shows how it stands"
 _OF_REASON = {
     OPERATOR: "`stand continue` ends the pause",
     INTERLOCK: "`stand clear` once the cause is removed",
     CAMERA_LOST: "it continues when the camera answers: `stand devices` shows what is connected",
     DISK_LOW: _ROOM,
-    NOT_RECORDED: _ROOM,
+    NOT_RECORDED: _DISK,
 }
 _OF_KIND = {
     "prompt": "`stand continue` when it is done",
@@ -21,7 +22,7 @@ _OF_KIND = {
     "camera_supply_off": "`stand devices` shows what is connected",
     "device_lost": "`stand devices` shows what is connected",
     "frames_stopped": _ROOM,
-    "telemetry_not_saved": _ROOM,
+    "telemetry_not_saved": _DISK,
     "disk_nearly_full": _ROOM,
     "not_confirmed_safe": "switch the stand off by hand; `stand status` says when it is safe",
     "alert_failed": "`stand alert test` tries them",
