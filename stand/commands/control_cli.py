@@ -117,7 +117,7 @@ def clear(server: Server) -> None:
     Example: stand clear
     """
     answer = server.order("clear")
-    _say(server, answer, f"cleared; {_still(answer)}")
+    _say(server, answer, f"cleared; {_still(answer) if answer.get('reasons') else 'nothing holds the stand any more'}")
 
 
 @app.command()
