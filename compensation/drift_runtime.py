@@ -54,6 +54,7 @@ class ThermalState:
         self._taus_s = np.array([RATE_TAU_S, *taus_s])
         self._radii_K = np.array(plays_K, float)
         self._self_heating_K = self_heating_K
+        self._dt_s = self._gained = math.nan
         self.begun = False
         self.settled_s = self.on_s = self.air_degC = self.camera_degC = math.nan
         self.ambient_lag = self.power_lag = self.camera_lag = np.full(len(self._taus_s), math.nan)
@@ -75,11 +76,14 @@ class ThermalState:
         self.camera_degC = ambient_degC + excess_K if math.isnan(camera_degC) else camera_degC
         # First-order followers of a constant input, exactly: z + (s - z)(1 - exp(-dt/tau)); and Prandtl-Ishlinskii
         # plays, which stay where they are until the camera is further away than their radius.
-        gained = -np.expm1(-dt_s / self._taus_s)
+        if dt_s != self._dt_s:
+            self._dt_s, self._gained = dt_s, -np.expm1(-dt_s / self._taus_s)
+        gained = self._gained
         self.ambient_lag = self.ambient_lag + (ambient_degC - self.ambient_lag) * gained
         self.power_lag = self.power_lag + (power_on - self.power_lag) * gained
         self.camera_lag = self.camera_lag + ((before_degC + self.camera_degC) / 2 - self.camera_lag) * gained
-        self.plays = np.clip(self.plays, self.camera_degC - self._radii_K, self.camera_degC + self._radii_K)
+        lowest, highest = self.camera_degC - self._radii_K, self.camera_degC + self._radii_K
+        self.plays = np.minimum(np.maximum(self.plays, lowest), highest)
         self.settled_s += dt_s
         self.on_s = self.on_s + dt_s if power_on == 1 else dt_s * power_on
 

@@ -142,19 +142,19 @@ def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: F
     marks_ns = marks_ns[marks_ns >= begin_ns]
     camera = _camera(history, marks_ns, time_ns, camera_degC)
     inputs = np.column_stack([np.diff(marks_ns) / NS_PER_S, *_means(history, marks_ns), camera[1:]])
-    rows = np.concatenate([unknown.rows[:1] * np.nan, _followed(memory, inputs)])
-    found = rows[np.clip(np.searchsorted(marks_ns, time_ns), 0, len(rows) - 1)]
+    found = _followed(memory, inputs, np.minimum(np.searchsorted(marks_ns, time_ns), len(inputs)))
     return States.from_rows(memory, np.where(np.isfinite(found[:, :1]), found, unknown.rows))
 
 
-def _followed(memory: Memory, inputs: Float) -> Float:
-    """The state's rows after each sample (dt, ambient, power, camera)."""
-    state = state_of(memory)
-    rows: list[Float] = []
-    for sample in inputs.tolist():
+def _followed(memory: Memory, inputs: Float, after: NDArray[np.intp]) -> Float:
+    """The state's row after so many (F,) of the samples (dt, ambient, power, camera); NaN after none."""
+    state, wanted = state_of(memory), set(after.tolist())
+    rows = {0: row_of(state)}
+    for number, sample in enumerate(inputs.tolist(), 1):
         state.advance(*sample)
-        rows.append(row_of(state))
-    return np.array(rows)
+        if number in wanted:
+            rows[number] = row_of(state)
+    return np.array([rows[number] for number in after.tolist()])
 
 
 def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
