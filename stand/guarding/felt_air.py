@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from statistics import fmean, median
+from statistics import fmean
 
 from foundation.clock import NS_PER_S, seconds_ns
 from stand.config.looks import CameraFeelsConfig, GraniteFeelsConfig
@@ -53,7 +53,8 @@ def felt(looks: Sequence[Look], window_s: float, lag_s: float) -> Felt | None:
     changes nothing: medians of three."""
     if len(looks) < 5 or looks[-1].time_ns - looks[0].time_ns < 0.9 * seconds_ns(window_s):
         return None
-    bodies_degC = [median(look.body_degC for look in looks[at - 1 : at + 2]) for at in range(1, len(looks) - 1)]
+    read_degC = [look.body_degC for look in looks]
+    bodies_degC = [sorted(three)[1] for three in zip(read_degC, read_degC[1:], read_degC[2:], strict=False)]
     times_s = [(look.time_ns - looks[0].time_ns) / NS_PER_S for look in looks[1:-1]]
     middle_s, body_degC = fmean(times_s), fmean(bodies_degC)
     product = sum((at - middle_s) * (each - body_degC) for at, each in zip(times_s, bodies_degC, strict=True))

@@ -20,6 +20,17 @@ from tests.sections import change
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.
 _CORNER: dict[str, object] = {"width_px": 612, "height_px": 256}
+# For runs in real time: what happens each second or in seconds on a stand happens several times a second.
+FAST: dict[str, dict[str, object]] = {
+    "regulator": {"poll_s": 0.25},
+    "thermometer_module": {"poll_s": 0.25},
+    "relays": {"poll_s": 0.5, "self_test_s": 0.6},
+    "flap": {"poll_s": 0.5},
+    "camera": {"poll_s": 0.5, "boot_s": 0.2},
+    "guard": {"period_s": 0.25, "heater_hold_s": 3.0, "heater_renew_s": 0.5},
+    # Longer than a commit takes on the busy disk of a shared machine: the fourth hold within an hour waits for `clear`.
+    "recording": {"telemetry_commit_s": 0.2, "durable_within_s": 3.0},
+}
 
 SHORT_RECIPE = """
 name: short

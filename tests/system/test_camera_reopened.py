@@ -11,9 +11,9 @@ import pytest
 from foundation.items import Batch
 from recording.reading.session import Session
 from stand.running.order import Order
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 from tests.system.test_run import fault
-from tests.system.test_unrecorded_heat import FAST, SOAK, happens, heating
+from tests.system.test_unrecorded_heat import SOAK, happens, heating
 
 
 @pytest.fixture(autouse=True)

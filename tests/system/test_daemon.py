@@ -29,11 +29,15 @@ from stand.daemon.serve import serve as serve_stand
 from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
 from stand.serving.desk import Conflict, RunRequest, StandState, Who
-from tests.system.test_real_time import BRIEF
+from tests.system.test_real_time import BRIEF as CYCLE
 from tests.system.test_two_runs import Laboratory
 
 LIMIT_S = 120.0  # for a busy machine
-LONG = BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600").replace("[26]", "[40]")
+BRIEF = """
+name: brief
+steps: [start_chamber: 26, soak: 0.5, stop_chamber]
+"""
+LONG = CYCLE.replace("equilibrium_s: 0.5", "equilibrium_s: 3600").replace("[26]", "[40]")
 
 
 class Served:

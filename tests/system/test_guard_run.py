@@ -132,7 +132,7 @@ async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_opera
     tmp_path: Path, order: Callable[..., Order], name: str, value: object, rule: str, text: str
 ):
     told, tasks = tmp_path / "told", list[asyncio.Task[None]]()
-    ordered = telling(order(LONG_SOAK, bus={"timeout_s": 0.3}), told)
+    ordered = telling(order(LONG_SOAK, bus={"timeout_s": 0.1}), told)
     begins = once_warm if name == "heater.cut_out" else partial(at_step, "Soak")  # the first heat has its own rule
     watch = begins(lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))
     with pytest.raises(StandTripped) as caught:

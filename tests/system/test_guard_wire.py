@@ -276,11 +276,11 @@ async def test_a_daemon_that_starts_again_spares_the_compressor_as_one_that_goes
 
 async def test_a_relay_board_that_stays_silent_holds_the_stand(order: Callable[..., Order], simulator: Start):
     """Its timed-on relays have dropped by themselves meanwhile."""
-    ordered = order(bus={"timeout_s": 0.05}, guard={"keys_s": 20.0})
+    ordered = order(bus={"timeout_s": 0.05}, guard={"keys_s": 10.0})
     async with bench_of(ordered, simulator) as bench:
         await bench.start(26, 60)
-        await bench.fault("relays.silent_s", 60)
-        trip = await bench.tripped(80)
+        await bench.fault("relays.silent_s", 40)
+        trip = await bench.tripped(60)
         assert (trip.rule, trip.action) == ("sensor_bad", "hold")
         assert trip.text.startswith("relays.heater_enable is BAD")
 

@@ -28,7 +28,7 @@ from stand.config.stand_config import StandConfig
 from stand.running.order import Order
 from stand.running.run import run_real
 from stand.simulator import ControlSocket, Simulator, laboratory_of
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 
 MOVED = Path(__file__).parent / "moved_clocks"
 COLD = """
@@ -38,7 +38,7 @@ experiments:
 """
 BRIEF = """
 name: brief
-steps: [start_chamber: 26, soak: 3.5, stop_chamber]
+steps: [start_chamber: 26, soak: 1.5, stop_chamber]
 """
 LIMIT_S = 90.0  # of real time for what should take a few seconds
 
@@ -66,7 +66,7 @@ async def test_a_suspend_and_a_step_of_the_system_clock_are_recorded_and_instant
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object], monkeypatch: pytest.MonkeyPatch
 ):
     """The run may go on or trip on readings so old; either way it is recorded in instants that have passed."""
-    ordered, host = order(BRIEF), MovedTime()
+    ordered, host = order(BRIEF, **FAST), MovedTime()
     await asyncio.to_thread(simulator, ordered.config, False)
     monkeypatch.setattr("foundation.clock.time", host)
 

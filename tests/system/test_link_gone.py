@@ -18,11 +18,11 @@ from foundation.items import Event
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, check_safe
 from tests.system.test_run import at_step, fault
 from tests.system.test_run_ends import break_now
-from tests.system.test_unrecorded_heat import FAST, SOAK, heater_is, plant
+from tests.system.test_unrecorded_heat import SOAK, heater_is, plant
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
 QUICK = {"timeout_s": 0.1}

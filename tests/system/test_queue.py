@@ -19,10 +19,10 @@ RECIPE = """
 name: queued
 experiments:
   - thermal_cycle:
-      equilibrium_s: 300
+      equilibrium_s: 120
       set_points_degC: [26]
       held_out_degC: []
-      dwell_s: 300
+      dwell_s: 120
       reference_frames: 1
       frames_per_point: 3
       interval_s: 1

@@ -17,7 +17,7 @@ from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_real
 from stand.simulator import ControlSocket
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 
 BRIEF = """
 name: brief
@@ -29,7 +29,16 @@ experiments:
       reference_frames: 3
       interval_s: 0.5
 """
-FAST = {"poll_s": 0.5}
+FRAMES = """
+name: frames
+steps:
+  - start_chamber: 26
+  - soak: 0.5
+  - open_flap
+  - capture: {frames: 3, role: reference, interval_s: 0.5}
+  - close_flap
+  - stop_chamber
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -45,13 +54,13 @@ def ignore(hub: Hub) -> None:
 async def test_a_brief_run_in_real_time_over_serial_wires(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object], trigger: str
 ):
-    ordered = order(BRIEF, wire="serial", camera={"trigger": trigger, "poll_s": 0.5}, regulator=FAST)
+    ordered = order(FRAMES, wire="serial", **{**FAST, "camera": {**FAST["camera"], "trigger": trigger}})
     await asyncio.to_thread(simulator, ordered.config, False)
     session = Session.open(await run_real(ordered, tmp_path / "out", ignore))
     assert session.metadata["clock_source"] == "wall"
     frames = list(session.frames())
-    assert len(frames) == 4
-    times_s = np.diff([frame.time_ns for frame in frames[:3]]) / 1e9
+    assert len(frames) == 3
+    times_s = np.diff([frame.time_ns for frame in frames]) / 1e9
     assert np.all(times_s > 0.3)
     assert all(frame.image.max() > 150 for frame in frames)
     assert session.readings("regulator.pv")[1].size >= 4
@@ -60,7 +69,7 @@ async def test_a_brief_run_in_real_time_over_serial_wires(
 async def test_an_interrupt_leaves_the_stand_safe_and_the_session_readable(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
-    ordered = order(BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600"), regulator=FAST)
+    ordered = order(BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600"), **FAST)
     await asyncio.to_thread(simulator, ordered.config, False)
 
     def watch(hub: Hub) -> None:

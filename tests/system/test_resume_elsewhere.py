@@ -23,7 +23,7 @@ from stand.running.own_stand import on_this_stand
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_real, run_virtual
 from tests.sections import change
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF
 from tests.system.test_resume import findable
 from tests.system.test_run import at_step, fault
@@ -33,11 +33,6 @@ name: captures
 experiments:
   - calibration: {equilibrium_s: 30, linear_mm: [0], rotary_deg: [0], frames_per_position: 2}
 """
-FAST = {
-    "regulator": {"poll_s": 0.5},
-    "relays": {"self_test_s": 0.6},
-    "camera": {"boot_s": 1.0, "poll_s": 0.5},
-}
 LIMIT_S = 90.0
 
 

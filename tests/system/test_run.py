@@ -66,7 +66,7 @@ def at_step(kind: str, action: Callable[[], object]) -> Callable[[Hub], None]:
 
 
 async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(camera=WHOLE_SENSOR)
+    ordered = order()
     first = await run_virtual(ordered, tmp_path / "first", 7, ignore)
     second = await run_virtual(ordered, tmp_path / "second", 7, ignore)
     assert digests(first) == digests(second)
@@ -77,7 +77,7 @@ async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_p
     captures = {step.step_id: step for step in session.steps() if step.kind == "Capture"}
     frames = list(session.frames())
     assert all(frame.step_id in captures for frame in frames)
-    assert frames[0].image.shape == (2048, 2448)
+    assert frames[0].image.shape == (256, 612)
     assert frames[0].image.max() > 150  # the flap was open
     assert [event.kind for event in session.events() if event.kind.startswith("run.")] == ["run.start", "run.end"]
     check_temperatures(session)

@@ -22,14 +22,14 @@ experiments:
   - thermal_cycle:
       table_position: {linear: 0, rotary: 0}
       equilibrium_s: 600
-      set_points_degC: [28, 24]
+      set_points_degC: [28]
       dwell_s: 3600
       until: {settled: {drift_px_per_min: 0.004}}
       reference_frames: 2
       frames_per_point: 1
 """
 # A chamber that is never at its set-point, as far as these thresholds can tell, and a target that is not there.
-NEVER = RECIPE.replace("drift_px_per_min: 0.004", "drift_px_per_min: 0.0001").replace("[28, 24]", "[26]")
+NEVER = RECIPE.replace("drift_px_per_min: 0.004", "drift_px_per_min: 0.0001").replace("[28]", "[26]")
 NEVER = NEVER.replace("dwell_s: 3600", "dwell_s: 900")
 
 
@@ -44,18 +44,18 @@ pytestmark = pytest.mark.usefixtures("_aravis")
 async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: Path, order: Callable[..., Order]):
     session = Session.open(await run_virtual(order(RECIPE, camera=WHOLE_SENSOR), tmp_path, 3, lambda _: None))
     told = [event.text for event in session.events() if event.kind == "settled"]
-    assert len(told) == 2
+    assert len(told) == 1
     assert all("K/min" in text and "mpx/min" in text for text in told)
     soaks = [mark for mark in session.steps() if mark.kind == "SoakUntilSettled"]
-    assert [mark.state for mark in soaks] == [StepState.STARTED, StepState.DONE] * 2
-    lasted_s = [(end.time_ns - begin.time_ns) / NS_PER_S for begin, end in zip(soaks[::2], soaks[1::2], strict=True)]
-    assert all(900.0 < soak_s < 2700.0 for soak_s in lasted_s)
+    assert [mark.state for mark in soaks] == [StepState.STARTED, StepState.DONE]
+    begin, end = soaks
+    soak_s = (end.time_ns - begin.time_ns) / NS_PER_S
+    assert 900.0 < soak_s < 2700.0
     entries, _ = read_lines((session.path / "journal.jsonl").read_bytes())
-    for begin, soak_s in zip(soaks[::2], lasted_s, strict=True):
-        earned_s = [entry.earned_s for entry in entries if isinstance(entry, Dwell) and entry.step_id == begin.step_id]
-        assert len(earned_s) >= soak_s / 70.0  # each 60 s, a look included
-        assert earned_s == sorted(earned_s)
-        assert earned_s[-1] == 3600.0  # nothing is owed
+    earned_s = [entry.earned_s for entry in entries if isinstance(entry, Dwell) and entry.step_id == begin.step_id]
+    assert len(earned_s) >= soak_s / 70.0  # each 60 s, a look included
+    assert earned_s == sorted(earned_s)
+    assert earned_s[-1] == 3600.0  # nothing is owed
     check_the_flap_opens_for_looks_only(session)
     check_looks_are_not_fitted(observe([session.path], progress))
 
@@ -67,10 +67,10 @@ def check_the_flap_opens_for_looks_only(session: Session) -> None:
 
 
 def check_looks_are_not_fitted(observed: Observations) -> None:
-    assert observed.of(Role.SETTLING).sum() > 10
+    assert observed.of(Role.SETTLING).sum() > 5
     assert observed.of(Role.REFERENCE).sum() == 2
-    assert observed.of(Role.FIT).sum() == 2
-    assert set(observed.chamber_degC[observed.of(Role.SETTLING)]) == {28.0, 24.0}
+    assert observed.of(Role.FIT).sum() == 1
+    assert set(observed.chamber_degC[observed.of(Role.SETTLING)]) == {28.0}
 
 
 async def test_a_dwell_that_never_settles_ends_at_its_longest_and_says_so(tmp_path: Path, order: Callable[..., Order]):

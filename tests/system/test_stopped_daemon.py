@@ -13,9 +13,9 @@ import yaml
 
 from recording.reading.session import Session
 from stand.running.order import Order
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 from tests.system.gateway import gateway
-from tests.system.test_unrecorded_heat import FAST, SOAK, heater_is, plant
+from tests.system.test_unrecorded_heat import SOAK, heater_is, plant
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
 STOPPED_S = 1.5  # 6 periods of the guard, and less than the camera waits for its client

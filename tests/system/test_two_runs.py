@@ -18,7 +18,7 @@ from stand.running.order import Order
 from stand.serving.client import ask_status, running_sessions
 from stand.simulator import ControlSocket
 from tests.stand.test_listening import connected
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF
 
 LIMIT_S = 90.0  # for a busy machine
@@ -79,7 +79,7 @@ async def test_a_second_run_touches_nothing_until_the_first_has_ended(
     stand: Callable[..., "subprocess.Popen[str]"],
     ending: str,
 ):
-    ordered = order(LONG, camera={"boot_s": 0.2, "poll_s": 0.5}, regulator={"poll_s": 0.5})
+    ordered = order(LONG, **FAST)
     await asyncio.to_thread(simulator, ordered.config, False)
     out, other = tmp_path / "out", tmp_path / "other"
     run = ("run", tmp_path / "recipe.yaml", "--config", tmp_path / "config.yaml", "--out")

@@ -23,7 +23,7 @@ from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_real
 from stand.simulator import ControlSocket
 from tests.recording.disks import ext4, run
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 from tests.system.test_guard_run import Watcher, telling
 from tests.system.test_run import at_step
 
@@ -37,16 +37,6 @@ experiments:
       reference_frames: 1
       frames_per_point: 1
 """
-FAST = {
-    "regulator": {"poll_s": 0.25},
-    "thermometer_module": {"poll_s": 0.25},
-    "relays": {"poll_s": 0.5, "self_test_s": 0.6},
-    "flap": {"poll_s": 0.5},
-    "camera": {"poll_s": 0.5, "boot_s": 0.2},
-    "guard": {"period_s": 0.25, "heater_hold_s": 3.0, "heater_renew_s": 0.5},
-    # Longer than a commit takes on the busy disk of a shared machine: the fourth hold within an hour waits for `clear`.
-    "recording": {"telemetry_commit_s": 0.2, "durable_within_s": 3.0},
-}
 LIMIT_S = 60.0  # for anything that happens within a second on a machine without other work
 
 
