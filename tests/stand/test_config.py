@@ -259,6 +259,7 @@ def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path
     ("text", "sentence"),
     [
         ("name: " + "[" * 5000 + "]" * 5000, "nested too deeply"),
+        ("name: " + "[" * 120_000, "nested too deeply"),
         ("name: " + "1" * 5000, "5000 digits"),
         ("name: 0x" + "f" * 9000, "name: give text, in quotes: "),
         ("name: 2026-13-45", "month must be in 1..12"),
@@ -266,7 +267,7 @@ def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path
         ("name: !!int ''", "does not fit its tag"),
         ("name: !!timestamp x", "does not fit its tag"),
     ],
-    ids=["nested", "digits", "hexadecimal", "date", "bool", "int", "timestamp"],
+    ids=["nested", "nested beyond any stack", "digits", "hexadecimal", "date", "bool", "int", "timestamp"],
 )
 def test_yaml_that_python_cannot_hold_is_refused_with_a_sentence(tmp_path: Path, text: str, sentence: str):
     file = tmp_path / "hostile.yaml"

@@ -3,12 +3,13 @@
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from drivers.wires.aravis_library import library
-from foundation.documents import load_document
+from foundation.documents import load_document, yaml_data
 from foundation.errors import StandError
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -66,7 +67,7 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
     frame = _CORNER if request.node.get_closest_marker("nightly") is None else WHOLE_SENSOR
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
-        data = yaml.safe_load(packaged("", "simulated").read_text())
+        data: Any = yaml_data(packaged("", "simulated").read_text(), "simulated")
         data["bus"]["address"] = f"tcp:127.0.0.1:{free_port()}" if wire == "tcp" else f"serial:{tmp_path / 'bus'}"
         for name, axis in data["axes"].items():
             axis["address"] = f"serial:{tmp_path / name}"
@@ -115,7 +116,7 @@ def simulator() -> Iterator[Callable[[StandConfig, bool], Simulator]]:
 def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Callable[..., object]) -> Path:
     """The configuration of a simulated stand that answers, with a guard that looks often."""
     require_aravis()
-    data = yaml.safe_load(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}))
+    data: Any = yaml_data(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}), "laboratory")
     data["relays"]["self_test_s"] = 1.0
     data["cameras"]["camera"] |= {"boot_s": 0.5, "poll_s": 1.0}
     data["flap"]["poll_s"] = 0.5
