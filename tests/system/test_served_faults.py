@@ -15,9 +15,9 @@ from foundation.errors import SessionError
 from stand.running.order import Order
 from stand.serving.desk import StandState
 from tests.recording.disks import ext4, run
-from tests.system.conftest import require_aravis
+from tests.system.conftest import FAST, require_aravis
 from tests.system.test_daemon import Served, is_idle
-from tests.system.test_unrecorded_heat import FAST, SOAK
+from tests.system.test_unrecorded_heat import SOAK
 
 LEAVES_WITHIN_S = 20.0  # 5 s where nothing else keeps the machine busy
 STOPPED_S = 1.5  # 6 periods of the guard
