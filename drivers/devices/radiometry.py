@@ -60,12 +60,12 @@ class Air:
     def transmission(self) -> float:
         """tau; NaN outside the formula's range."""
         t = self.temperature_K - ZERO_C_K
-        exponent = 1.5587 + 0.06939 * t - 0.00027816 * t * t + 0.00000068455 * t**3
+        exponent = 1.5587 + 0.06939 * t - 0.00027816 * t * t + 0.00000068455 * t * t * t
         if not (self.distance_m >= 0 and self.humidity >= 0 and abs(exponent) < 50):
             return math.nan
         way, root_w = math.sqrt(self.distance_m / 2), math.sqrt(self.humidity * math.exp(exponent))
         first, second = self.alpha1 + self.beta1 * root_w, self.alpha2 + self.beta2 * root_w
-        if max(abs(first), abs(second)) * way > 50:
+        if not (abs(first) * way <= 50 and abs(second) * way <= 50):  # nor NaN
             return math.nan
         return self.X * math.exp(-way * first) + (1 - self.X) * math.exp(-way * second)
 

@@ -31,6 +31,7 @@ from pymodbus.pdu.register_message import (
     ReadInputRegistersRequest,
     ReadInputRegistersResponse,
     WriteMultipleRegistersRequest,
+    WriteMultipleRegistersResponse,
     WriteSingleRegisterRequest,
 )
 
@@ -58,6 +59,8 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "no answer behind the gateway",
 }
+_EXCEPTION = 0x80  # of the function in a reply
+_ADDRESS_AND_COUNT = 4  # bytes
 UNANSWERED_EXCEPTIONS = frozenset({6, 10, 11})  # somebody answered, but not the unit, or not now
 
 
@@ -122,8 +125,19 @@ def _strict(reply: type[ModbusPDU]) -> type[ModbusPDU]:
     return type(reply.__name__, (reply,), {"decode": decode})
 
 
+class _RegistersWritten(WriteMultipleRegistersResponse):
+    """FC 16, whose reply is address and count and nothing else."""
+
+    def decode(self, data: bytes) -> None:
+        """ValueError when something follows."""
+        if len(data) != _ADDRESS_AND_COUNT:
+            raise ValueError(f"{len(data)} bytes of address and count")
+        super().decode(data)
+
+
 REPLIES = (
     WriteCoilWord,
+    _RegistersWritten,
     *map(
         _strict,
         (ReadCoilsResponse, ReadDiscreteInputsResponse, ReadHoldingRegistersResponse, ReadInputRegistersResponse),
@@ -280,7 +294,8 @@ class ModbusClient:
         reply = self._execute(request)
         if reply.function_code & 0x7F != request.function_code:
             raise WireFault(FaultKind.GARBLED, f"asked function {request.function_code}, got {reply.function_code}")
-        if code := reply.exception_code:
+        if reply.function_code & _EXCEPTION:
+            code = reply.exception_code
             fault = FaultKind.SILENCE if code in UNANSWERED_EXCEPTIONS else FaultKind.REFUSED
             raise WireFault(fault, f"exception {code} ({EXCEPTIONS.get(code, 'not in the standard')})")
         return reply

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import flyr
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.devices.radiometric_jpeg import NotRadiometric, is_whole, parse
-from drivers.devices.radiometry import temperatures_degC
+from drivers.devices.radiometry import Air, temperatures_degC
 from drivers.sim.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 
 SCENE_DEGC = np.linspace(-15.0, 75.0, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
@@ -27,6 +29,12 @@ def with_air(jpeg: bytes) -> bytes:
     for offset, value in stated.items():
         struct.pack_into("<f", changed, begin + offset, value)
     return bytes(changed)
+
+
+def test_constants_that_no_camera_has_have_no_transmission() -> None:
+    air = Air(1.0, 293.15, 0.5, alpha1=0.0, alpha2=-1.7e38, beta1=math.nan, beta2=0.0, X=1.0)
+    assert math.isnan(air.transmission)
+    assert math.isnan(replace(air, temperature_K=1e38).transmission)
 
 
 @pytest.mark.parametrize("png", [False, True])

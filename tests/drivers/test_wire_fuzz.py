@@ -53,6 +53,18 @@ def test_damaged_frames_are_refused_or_read_for_what_they_say(name: str, inputs:
             raise AssertionError(f"frame {number} as {wire[:400].hex(' ')}") from error
 
 
+# Taken once, though they are not what a unit sends.
+FOUND = (
+    ("Modbus TCP", 6, "00 01 00 00 00 07 01 10 0a de 00 02 00 02"),  # longer than address and count
+    ("Modbus TCP", 5, "00 01 00 00 00 06 01 85 00 00 00 00"),  # an exception without a number
+)
+
+
+@pytest.mark.parametrize(("name", "number", "wire"), FOUND)
+def test_what_was_found_is_refused(name: str, number: int, wire: str) -> None:
+    assert not PARSERS[name].make()(number, bytes.fromhex(wire))
+
+
 @parsers
 @settings(max_examples=50, deadline=None, derandomize=True)
 @example(wire=b"")
