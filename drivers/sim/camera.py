@@ -22,7 +22,7 @@ from drivers.sim.genicam import TICKS_PER_S, features
 from drivers.sim.genicam_file import GenicamFile
 from drivers.sim.gvcp import Nack, Resend, Status
 from drivers.sim.gvcp_device import ControlChannel, Peer
-from drivers.sim.gvsp_pixels import encoded
+from drivers.sim.gvsp_pixels import binned, encoded
 from drivers.sim.gvsp_sender import CameraFaults, StreamCounts, StreamSender
 from foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 
@@ -266,7 +266,7 @@ class FakeCamera:
     def _resize(self, now_ns: int) -> None:
         pixels = self._registers.integer("Width") * self._registers.integer("Height")
         pixel_format = gvsp.PixelFormat(self._registers.integer("PixelFormat"))
-        self._registers.put("PayloadSize", pixel_format.size_bytes(pixels))
+        self._registers.put("PayloadSize", pixel_format.size_bytes(pixels) - self.faults.payload_short_bytes)
 
     def _latch_timestamp(self, now_ns: int) -> None:
         self._registers.put("GevTimestampValue", now_ns - self._ticks_from_ns)
@@ -294,6 +294,7 @@ class FakeCamera:
             self._render(self._clock.now_ns(), 0.001, 0.0, self._registers.integer("HeightMax"))
         while (shot := self._next_shot()) is not None:
             rows = self._registers.integer("OffsetY") + self._registers.integer("Height")
+            rows = min(rows * self._registers.binning[1], self._registers.integer("HeightMax"))
             image = self._render(shot.middle_ns, shot.exposure_ns / NS_PER_S, shot.gain_dB, rows)
             self._send(shot, image)
 
@@ -321,7 +322,7 @@ class FakeCamera:
     def _block(self, shot: Shot, image: NDArray[np.uint8]) -> gvsp.Block:
         value = self._registers.integer
         x, y, width, height = value("OffsetX"), value("OffsetY"), value("Width"), value("Height")
-        pixels = image[y : y + height, x : x + width]
+        pixels = binned(image, *self._registers.binning)[y : y + height, x : x + width]
         if pixels.shape != (height, width) and isinstance(self._registers, DressedRegisters):
             # its file may have a larger sensor: dark beyond ours
             missing = (height - pixels.shape[0], width - pixels.shape[1])

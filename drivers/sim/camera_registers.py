@@ -87,6 +87,11 @@ class Registers:
         feature = self._table[name]
         return _field(feature, int.from_bytes(self._load(feature.address, feature.length), "big"))
 
+    @property
+    def binning(self) -> tuple[int, int]:
+        """How many pixels of the sensor, across and down, make one of the image."""
+        return 1, 1
+
     def real(self, name: str) -> float:
         """The value of a float feature."""
         (value,) = struct.unpack(">d", self._load(self._table[name].address, 8))

@@ -33,6 +33,7 @@ _NUMBERS = {
     "AcquisitionFrameRate": ("AcquisitionFrameRate", "AcquisitionFrameRateAbs"),
 }
 _SOFTWARE = ("Software", "SoftwareTrigger", "SoftTrigger")
+BINNING = ("BinningHorizontal", "BinningVertical")
 _PACED = ("FixedRate", "Freerun")  # sources of a trigger that is none
 
 
@@ -46,6 +47,12 @@ class DressedRegisters(Registers):
         self._temperature_degC: float | None = None
         self._commands = {name: self._command(name) for name in COMMANDS if name in file}
         super().__init__(dressed, address, serial, file.xml, XML_ADDRESS)
+
+    @property
+    def binning(self) -> tuple[int, int]:
+        """As the client has set it, 1 where the file knows none."""
+        across, down = (int(self._file.get(name)) if name in self._file.file else 1 for name in BINNING)
+        return max(1, across), max(1, down)
 
     def close(self) -> None:
         """Free what evaluates the file."""

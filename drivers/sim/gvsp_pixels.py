@@ -33,3 +33,13 @@ def _in_three_bytes(values: NDArray[np.uint16], bits: int) -> bytes:
     shared = (pairs[:, 0] & (1 << low) - 1) | (pairs[:, 1] & (1 << low) - 1) << 4
     packed = np.stack([pairs[:, 0] >> low, shared, pairs[:, 1] >> low], axis=1).astype(np.uint8).tobytes()
     return packed[: -(-len(values) * 12 // 8)]
+
+
+def binned(image: NDArray[np.uint8], across: int, down: int) -> NDArray[np.uint8]:
+    """The mean of so many pixels across and down in the place of each; what does not fill one at the edges is left
+    out."""
+    if across == down == 1:
+        return image
+    height, width = image.shape[0] // down, image.shape[1] // across
+    parts = image[: height * down, : width * across].reshape(height, down, width, across)
+    return parts.mean(axis=(1, 3)).round().astype(np.uint8)

@@ -14,6 +14,7 @@ from typing import Literal
 from drivers.sim import gvsp
 from drivers.sim.gvcp import Resend
 from drivers.sim.gvsp import Block
+from drivers.sim.switch import Switch
 
 Destination = tuple[str, int]
 
@@ -33,6 +34,8 @@ class CameraFaults:
     can. drop_leader, drop_trailer: missing from every frame until asked for again. trigger_twice: every software
     trigger gives two frames. no_stream_channel: it says that it has none, as one that is not ready yet. temperature:
     DeviceTemperature reads 0, is refused, or keeps its last value; temperature_offset_K: it is wrong by so much.
+    payload_short_bytes: PayloadSize is too small by so much from the next change of region on.
+    switch: what it shares with other cameras on the way to the computer.
     """
 
     seed: int = 0
@@ -55,6 +58,8 @@ class CameraFaults:
     no_ticks: bool = False
     acks_twice: bool = False
     pending: int = 0
+    payload_short_bytes: int = 0
+    switch: Switch | None = None
 
 
 @dataclass
@@ -243,7 +248,8 @@ class StreamSender:
     def _transmit(self, parts: list[bytes] | tuple[bytes, bytes | memoryview], destination: Destination) -> None:
         if self._faults.silent_gvsp:
             return
-        if self._lost():
+        switch = self._faults.switch
+        if self._lost() or not (switch is None or switch.passes(sum(map(len, parts)))):
             self.counts.lost += 1
             return
         try:

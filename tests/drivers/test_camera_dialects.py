@@ -20,7 +20,7 @@ from foundation.clock import WallClock
 from foundation.errors import ConfigError, Refused
 from foundation.readings import Quality
 from tests.addresses import camera_address
-from tests.dialects import DIALECTS, HEIGHT, WIDTH, Dialect
+from tests.dialects import DIALECTS, EXPOSURE, HEIGHT, SOURCE, STANDARD, TRIGGER, WIDTH, Dialect, integer
 from tests.system.conftest import require_aravis
 
 ADDRESS = camera_address()
@@ -110,6 +110,15 @@ async def test_a_region_is_what_is_asked_for_and_a_new_exposure_is_taken():
             frame = await camera.grab(0.02)
     assert (frame.image == scene(HEIGHT, WIDTH)[:16, :32]).all()
     assert frame.exposure_s == pytest.approx(0.02)
+
+
+async def test_binned_pixels_are_the_mean_of_those_of_the_sensor():
+    binning = integer("BinningHorizontal", 0xA090) + integer("BinningVertical", 0xA094)
+    with dressed(GenicamFile(Dialect(STANDARD + TRIGGER + SOURCE + EXPOSURE + binning).xml("binned"), "binned")):
+        async with opened(binning=2, width_px=WIDTH // 2, height_px=HEIGHT // 2) as camera:
+            frame = await camera.grab()
+    four = scene(HEIGHT, WIDTH).reshape(HEIGHT // 2, 2, WIDTH // 2, 2)
+    assert (frame.image == four.mean(axis=(1, 3)).round()).all()
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,23 @@ async def test_a_frame_with_a_packet_cut_short_is_never_used(wired: tuple[Virtua
         assert all(map(is_right, await grabbed(camera, clock, 1)))
 
 
+async def test_frames_larger_than_the_camera_has_said_are_counted_and_never_used(
+    wired: tuple[VirtualClock, FakeCamera],
+):
+    clock, fake = wired
+    fake.faults.payload_short_bytes = 5000
+    async with opened(clock, packet_size=1500, height_px=64) as camera:
+        with pytest.raises(Unreachable):
+            await camera.grab()
+        counted = camera.counters()
+        assert counted.get("incomplete_size_mismatch", 0) + counted.get("wrong_size", 0) > 0, counted
+        fake.faults.payload_short_bytes = 0
+        await camera.close()
+    async with opened(clock, packet_size=1500, height_px=32) as camera:
+        frame = await camera.grab()
+        assert (frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)[:32]).all()
+
+
 @pytest.mark.parametrize(("fault", "value"), [("acks_twice", True), ("pending", 1)])
 async def test_answers_that_come_twice_or_are_announced_as_late_are_taken_once(
     wired: tuple[VirtualClock, FakeCamera], fault: str, value: int
