@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from foundation.clock import NS_PER_S
 from foundation.items import Batch
 from foundation.readings import Frame, Reading
-from recording.format import messages
+from recording.format import kinds, messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.reading.session import Session
@@ -50,8 +50,8 @@ DEVICES = {
     "rotary": "axis",
     "flap": "flap",
 }
-TEMPERATURES = tuple(f"thermometers.{place}" for place in messages.THERMOMETERS)
-TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in messages.THERMOMETERS)
+TEMPERATURES = tuple(f"thermometers.{place}" for place in kinds.THERMOMETERS)
+TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in kinds.THERMOMETERS)
 METADATA = {"session_id": "bench"}
 ATTACHMENTS = {"config.yaml": "a: 1\n" * 400}
 
