@@ -93,9 +93,7 @@ def _tell(findings: tuple[Finding, ...]) -> None:
     """A line for each device with what is well, and two for each thing that is not."""
     for name, group in groupby(findings, lambda finding: finding.device):
         found = tuple(group)
-        lines = (
-            [(worst(found), well)] if (well := "; ".join(each.text for each in found if each.verdict == "ok")) else []
-        )
+        lines = [("ok", well)] if (well := "; ".join(each.text for each in found if each.verdict == "ok")) else []
         for each in found:
             if each.verdict != "ok":
                 lines.append((each.verdict, f"{each.what}: {each.text}"))

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, cast
 from urllib.parse import quote
 
 import typer
+from pydantic import JsonValue
 
 from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.output import show
+from foundation.errors import ConfigError, SessionError
+from foundation.exit_codes import one_line_errors
+from foundation.output import say, show
 from foundation.usage import one_line
-from stand.commands.reached import on_stand
+from stand.commands.reached import ConfigOption, DirectoryOption, TokenOption, UrlOption, on_stand, reached
 from stand.commands.submitted import submit_recipe
 from stand.serving.client import API, Answer, Server
-from stand.serving.desk import DeviceState
+from stand.serving.desk import DeviceState, StandState
 
 app = App()
 
@@ -40,26 +44,70 @@ def submit(
 
 
 @app.command()
-@on_stand(by_option=True)
 def device(
-    server: Server,
     name: Annotated[str, typer.Argument(help="The device; without one all are listed, with what they take.")] = "",
     verb: Annotated[str, typer.Argument(help="What it is told.")] = "",
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="What the verb takes.")
     ] = None,
+    out: Annotated[Path | None, typer.Option("-o", metavar="FILE", help="The PNG for a frame that is grabbed.")] = None,
+    directory: DirectoryOption = None,
+    config: ConfigOption = "simulated",
+    url: UrlOption = "",
+    token_file: TokenOption = None,
 ) -> None:
-    """Tell a device something by hand, between runs, through the same gate as a run.
+    """Tell a device something by hand, between runs, through the same gate as a run. Without a daemon the device is
+    opened for it, and made safe and closed at the end; it then knows read, registers and grab, too.
 
     Example: stand device flap open
     """
+    with one_line_errors():
+        given = dict(map(_argument, arguments or ()))
+        try:
+            server = reached(directory, config, url, token_file)
+        except SessionError:
+            if url or directory is not None:
+                raise
+            _without_daemon(config, name, verb, given, out)
+            return
+        _by_daemon(server, name, verb, given)
+
+
+def _by_daemon(server: Server, name: str, verb: str, arguments: dict[str, object]) -> None:
     if not verb:
         _show_devices(server, name)
         return
-    body: dict[str, object] = {"arguments": dict(map(_argument, arguments or ()))}
+    if verb == "read":
+        state = StandState.model_validate(server.request("GET", f"{API}/state"))
+        found = {channel: each for channel, each in state.readings.items() if channel.startswith(f"{name}.")}
+        lines = (
+            f"{channel:<28}{each.value} {each.unit} {each.quality} {each.reason}" for channel, each in found.items()
+        )
+        show({channel: each.model_dump(mode="json") for channel, each in found.items()}, map(one_line, lines))
+        return
+    if verb in ("registers", "grab"):
+        raise ConfigError(f"{verb} is for a stand that no daemon has; the daemon takes a frame by `{name} frame`")
+    body: dict[str, object] = {"arguments": arguments}
     path = f"{API}/devices/{quote(name, safe='')}/{quote(verb, safe='')}"
     answer = cast("Answer", server.request("POST", path, body, _LIMIT_S))
     show(answer, [one_line(answer["text"] or f"{name}: {verb}")])
+
+
+def _without_daemon(config: str, name: str, verb: str, arguments: dict[str, object], out: Path | None) -> None:
+    # Opening devices takes half a second of imports, which a client of the daemon need not wait for.
+    from stand.config.stand_config import load_config, packaged
+    from stand.daemon.hands_on import by_hand, known_devices
+
+    stand = load_config(packaged("", config))
+    if verb:
+        values = cast("dict[str, JsonValue]", arguments)
+        done = asyncio.run(by_hand(stand, name, verb, values, out, say))
+        show(done.data, map(one_line, done.lines))
+        return
+    devices = [each for each in known_devices(stand) if name in ("", each.name)]
+    if not devices:
+        raise ConfigError(f"there is no device {name}; `stand device` lists them")
+    show([each.model_dump(mode="json") for each in devices], _device_lines(devices))
 
 
 def _show_devices(server: Server, name: str) -> None:

@@ -43,11 +43,18 @@ def for_axis(error: DeviceError, name: str) -> str:
     return "look at the stage, remove the cause, and switch its controller off and on"
 
 
+def for_probe(error: DeviceError, name: str) -> str:
+    """A thermometer or hygrometer with a line of its own."""
+    if isinstance(error, Unreachable):
+        return f"is it plugged in and on, and baud as probes.{name} has it? `stand devices` lists the ports"
+    return f"compare probes.{name} with the instrument: its protocol, serial number and unit (degC)"
+
+
 def for_flap(error: DeviceError) -> str:
     """The flap."""
     if isinstance(error, Unreachable):
         return "is it plugged in and powered, and flap.serial_number its own? `stand devices` lists all with theirs"
-    return "look at the flap and its controller's settings"
+    return "is something in its way? its counts are of the feedback: compare open_target, closed_target and travel_s"
 
 
 def for_camera(error: DeviceError, name: str, address: str) -> str:

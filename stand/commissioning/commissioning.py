@@ -84,6 +84,11 @@ async def _looks(assembly: Assembly, add: Callable[[Finding], None], *, has_move
     yield
     await look(links.inputs)
     yield
+    for name in devices.probes:
+        await links.probe(name)
+        yield
+    await links.imager()
+    yield
     await look(links.flap, devices.flap, moves and moves.flap)
     yield
     for name, axis in devices.axes.items():

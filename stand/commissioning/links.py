@@ -5,6 +5,7 @@ A device is opened as a run opens it: a regulator gets its start-up commands, a 
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, is_dataclass
 from typing import Any, cast
@@ -18,7 +19,9 @@ from foundation.readings import Quality, Reading
 from stand.assembly import Assembly, register_map
 from stand.chamber.permits import WATCHED
 from stand.commissioning import advice
+from stand.commissioning.camera_lines import packet_finding
 from stand.commissioning.finding import Add, Finding
+from stand.commissioning.imager import imager_finding
 from stand.commissioning.points import unverified_points
 from stand.commissioning.thermometers import each_other
 
@@ -105,8 +108,21 @@ class Links:
                 text = f"{name} is {state}, which means {contact.means or 'a fault'}"
                 self._warn(inputs.name, text, "is it so now? else exchange fault_when, or look at its wire")
 
+    async def probe(self, name: str) -> None:
+        """An instrument with a line of its own."""
+        await self._device(self._assembly.devices.probes[name], lambda error: advice.for_probe(error, name))
+
+    async def imager(self) -> None:
+        """The folder of its pictures, where there is one."""
+        if (settings := self._assembly.config.imager) is not None:
+            self._add(await asyncio.to_thread(imager_finding, settings))
+
     async def flap(self) -> None:
         """Its controller, and where it stands."""
+        if self._assembly.config.flap is None:
+            text = "no flap: cameras see the target all the time"
+            self._add(Finding(self._assembly.devices.flap.name, "link", "ok", text))
+            return
         await self._device(self._assembly.devices.flap, advice.for_flap)
 
     async def axis(self, name: str) -> None:
@@ -141,6 +157,9 @@ class Links:
         size = f"{data['width_px']} x {data['height_px']} {data['pixel_format']}, " if "width_px" in data else ""
         data["temperature_place"] = await camera.temperature_place()
         self._add(Finding(camera.name, "settings", "ok", f"{size}settings taken over and read back", data=data))
+        packet_size = data.get("packet_size")
+        if isinstance(packet_size, int):
+            self._add(packet_finding(camera.name, camera.settings.address, packet_size))
 
     async def _has_supply(self) -> bool:
         """As far as the relays tell."""

@@ -61,8 +61,8 @@ class Moves:
 
     async def flap(self) -> None:
         """Open and close, each with its time."""
-        name = self._assembly.devices.flap.name
-        if name not in self._links.opened:
+        name, flap = self._assembly.devices.flap.name, self._assembly.config.flap
+        if flap is None or name not in self._links.opened:
             return
         if apart_K := await self._chamber_apart_K():
             text = f"not moved: the chamber is {apart_K:+.0f} K from the laboratory"
@@ -70,11 +70,7 @@ class Moves:
                 Finding(name, "travel", "unverified", text, "check again when it is at the laboratory's temperature")
             )
             return
-        imaging, clock, travel_s = (
-            self._assembly.stand.imaging,
-            self._assembly.clock,
-            self._assembly.config.flap.travel_s,
-        )
+        imaging, clock, travel_s = self._assembly.stand.imaging, self._assembly.clock, flap.travel_s
         try:
             await imaging.close_flap()
             open_s = await _timed(imaging.open_flap(), clock)

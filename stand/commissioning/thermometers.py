@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import statistics
 
-from drivers.devices.protocols import Controller
-from drivers.devices.thermometers import Thermometers
+from drivers.devices.protocols import Controller, Sensor
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError
 from foundation.readings import Quality
@@ -14,7 +13,7 @@ from stand.commissioning.finding import Finding
 _LOOKS, _PERIOD_S = 5, 0.3
 
 
-async def each_other(thermometers: Thermometers, regulator: Controller | None, warn_K: float, clock: Clock) -> Finding:
+async def each_other(thermometers: Sensor, regulator: Controller | None, warn_K: float, clock: Clock) -> Finding:
     """How far each is from the median of all, the regulator's own value among them; a warning beyond `warn_K`."""
     seen: dict[str, list[float]] = {}
     try:

@@ -1,0 +1,214 @@
+"""One device by hand while no daemon has the stand: `stand device NAME VERB` at the bench.
+
+The stand's addresses are locked as for a run, the device and what it needs are opened, what it is told goes through the
+verbs of the stand, so through its gate and limits, and at the end what was moved is made safe: the flap is shut, stages
+stand still, the cameras' supply is as it was. Nothing is heated: heat needs a recording and the guard.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from pydantic import JsonValue
+
+from drivers.devices.protocols import Sensor
+from drivers.settings import OnBus
+from drivers.wires.modbus_unit import ModbusUnit
+from foundation.clock import WallClock, seconds_ns
+from foundation.errors import ConfigError, DeviceError, StandTripped
+from foundation.files import write_whole_bytes
+from foundation.hub import Hub
+from foundation.readings import Reading
+from recording.format.images import encode_png
+from stand.assembly import Assembly, assemble, register_map
+from stand.config.stand_config import StandConfig
+from stand.daemon.by_hand import ByHand
+from stand.running.claim import claimed
+from stand.running.house import close_devices
+from stand.running.run_desk import device_kinds
+from stand.running.stop import Stop
+from stand.serving.desk import Conflict, DeviceState
+
+COMMAND = "stand device"
+READ, REGISTERS, GRAB = "read", "registers", "grab"
+_OPEN_S = 10.0  # that a flap stays open
+_KEYS = {"thermometers": "thermometer_module"}  # of the stand's file, where it is not the device's name
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What came of it: lines for people, and the same as data."""
+
+    lines: Sequence[str]
+    data: object
+
+
+def known_devices(config: StandConfig) -> tuple[DeviceState, ...]:
+    """What there is, and what it takes; nothing is opened."""
+    return ByHand(assemble(config, Hub(), WallClock()), _no_heat).devices("no daemon has this stand")
+
+
+async def by_hand(
+    config: StandConfig, name: str, verb: str, arguments: Mapping[str, JsonValue], out: Path | None, tell: Tell
+) -> Done:
+    """Do it. ConfigError and Missing for what the device does not know, Conflict for what needs a daemon, InUse when
+    another program has the stand: then nothing was touched."""
+    arguments = dict(arguments)
+    open_s = float(str(arguments.pop("open_s", _OPEN_S))) if verb == "open" else 0.0
+    async with _session(config) as hands:
+        device = await hands.opened(name)
+        match verb:
+            case "read":
+                return _readings(await device.read())
+            case "registers":
+                return await _registers(hands.assembly, name)
+            case "grab":
+                return await hands.grab(name, arguments, out)
+            case _:
+                await ByHand(hands.assembly, _no_heat).work(name, verb, arguments)
+        if verb == "open":
+            tell(f"{name} is open, and closes in {open_s:g} s")
+            clock = hands.assembly.clock
+            await clock.sleep_until(clock.now_ns() + seconds_ns(open_s))
+        done = _readings(await device.read())
+        return Done([f"{name}: {verb}", *done.lines], done.data)
+
+
+Tell = Callable[[str], None]
+
+
+class _Hands:
+    """What is open."""
+
+    def __init__(self, assembly: Assembly) -> None:
+        self.assembly = assembly
+        self._kinds = device_kinds(assembly)
+
+    async def opened(self, name: str) -> Sensor:
+        """The device, with what it needs."""
+        assembly, devices = self.assembly, self.assembly.devices
+        if name not in self._kinds:
+            raise ConfigError(f"this stand has no device {name}; there are {', '.join(self._kinds)}")
+        kind = self._kinds[name]
+        on_bus: dict[str, Sensor] = {
+            "relays": devices.relays,
+            "thermometers": devices.thermometers,
+            "regulator": devices.regulator,
+        }
+        if kind == "camera":
+            await assembly.bus.open()
+            await self._open(devices.relays)
+            supply = assembly.stand.imaging.supply
+            await supply.switch_on()
+            if supply.was_on is False:
+                assembly.stand.safety.take(supply)
+            return devices.cameras[name]
+        if name in on_bus:
+            await assembly.bus.open()
+            return await self._open(on_bus[name])
+        if name in devices.probes:
+            return await self._open(devices.probes[name])
+        mover = devices.axes.get(name, devices.flap)
+        await mover.open()
+        assembly.stand.opened(mover)
+        return mover
+
+    async def _open(self, device: Sensor) -> Sensor:
+        await device.open()
+        return device
+
+    async def grab(self, name: str, arguments: Mapping[str, JsonValue], out: Path | None) -> Done:
+        """One frame, as a PNG in `out` when that is given; flap=open: through the flap, which is shut again."""
+        camera = self.assembly.devices.cameras.get(name)
+        if camera is None:
+            raise ConfigError(f"{name} is no camera; {', '.join(self.assembly.devices.cameras) or 'there is none'}")
+        exposure, imaging = arguments.get("exposure_s"), self.assembly.stand.imaging
+        if arguments.get("flap") == "open":
+            await self.opened("flap")
+            await imaging.open_flap()
+        frame = await camera.grab(None if exposure is None else float(str(exposure)))
+        height, width = frame.image.shape
+        data = {
+            "width_px": width,
+            "height_px": height,
+            "mean_grey": round(float(frame.image.mean()), 2),
+            "darkest": int(frame.image.min()),
+            "brightest": int(frame.image.max()),
+            "exposure_s": frame.exposure_s,
+            "camera_degC": None if math.isnan(frame.camera_degC) else round(frame.camera_degC, 2),
+            "file": None if out is None else str(out),
+        }
+        if out is not None:
+            write_whole_bytes(out, encode_png(frame.image))
+        kept = "; -o FILE keeps it" if out is None else f", {out}"
+        text = (
+            f"{name}: {width} x {height}, grey {data['darkest']} to {data['brightest']}, mean {data['mean_grey']}{kept}"
+        )
+        return Done([text], data)
+
+
+@asynccontextmanager
+async def _session(config: StandConfig) -> AsyncGenerator[_Hands]:
+    """Locked, and safe at the end."""
+    async with AsyncExitStack() as stack:
+        stop = await stack.enter_async_context(Stop())
+        await stack.enter_async_context(claimed(config, None, COMMAND))
+        assembly = assemble(config, Hub(), WallClock())
+        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
+        stack.push_async_callback(close_devices, assembly)
+        stack.push_async_callback(_made_safe, assembly, stop)
+        stop.watch(assembly.stand)
+        yield _Hands(assembly)
+
+
+async def _made_safe(assembly: Assembly, stop: Stop) -> None:
+    stop.taking_down()
+    await stop.settled()
+    safety = assembly.stand.safety
+    safety.demand()
+    await safety.confirmed(assembly.config.guard.safe_limit_s)
+    await safety.close()
+    if unsafe := safety.unconfirmed:
+        raise StandTripped(f"NOT SAFE: {'; '.join(unsafe)}; look at the stand now")
+
+
+def _no_heat() -> None:
+    raise Conflict("heat needs a recording and a guard that look after it: `stand serve`, then the same command again")
+
+
+def _readings(readings: Sequence[Reading]) -> Done:
+    lines = [
+        f"{each.channel:<28}{each.value:>12.5g} {'' if each.unit == '1' else each.unit:<6}{each.quality.name.lower()}"
+        f"{f': {each.reason}' if each.reason else ''}"
+        for each in readings
+    ]
+    return Done(lines or ["it reads nothing"], [asdict(each) for each in readings])
+
+
+async def _registers(assembly: Assembly, name: str) -> Done:
+    """Every point of the unit's register map, read one by one; what cannot be read says why."""
+    key = _KEYS.get(name, name)
+    settings = getattr(assembly.config, key, None)
+    if not isinstance(settings, OnBus):
+        raise ConfigError(f"{name} has no registers; the units on the bus have")
+    found = register_map(key, settings)
+    unit = ModbusUnit(name, assembly.bus, found)
+    lines: list[str] = []
+    data: dict[str, object] = {}
+    for point_name, point in found.points.items():
+        where = f"{point_name:<18}{point.space:<9}{point.address:#06x}"
+        remark = f"   unverified: {point.unverified}" if point.unverified else ""
+        try:
+            sample = (await unit.snapshot([point_name])).samples[point_name]
+        except DeviceError as error:
+            lines.append(f"{where}  not read: {error.text}{remark}")
+            data[point_name] = None
+            continue
+        shown = sample.reason or f"{sample.value:g}{'' if point.unit == '1' else f' {point.unit}'}"
+        lines.append(f"{where}  {sample.raw:#06x}  {shown}{remark}")
+        data[point_name] = {"raw": sample.raw, "value": None if math.isnan(sample.value) else sample.value}
+    return Done(lines, data)
