@@ -11,17 +11,19 @@ import usb.backend
 
 from drivers.devices.cameras import make_camera
 from drivers.devices.climate_chamber import ClimateChamber
-from drivers.devices.flap import Flap
+from drivers.devices.flap import Flap, FlapSettings
 from drivers.devices.heat_pulses import HeatPulses
 from drivers.devices.inputs import Inputs
+from drivers.devices.no_flap import NoFlap
 from drivers.devices.no_relays import NoRelays
-from drivers.devices.protocols import Controller, Sensor, Switches
+from drivers.devices.probes import Probe
+from drivers.devices.protocols import Controller, Sensor, Shutter, Switches
 from drivers.devices.regulator import Regulator
 from drivers.devices.relays import Relays, RelaysSettings
 from drivers.devices.software_regulator import SoftwareRegulator, SoftwareRegulatorSettings
 from drivers.devices.stage import Axis
 from drivers.devices.thermal_imager import ThermalImager
-from drivers.devices.thermometers import Thermometers
+from drivers.devices.thermometers import SeveralModules, Thermometers
 from drivers.settings import EquilibriumSettings, OnBus
 from drivers.wires.bus import Bus
 from drivers.wires.registers import RegisterMap, load_register_map
@@ -62,12 +64,13 @@ class Assembly:
         config, devices = self.config, self.devices
         first: list[tuple[Sensor, float]] = [
             (devices.regulator, config.controller.poll_s),
-            (devices.thermometers, config.thermometer_module.poll_s),
+            *((module, config.thermometer_module.poll_s) for module in devices.thermometers.modules),
         ]
         if isinstance(devices.regulator, SoftwareRegulator):  # which shows what the thermometers have read
             first.reverse()
         timed: list[tuple[Sensor, float]] = [
             *first,
+            *((devices.probes[name], probe.poll_s) for name, probe in config.probes.items()),
             (devices.relays, config.relays.poll_s if config.relays is not None else _NO_BOARD_POLL_S),
             *(
                 ((devices.inputs, config.inputs.poll_s),)
@@ -75,7 +78,7 @@ class Assembly:
                 else ()
             ),
             *((devices.cameras[name], camera.poll_s) for name, camera in config.cameras.items()),
-            (devices.flap, config.flap.poll_s),
+            *(((devices.flap, config.flap.poll_s),) if config.flap is not None else ()),
             *((devices.axes[name], axis.poll_s) for name, axis in config.axes.items()),
             *(
                 ((devices.imager, config.imager.poll_s),)
@@ -138,11 +141,12 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         relays=relays,
         thermometers=thermometers,
         axes={name: Axis(name, axis, clock) for name, axis in config.axes.items()},
-        flap=_flap(config, clock),
+        flap=_flap(config.flap, clock),
         cameras={
             name: make_camera(name, sharing(config, name) or camera, clock) for name, camera in config.cameras.items()
         },
         inputs=inputs_of(config, bus, clock),
+        probes={name: Probe(name, probe, clock) for name, probe in config.probes.items()},
         imager=config.imager and ThermalImager("imager", config.imager, clock, hub.publish),
     )
     state_file = config.compressor.state_file
@@ -161,17 +165,34 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     return Assembly(config, hub, clock, bus, devices, stand, notifier)
 
 
-def bus_units(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> tuple[Controller, Switches, Thermometers]:
+def bus_units(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> tuple[Controller, Switches, Thermometers | SeveralModules]:
     """Regulator or climate chamber, relays, thermometers; ConfigError when a register map is missing or wrong, or that
     of another kind of unit."""
 
-    module = register_map("thermometer_module", config.thermometer_module)
     relays = _switches(config.relays, bus, clock)
     return (
         _controller(config, bus, relays, hub, clock),
         relays,
-        Thermometers("thermometers", bus, module, config.thermometers, clock),
+        _thermometers(config, bus, clock),
     )
+
+
+def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers | SeveralModules:
+    """Each sensor on the module that has its channel."""
+    settings = config.thermometer_module
+    first = register_map("thermometer_module", settings)
+    count = sum(name.startswith("value_") for name in first.points)
+    modules: list[Thermometers] = []
+    for number, unit in enumerate(settings.units):
+        here = {
+            name: each.model_copy(update={"channel": each.channel - number * count})
+            for name, each in config.thermometers.items()
+            if each.channel // count == number or (each.channel // count > number and unit == settings.units[-1])
+        }
+        if not here:
+            raise ConfigError(f"thermometer_module: no thermometer has a channel of unit {unit}")
+        modules.append(Thermometers("thermometers", bus, first.at_unit(unit), here, clock))
+    return modules[0] if len(modules) == 1 else SeveralModules(modules)
 
 
 def _controller(config: StandConfig, bus: Bus, relays: Switches, hub: Hub, clock: Clock) -> Controller:
@@ -217,8 +238,9 @@ class _BackendModule(Protocol):
     def get_backend(self, address: str) -> usb.backend.IBackend: ...
 
 
-def _flap(config: StandConfig, clock: Clock) -> Flap:
-    flap = config.flap
+def _flap(flap: FlapSettings | None, clock: Clock) -> Shutter:
+    if flap is None:
+        return NoFlap("flap")
     backend: usb.backend.IBackend | None = None
     if flap.backend is not None and flap.backend_address is not None:
         try:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from drivers.settings import OnBus
 from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
 from foundation.errors import ConfigError, Unreachable
@@ -53,13 +54,27 @@ def laboratory_of(
         "relays_unit": config.relays.unit if config.relays is not None else None,
         "relay_channels": dict(config.relays.channels) if config.relays is not None else {},
         **_inputs_of(config),
-        "thermometers_unit": config.thermometer_module.unit,
+        "thermometers_units": list(config.thermometer_module.units),
+        "thermometers_model": _model_of(config.thermometer_module),
         "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.items()},
         "axes": {
-            name: {"address": address_of(axis.address), "profile": axis.profile, "serial_number": axis.serial_number}
+            name: {
+                "address": address_of(axis.address),
+                "profile": axis.profile if isinstance(axis.profile, str) else axis.profile.model_dump(),
+                "serial_number": axis.serial_number,
+            }
             for name, axis in config.axes.items()
         },
-        "flap": {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
+        "probes": {
+            name: {
+                "protocol": probe.protocol,
+                "address": address_of(probe.address),
+                "serial_number": probe.serial_number,
+            }
+            for name, probe in config.probes.items()
+        },
+        "flap": config.flap
+        and {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
         "cameras": {
             name: {
                 "address": None if is_anywhere else camera.address,
@@ -71,6 +86,11 @@ def laboratory_of(
         "imager": _imager_of(config, is_anywhere=is_anywhere),
         "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
     }
+
+
+def _model_of(module: OnBus) -> str:
+    """The fake of that map."""
+    return "adam4015" if Path(module.registers).stem == "adam-4015" else "m7015"
 
 
 def _dress_of(camera: SimulatedCamera) -> dict[str, str | None]:
@@ -113,15 +133,17 @@ def _chamber_of(config: StandConfig, address_of: Callable[[str | None], str | No
 def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
     """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses)."""
     simulation = config.simulation
+    probes = {name: probe.model_copy(update={"address": addresses[name]}) for name, probe in config.probes.items()}
     axes = {name: axis.model_copy(update={"address": addresses[name]}) for name, axis in config.axes.items()}
     cameras = {name: each.model_copy(update={"address": addresses[name]}) for name, each in config.cameras.items()}
     return config.model_copy(
         update={
             "bus": config.bus.model_copy(update={"address": addresses["bus"]}),
             "axes": axes,
+            "probes": probes,
             "climate_chamber": config.climate_chamber
             and config.climate_chamber.model_copy(update={"address": addresses["regulator"]}),
-            "flap": config.flap.model_copy(update={"backend_address": addresses["flap"]}),
+            "flap": config.flap and config.flap.model_copy(update={"backend_address": addresses["flap"]}),
             "cameras": cameras,
             "imager": config.imager and config.imager.model_copy(update={"folder": Path(addresses["imager"])}),
             "simulation": simulation and simulation.model_copy(update={"control": addresses["control"]}),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from drivers.devices.flap import Flap
 from drivers.devices.inputs import Inputs
-from drivers.devices.protocols import Actuator, Camera, Controller, Switches
+from drivers.devices.probes import Probe
+from drivers.devices.protocols import Actuator, Camera, Controller, Shutter, Switches
 from drivers.devices.stage import Axis
 from drivers.devices.thermal_imager import ThermalImager
-from drivers.devices.thermometers import Thermometers
+from drivers.devices.thermometers import SeveralModules, Thermometers
 from foundation.clock import Clock
 from foundation.hub import Hub
 from foundation.items import Event
@@ -33,12 +33,13 @@ class Devices:
 
     regulator: Controller
     relays: Switches
-    thermometers: Thermometers
+    thermometers: Thermometers | SeveralModules
     axes: Mapping[str, Axis]
-    flap: Flap
+    flap: Shutter
     cameras: Mapping[str, Camera]
     inputs: Inputs | None = None
     imager: ThermalImager | None = None
+    probes: Mapping[str, Probe] = field(default_factory=dict[str, Probe])
 
 
 class Stand:

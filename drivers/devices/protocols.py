@@ -78,6 +78,24 @@ class Switches(Sensor, Actuator, Protocol):
         ...
 
 
+class Shutter(Sensor, Actuator, Protocol):
+    """What is between the cameras and their target: a flap, or nothing. is_shut: the last movement has confirmed it."""
+
+    is_shut: bool
+
+    async def move_open(self) -> None:
+        """Open, confirmed."""
+        ...
+
+    async def move_closed(self) -> None:
+        """Shut, confirmed."""
+        ...
+
+    def allow(self) -> None:
+        """New commands may move it again after it was made safe."""
+        ...
+
+
 class Camera(Sensor, Protocol):
     """A camera; channels `<name>.image` and `<name>.temperature`. When it is lost, its calls raise Unreachable until it
     is opened again. `restarted`: why it has, or may have, restarted between the last open and the one before; "" if

@@ -15,7 +15,8 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from drivers.devices.motion import Motion, Turn
-from drivers.devices.stage_identity import identity_of
+from drivers.devices.stage_identity import changed_settings, identity_of, power_off_s
+from drivers.devices.stage_profiles import PROFILES, ProfileName, StageProfile
 from drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
 from drivers.wires.link import SerialSettings, open_link
 from drivers.wires.ximc_client import XimcClient
@@ -52,31 +53,9 @@ _EDGES = 0x3  # of GPIOFlags
 _NOT_HOMED = "not homed"
 
 
-@dataclass(frozen=True, slots=True)
-class Profile:
-    """unit per full step, the way (in units) that every move ends upwards at least, and how far it travels.
-
-    `home_from`: from where the homing procedure, which seeks its switch downwards, has a short way to it; None: from
-    anywhere. The rotary table's switch is 12.5 deg above its zero (HomeDelta -1250): from below it would go all the way
-    round, and its cables with it.
-    """
-
-    unit: Literal["mm", "deg"]
-    unit_per_step: float
-    overshoot: float
-    travel: float
-    home_from: float | None = None
-
-
-ProfileName = Literal["8MT160-300", "8MR151"]
-PROFILES: dict[ProfileName, Profile] = {
-    "8MT160-300": Profile("mm", 0.0025, 0.5, travel=300.0),
-    "8MR151": Profile("deg", 0.01, 1.0, travel=360.0, home_from=16.0),  # it goes round, its cables do not
-}
-
-
 class AxisSettings(Polled):
-    """A stage behind a Standa XIMC controller; lengths in the profile's unit.
+    """A stage behind an XIMC controller; profile: the name of a Standa stage, or another model written out. Lengths in
+    its unit.
 
     limits: lowest and highest target. To reach a target from below, the stage passes the lowest by up to the
     profile's overshoot, which must be free.
@@ -84,13 +63,13 @@ class AxisSettings(Polled):
 
     address: ByteAddress
     serial_number: int = Field(ge=0, le=0xFFFFFFFF)
-    profile: ProfileName
+    profile: ProfileName | StageProfile
     limits: Range
     poll_s: PollPeriod_s = 5.0
 
     @model_validator(mode="after")
     def _within_travel(self) -> Self:
-        travel, unit = PROFILES[self.profile].travel, self.unit
+        travel, unit = self.stage.travel, self.unit
         if max(map(abs, self.limits)) > travel:
             raise ValueError(f"limits {self.limits} are beyond the travel of {travel:g} {unit}")
         return self
@@ -98,7 +77,12 @@ class AxisSettings(Polled):
     @property
     def unit(self) -> Literal["mm", "deg"]:
         """The axis' unit."""
-        return PROFILES[self.profile].unit
+        return self.stage.unit
+
+    @property
+    def stage(self) -> StageProfile:
+        """The model."""
+        return self.profile if isinstance(self.profile, StageProfile) else PROFILES[self.profile]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,11 +129,12 @@ class Axis:
     def __init__(self, name: str, settings: AxisSettings, clock: Clock) -> None:
         self.name = name
         self._settings = settings
-        self.profile = PROFILES[settings.profile]
+        self.profile = settings.stage
         self._clock = clock
         self._lane: Lane | None = None
         self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
         self._speed_steps_s = 1000.0
+        self._changed = ""  # what of the controller's settings is not as delivered
         self._motion = Motion(name)
         self.identity: Identity | None = None  # which controller has answered
         self._zero_due = False  # homing has begun, and its end was not made the zero of the scale yet
@@ -169,7 +154,8 @@ class Axis:
 
     async def read(self) -> tuple[Reading, ...]:
         """(position in mm or deg, moving 0/1, homed 0/1); the position is STALE, with the reason, while the controller
-        has an alarm, is not homed, or leaves the motor without current."""
+        has an alarm, is not homed, or leaves the motor without current; homed has a reason while the controller is set
+        otherwise than its profile says."""
         status = await self._call(self._status)
         now_ns = self._clock.now_ns()
         homed = self._is_homed(status)
@@ -186,7 +172,7 @@ class Axis:
         return (
             position,
             Reading(f"{self.name}.moving", float(status.running), "1", now_ns),
-            Reading(f"{self.name}.homed", float(homed), "1", now_ns),
+            Reading(f"{self.name}.homed", float(homed), "1", now_ns, reason=self._changed),
         )
 
     async def homed(self) -> bool:
@@ -331,7 +317,9 @@ class Axis:
         mode = _ENGINE.unpack(self._client.query("geng", _ENGINE.size))[6]
         if mode != _MICROSTEP_MODE_256:
             raise Refused(self.name, f"microstep mode {mode}, expected {_MICROSTEP_MODE_256} (1/256)")
-        self._speed_steps_s = float(max(1, _MOVE.unpack(self._client.query("gmov", _MOVE.size))[0]))
+        speed, *_ = _MOVE.unpack(self._client.query("gmov", _MOVE.size))
+        self._speed_steps_s = float(max(1, speed))
+        self._changed = changed_settings(self.profile, speed, power_off_s(self._client))
 
     def _identified(self) -> XimcClient:
         """The client, on a link whose other end has been checked."""

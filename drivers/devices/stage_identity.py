@@ -1,9 +1,10 @@
-"""Which XIMC controller has answered: what it tells of itself besides its serial number (libximc, GETI and GFWV)."""
+"""Which XIMC controller has answered (libximc, GETI and GFWV), and whether it is set as it was delivered (GPWR)."""
 
 from __future__ import annotations
 
 import struct
 
+from drivers.devices.stage_profiles import StageProfile
 from drivers.settings import Identity
 from drivers.wires.ximc_client import XimcClient
 from foundation.errors import Refused
@@ -20,6 +21,30 @@ def identity_of(client: XimcClient, serial_number: int) -> Identity:
     except Refused:
         return Identity("Standa", "XIMC", str(serial_number), "", by_map=True)
     return Identity(_text(maker), _text(product), str(serial_number), version)
+
+
+_POWER = struct.Struct("<BHHHB6x")  # GPWR: HoldCurrent, CurrReductDelay, PowerOffDelay, CurrentSetTime, PowerFlags
+_POWER_OFF_ENABLED = 0x2
+
+
+def power_off_s(client: XimcClient) -> float | None:
+    """After how long at rest it switches its motor off, None for never; blocking. Unreachable, GarbledReply."""
+    _, _, delay_s, _, flags = _POWER.unpack(client.query("gpwr", _POWER.size))
+    return float(delay_s) if flags & _POWER_OFF_ENABLED else None
+
+
+def changed_settings(profile: StageProfile, speed: float, power_off: float | None) -> str:
+    """What somebody else has changed, in words; "" when all is as the profile says."""
+    pairs = (("speed", speed, profile.speed, "steps/s"), ("power-off delay", power_off, profile.power_off_s, "s"))
+    return "; ".join(
+        f"{what} {_said(is_, unit)}, not {_said(wanted, unit)} as in its profile"
+        for what, is_, wanted, unit in pairs
+        if is_ != wanted
+    )
+
+
+def _said(value: float | None, unit: str) -> str:
+    return "none" if value is None else f"{value:g} {unit}"
 
 
 def _text(field: bytes) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
+from typing import Annotated
 
 from pydantic import Field
 
-from drivers.settings import Identity, Line, Range
+from drivers.settings import Identity, Line, OnBus, Range
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import RegisterMap, Sample
@@ -19,15 +20,14 @@ from foundation.readings import Quality, Reading, bad_reading
 PLAUSIBLE_DEGC = (-40.0, 100.0)
 
 
-class ThermometerSettings(Document):
-    """One sensor: `channel` 0.. of the module and its calibration against a certificate.
+class Calibration(Document):
+    """Of one sensor against a certificate.
 
-    T = t + offset_K + sum_k polynomial[k] * t**k, where t is what the module says, in degC. A calibrated value outside
-    plausible_degC is no measurement. certificate: its number, and when (calibrated) it was made; uncertainty_K: the
-    expanded one (k = 2) that it states. All three are recorded with every session and stand in its reports.
+    T = t + offset_K + sum_k polynomial[k] * t**k, where t is what the instrument says, in degC. A calibrated value
+    outside plausible_degC is no measurement. certificate: its number, and when (calibrated) it was made; uncertainty_K:
+    the expanded one (k = 2) that it states. All three are recorded with every session and stand in its reports.
     """
 
-    channel: int = Field(ge=0, le=15)
     offset_K: float = Field(default=0.0, ge=-10, le=10)  # a Pt100 that is further off is broken
     polynomial: tuple[float, ...] = Field(default=(), max_length=8)
     certificate: Line = ""
@@ -41,6 +41,31 @@ class ThermometerSettings(Document):
         for coefficient in reversed(self.polynomial):  # Horner
             correction_K = correction_K * indicated_degC + coefficient
         return indicated_degC + self.offset_K + correction_K
+
+    def reading(self, channel: str, indicated_degC: float, now_ns: int, doubt: str = "") -> Reading:
+        """Of an indication; BAD outside plausible_degC, STALE with a doubt."""
+        T_degC, (low_degC, high_degC) = self.calibrated_degC(indicated_degC), self.plausible_degC
+        if not low_degC <= T_degC <= high_degC:
+            return bad_reading(channel, "degC", now_ns, f"{T_degC:g} degC is outside {low_degC:g}..{high_degC:g} degC")
+        return Reading(channel, T_degC, "degC", now_ns, Quality.STALE if doubt else Quality.GOOD, doubt)
+
+
+class ThermometerSettings(Calibration):
+    """One sensor; channel: its place, 0 is the first of the first module, and counted on through further ones."""
+
+    channel: int = Field(ge=0, le=63)
+
+
+class ThermometerModuleSettings(OnBus):
+    """The RTD module. further_units: the numbers on the bus of more of the same kind, whose channels are counted on:
+    with six channels a module, 6 is the first of the second one."""
+
+    further_units: tuple[Annotated[int, Field(ge=1, le=247)], ...] = Field(default=(), max_length=7)
+
+    @property
+    def units(self) -> tuple[int, ...]:
+        """All of them."""
+        return (self.unit, *self.further_units)
 
 
 class Thermometers:
@@ -68,6 +93,7 @@ class Thermometers:
         self._fault_bits = [bit for point in self._points.values() for bit in register_map.points[point].bad_if]
         self._clock = clock
         self._probe_due = True
+        self.modules = (self,)
 
     @property
     def identity(self) -> Identity | None:
@@ -123,9 +149,29 @@ class Thermometers:
     ) -> Reading:
         if reason := sample.reason or alarms:
             return bad_reading(channel, "degC", now_ns, reason)
-        T_degC = sensor.calibrated_degC(sample.value)
-        low_degC, high_degC = sensor.plausible_degC
-        if not low_degC <= T_degC <= high_degC:
-            return bad_reading(channel, "degC", now_ns, f"{T_degC:g} degC is outside {low_degC:g}..{high_degC:g} degC")
-        quality = Quality.STALE if unconfirmed else Quality.GOOD
-        return Reading(channel, T_degC, "degC", now_ns, quality, unconfirmed)
+        return sensor.reading(channel, sample.value, now_ns, unconfirmed)
+
+
+class SeveralModules:
+    """Thermometers on several modules under one name, of which each is polled by itself. identity: of the first."""
+
+    def __init__(self, modules: Sequence[Thermometers]) -> None:
+        self.name = modules[0].name
+        self.modules = tuple(modules)
+
+    @property
+    def identity(self) -> Identity | None:
+        """Which module has answered as the first; None before `open`."""
+        return self.modules[0].identity
+
+    async def open(self) -> None:
+        """As of each module."""
+        for module in self.modules:
+            await module.open()
+
+    async def close(self) -> None:
+        """Nothing to let go of."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """Of all modules; DeviceError when one cannot be read."""
+        return tuple([reading for module in self.modules for reading in await module.read()])

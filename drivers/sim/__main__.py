@@ -16,8 +16,9 @@ import sys
 
 from drivers.sim.control import serve_control
 from drivers.sim.fault_schedule import FaultSchedule, parse_fault
-from drivers.sim.laboratory import Laboratory, LaboratorySpec
+from drivers.sim.laboratory import Laboratory
 from drivers.sim.laboratory_faults import table
+from drivers.sim.laboratory_spec import LaboratorySpec
 from foundation.documents import parse_document
 from foundation.ending import Ending
 from foundation.errors import ConfigError

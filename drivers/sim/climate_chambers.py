@@ -63,9 +63,10 @@ class FakeClimateChamber:
         """Somebody stops it at the panel."""
         self.running = False
 
-    def restart(self) -> None:
-        """A power failure: it comes back stopped, with its set-point."""
-        self.running = False
+    def restart(self, running_at_degC: float | None = None) -> None:
+        """A power failure: it comes back stopped, or running at an older set-point."""
+        self.running = running_at_degC is not None
+        self.setpoint_degC = self.setpoint_degC if running_at_degC is None else running_at_degC
 
     @property
     def actual_degC(self) -> float:

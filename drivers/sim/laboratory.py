@@ -6,111 +6,42 @@ import secrets
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
+from drivers.sim.adam_4015 import FakeAdam4015
 from drivers.sim.camera import FakeCamera
 from drivers.sim.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
 from drivers.sim.faults import LinkFaults
 from drivers.sim.flap import FakeFlap
 from drivers.sim.genicam_file import read_genicam
+from drivers.sim.laboratory_spec import CameraSpec, ChamberUnitSpec, LaboratorySpec
 from drivers.sim.link_faults import Link
 from drivers.sim.modbus import RtuEngine, TcpEngine, Unit
-from drivers.sim.optics import CameraKind, true_centres_px
+from drivers.sim.optics import true_centres_px
 from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.probes import FakeProbe
 from drivers.sim.regulator import FakeRegulator
 from drivers.sim.relays import FakeRelays
+from drivers.sim.rtd_sensors import CHANNELS
 from drivers.sim.scene import Scene, SceneSpec
+from drivers.sim.switch import Switch
 from drivers.sim.thermal_imager import FakeThermalImager
 from drivers.sim.thermometers import FakeThermometers
 from drivers.sim.usb import UsbServer
 from drivers.sim.wire import Engine, PtyWire, TcpWire
 from drivers.sim.ximc import FakeAxis
-from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 from foundation.addresses import tcp_place
 from foundation.clock import FollowedClock, WallClock
-from foundation.documents import Document
 from foundation.errors import ConfigError
-
-PROFILES = {"8MT160-300": LINEAR_8MT160_300, "8MR151": ROTARY_8MR151}
 
 # How fast frames leave: as a camera's readout in real time; in virtual time nothing else moves meanwhile.
 _PACE_MBps = {False: 40.0, True: 120.0}
 
+_LINE_MBps = 125.0  # 1 Gbit/s, at which each of several cameras sends unless it is told to pause
 _FREE_ADDRESS_TRIES = 100
-
-
-class AxisSpec(Document):
-    """A stage: where its controller answers and which profile it was delivered with."""
-
-    address: str
-    profile: Literal["8MT160-300", "8MR151"]
-    serial_number: int
-
-
-class EndpointSpec(Document):
-    """A device with an address and a serial number."""
-
-    address: str | None
-    serial_number: str | None
-
-
-class CameraSpec(EndpointSpec):
-    """A camera; optics: none is as `camera_kind`. genicam: the file of another make, which it then shows."""
-
-    optics: CameraKind | None = None
-    genicam: Path | None = None
-
-
-class ChamberUnitSpec(Document):
-    """A commercial climate chamber: its protocol, where it answers, and the set-points that its controller allows (by
-    default as the stand asks for)."""
-
-    protocol: Literal["espec", "cts", "ascii2"]
-    address: str
-    unit: int
-    limits_degC: tuple[float, float] | None = None
-
-
-class ImagerSpec(Document):
-    """A thermal imager: where its pictures go, None for a folder of its own, and where it sees what (x, y in px)."""
-
-    folder: Path | None
-    spots: dict[str, tuple[int, int]]
-
-
-class LaboratorySpec(Document):
-    """What the simulator process reads on its standard input.
-
-    Port 0, "serial:" without a path and a camera without an address stand for free ones. All cameras see the same.
-    """
-
-    virtual: bool
-    control: str
-    start_ns: int = Field(ge=0)
-    seed: int
-    camera_kind: CameraKind
-    laboratory_degC: float
-    chamber_seed: int | None = None
-    bus: str
-    regulator_unit: int | None
-    chamber: ChamberUnitSpec | None = None
-    relays_unit: int | None
-    relay_channels: dict[str, int]
-    inputs_unit: int | None = None
-    input_channels: dict[str, int] = Field(default_factory=dict[str, int])
-    inputs_closed: tuple[int, ...] = ()
-    thermometers_unit: int
-    thermometer_channels: dict[str, int]
-    axes: dict[Literal["linear", "rotary"], AxisSpec]
-    flap: EndpointSpec
-    cameras: dict[str, CameraSpec]
-    imager: ImagerSpec | None = None
-    camera_boot_s: float = Field(default=3.0, ge=0)
-    faults: tuple[str, ...] = ()
 
 
 Found = TypeVar("Found")
@@ -142,6 +73,8 @@ class Laboratory:
         )
         self.plant = Plant(plant_spec, self._clock.now_ns())
         self.axes: dict[str, FakeAxis] = {}
+        self.probes: dict[str, FakeProbe] = {}
+        self.thermometer_modules: list[FakeThermometers | FakeAdam4015] = []
         self.cameras: dict[str, FakeCamera] = {}
         self.addresses: dict[str, str] = {}
         self._links: dict[str, Link] = {}
@@ -149,6 +82,8 @@ class Laboratory:
         self._relays: FakeRelays | None = None
         self._chamber: FakeClimateChamber | None = None
         self._imager: FakeThermalImager | None = None
+        self._flap: FakeFlap | None = None
+        self.switch: Switch | None = None
         self.ssr_welded_share = 0.0
         self.camera_sensor_degC: float | None = None
         self._closers: list[Callable[[], None]] = []
@@ -192,6 +127,11 @@ class Laboratory:
     def imager(self) -> FakeThermalImager:
         """The thermal imager; ValueError when there is none."""
         return _there(self._imager, "thermal imager")
+
+    @property
+    def flap(self) -> FakeFlap:
+        """The flap; ValueError when there is none."""
+        return _there(self._flap, "flap")
 
     @property
     def now_ns(self) -> int:
@@ -259,10 +199,7 @@ class Laboratory:
             self._relays = FakeRelays(plant, clock, spec.relays_unit, spec.relay_channels)
             units.append(self._relays)
         plant.on_step.append(self._conduct)  # after the regulator's and the relays'
-        self.thermometers = FakeThermometers(
-            plant, clock, spec.thermometers_unit, spec.thermometer_channels, seed=spec.seed
-        )
-        units.append(self.thermometers)
+        units += self._rtd_modules()
         self.inputs: FakeRelays | None = self._relays  # a board that has both
         if spec.inputs_unit not in (None, spec.relays_unit):
             self.inputs = FakeRelays(plant, clock, spec.inputs_unit, {})
@@ -271,14 +208,18 @@ class Laboratory:
             self.inputs.closed_inputs = set(spec.inputs_closed)
         framing = RtuEngine if spec.bus.startswith("serial:") else TcpEngine
         self._listen("bus", spec.bus, lambda: framing(units))
+        for name, probe in spec.probes.items():
+            self.probes[name] = FakeProbe(plant, clock, probe.protocol, probe.serial_number or "P-1", spec.seed)
+            self._listen(name, probe.address, self.probes[name].engine)
         for name, settings in spec.axes.items():
-            axis = FakeAxis(plant, clock, PROFILES[settings.profile], settings.serial_number, name)
+            axis = FakeAxis(plant, clock, settings.stage, settings.serial_number, name)
             self.axes[str(name)] = axis
             self._listen(name, settings.address, axis.engine)
-        self.flap = FakeFlap(plant, clock, spec.flap.serial_number or "")
-        usb = UsbServer(*tcp_place(spec.flap.address or "", may_be_free=True), [self.flap])
-        self._closers.append(usb.close)
-        self.addresses["flap"] = usb.address
+        if spec.flap is not None:
+            self._flap = FakeFlap(plant, clock, spec.flap.serial_number or "")
+            usb = UsbServer(*tcp_place(spec.flap.address or "", may_be_free=True), [self._flap])
+            self._closers.append(usb.close)
+            self.addresses["flap"] = usb.address
         if spec.imager is not None:
             self._imager = FakeThermalImager(plant, spec.imager.folder, spec.imager.spots, spec.seed)
             self._closers.append(self._imager.close)
@@ -289,6 +230,30 @@ class Laboratory:
             self._closers.append(camera.close)
             camera.start()
             self.cameras[name], self.addresses[name] = camera, camera.address
+        self._share_a_switch()
+
+    def _rtd_modules(self) -> list[Unit]:
+        spec, make = self.spec, FakeAdam4015 if self.spec.thermometers_model == "adam4015" else FakeThermometers
+        for number, unit in enumerate(spec.thermometers_units):
+            first = number * CHANNELS
+            here = {name: at for name, at in spec.thermometer_channels.items() if first <= at < first + CHANNELS}
+            self.thermometer_modules.append(make(self.plant, self._clock, unit, here, spec.seed, first))
+        return list(self.thermometer_modules)
+
+    @property
+    def thermometers(self) -> FakeThermometers:
+        """The first module; ValueError when it is of another make."""
+        first = self.thermometer_modules[0]
+        if not isinstance(first, FakeThermometers):
+            raise ValueError("this laboratory has an ADAM-4015")
+        return first
+
+    def _share_a_switch(self) -> None:
+        """Between several cameras and the computer; in virtual time they take turns, and need none."""
+        if not self.is_virtual and len(self.cameras) > 1:
+            self.switch = Switch(_LINE_MBps)
+            for camera in self.cameras.values():
+                camera.faults.switch = self.switch
 
     def _climate_chamber(self, spec: ChamberUnitSpec) -> FakeClimateChamber:
         is_serial = spec.address.startswith("serial:")
@@ -311,7 +276,8 @@ class Laboratory:
         def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
             with self.plant.lock:
                 self.plant.advance(time_ns if self._followed is None else self._clock.now_ns())
-                optics, flap_open = self.plant.optics(time_ns, kind), self.plant.flap_open_at(time_ns)
+                optics = self.plant.optics(time_ns, kind)
+                flap_open = 1.0 if self._flap is None else self.plant.flap_open_at(time_ns)  # else a window
             return scene.render(optics, time_ns, exposure_s, gain_dB, flap_open, rows)
 
         def at(address: str) -> FakeCamera:
@@ -322,7 +288,7 @@ class Laboratory:
                 address,
                 settings.serial_number or "",
                 real_time=not self.spec.virtual,
-                pace_MBps=_PACE_MBps[self.spec.virtual],
+                pace_MBps=_PACE_MBps[self.spec.virtual] if len(self.spec.cameras) < 2 else _LINE_MBps,
                 boot_s=self.spec.camera_boot_s,
                 genicam=genicam,
             )

@@ -28,9 +28,8 @@ _AXES = ("linear", "rotary")
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """How something is broken: `apply(laboratory, value)`, the value it has when none is given, the one that mends it,
-    and what it means. `locks`: whether it is set under the plant's lock; a wire that is unplugged waits for its
-    thread, which may want that lock."""
+    """How something is broken: by a value, `worst` when none is given; the one that mends it; what it means. `locks`:
+    set under the plant's lock; a wire that is unplugged waits for its thread, which may want that lock."""
 
     apply: Setter
     worst: object
@@ -49,7 +48,7 @@ def inject(laboratory: Laboratory, name: str, value: object) -> None:
 
 
 def _numbers(laboratory: Laboratory, value: object) -> dict[int, float]:
-    """`{"air": 30.0}` by the module's channel numbers."""
+    """`{"air": 30.0}` by channel numbers."""
     named = TypeAdapter(dict[str, float]).validate_python(value or {})
     return {laboratory.spec.thermometer_channels[name]: number for name, number in named.items()}
 
@@ -77,7 +76,8 @@ def _to(find: Callable[[Laboratory], object], attribute: str, kind: Callable[[ob
 
 def _thermometers(attribute: str, kind: Callable[[Laboratory, object], object]) -> Setter:
     def apply(laboratory: Laboratory, value: object) -> None:
-        setattr(laboratory.thermometers, attribute, kind(laboratory, value))
+        for module in laboratory.thermometer_modules:
+            setattr(module, attribute, kind(laboratory, value))
 
     return apply
 

@@ -39,11 +39,12 @@ class ByteLink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """Baud, data bits 8, stop bits, parity."""
+    """Baud, stop bits, parity, data bits."""
 
     baud: int
     stopbits: int
     parity: str = "N"
+    databits: int = 8
 
 
 def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
@@ -63,6 +64,7 @@ class _SerialLink:
             self._port = serial.Serial(
                 path,
                 settings.baud,
+                bytesize=settings.databits,
                 parity=settings.parity,
                 stopbits=settings.stopbits,
                 timeout=0,

@@ -18,7 +18,6 @@ from pydantic import Field, model_validator
 from foundation.documents import Document, load_document
 
 _SMALLEST = 1e-30  # a float of exchanged words is next to nothing: 25.0 would be 2.4e-41
-MAX_GAP_WORDS = 4  # reading four words too many costs less than another request
 
 Space = Literal["holding", "input", "coil", "discrete"]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
@@ -34,6 +33,7 @@ class Transport(Document):
     unit: int = Field(ge=1, le=247)
     write_fc: Literal[6, 16] = 6
     max_read_words: int = Field(default=32, ge=1, le=125)
+    max_gap_words: int = Field(default=4, ge=0, le=125)  # four words too many cost less than another request
 
 
 class RawFault(Document):
@@ -264,7 +264,7 @@ class Block:
 
 
 def plan_blocks(register_map: RegisterMap, names: Iterable[str]) -> tuple[Block, ...]:
-    """The fewest reads that cover `names`: by address, gaps up to 4, at most max_read_words each."""
+    """The fewest reads that cover `names`: by address, gaps and lengths as the transport allows."""
     blocks: list[Block] = []
     points = register_map.points
     for name in sorted(set(names), key=lambda name: (points[name].space, points[name].address)):
@@ -274,7 +274,7 @@ def plan_blocks(register_map: RegisterMap, names: Iterable[str]) -> tuple[Block,
         if (
             last is not None
             and last.space == point.space
-            and point.address - (last.address + last.count) <= MAX_GAP_WORDS
+            and point.address - (last.address + last.count) <= register_map.transport.max_gap_words
             and end - last.address <= register_map.transport.max_read_words
         ):
             blocks[-1] = Block(last.space, last.address, end - last.address, (*last.names, name))

@@ -49,8 +49,9 @@ class Permission(StrEnum):
 
 
 class Permits:
-    """The relays of heater and compressor. `allowed` says whether the guard looks and finds all well: else nothing is
-    armed. `keep` is called at each change of the compressor, and must not wait."""
+    """The relays of heater and compressor; a board may have none of the latter. `allowed` says
+    whether the guard looks and finds all well: else nothing is armed. `keep` is called at each change of the
+    compressor, and must not wait."""
 
     def __init__(
         self,
@@ -120,11 +121,11 @@ class Permits:
             coils = await self._coils()
             if self.granted:
                 self._compare(coils)
-            if self.granted and coils[COMPRESSOR] and not self._compressor.running:
+            if self.granted and coils.get(COMPRESSOR) and not self._compressor.running:
                 await self._intruded(COMPRESSOR)
             if self.gives:
                 await self._hold_on(HEATER)
-            if self.gives:  # still, after the wait
+            if self.gives and COMPRESSOR in coils:  # still, after the wait
                 await self._arm_compressor(mv_heat, mv_cool)
             return coils
 
@@ -182,7 +183,7 @@ class Permits:
         now_ns = self._clock.now_ns()
         for channel in (HEATER, COMPRESSOR):
             until_ns = self._until_ns.get(channel, 0)
-            if coils[channel] or not until_ns:
+            if coils.get(channel) or not until_ns:
                 continue
             del self._until_ns[channel]
             early = until_ns - now_ns > seconds_ns(_EARLY_S)

@@ -18,6 +18,7 @@ from foundation.ending import Ending
 from foundation.exit_codes import one_line_errors
 from foundation.output import say, show
 from stand.config.stand_config import load_config, packaged
+from stand.estimating.absent import absences
 from stand.estimating.camera_lines import camera_lines
 from stand.estimating.estimate import PricedStep
 from stand.estimating.learned import load_learned
@@ -67,10 +68,11 @@ def plan(
             **totals,
             "cameras": [asdict(line) for line in lines],
             "looks": None if looks is None else asdict(looks),
+            "absent": (absent := absences(order.config)),
         }
         shared = [str(line) for line in lines if line.shared_by > 1]
         seen = [] if looks is None else [str(looks)]
-        show(data, [*map(_line, steps), *back, total, *seen, str(learned), *shared])
+        show(data, [*map(_line, steps), *back, total, *seen, str(learned), *shared, *absent])
 
 
 @app.command()

@@ -7,6 +7,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
+from drivers.settings import DeviceName
 from foundation.documents import Document
 
 # Magnus' formula over water, with the constants of Sonntag, Z. Meteorol. 70 (1990) 340, -45..60 degC.
@@ -24,11 +25,13 @@ def dew_point_degC(air_degC: float, humidity_percent: float) -> float:
 class DewConfig(Document):
     """The laboratory's air at its wettest. dew_point_degC: of it; or humidity_percent, with the laboratory's
     thermometer. With the flap open no camera and no target may be less than margin_K above it for flap_s: the run is
-    held and the flap closes. A plan that captures below a given dew_point_degC is refused.
+    held and the flap closes. A plan that captures below a given dew_point_degC is refused. hygrometer: the one of
+    probes that measures that air; what is given counts while it tells nothing.
     """
 
     dew_point_degC: float | None = Field(default=None, ge=-40, le=40)
     humidity_percent: float | None = Field(default=None, ge=1, le=100)
+    hygrometer: DeviceName | None = None
     margin_K: float = Field(default=1.0, ge=0, le=10)
     flap_s: float = Field(default=10.0, ge=0, le=300)
 
@@ -38,8 +41,11 @@ class DewConfig(Document):
             raise ValueError("give dew_point_degC or humidity_percent, one of them")
         return self
 
-    def lowest_degC(self, laboratory_degC: float) -> float:
-        """What nothing may be below that meets the laboratory's air at that temperature; NaN while that is unknown."""
+    def lowest_degC(self, laboratory_degC: float, measured_degC: float = math.nan) -> float:
+        """What nothing may be below that meets the laboratory's air at that temperature and, where it is measured, with
+        that dew point; NaN while neither is known."""
+        if not math.isnan(measured_degC):
+            return measured_degC + self.margin_K
         if self.dew_point_degC is not None:
             return self.dew_point_degC + self.margin_K
         return dew_point_degC(laboratory_degC, self.humidity_percent or math.nan) + self.margin_K

@@ -19,11 +19,12 @@ from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamber
 from drivers.devices.flap import FlapSettings
 from drivers.devices.inputs import InputsSettings
 from drivers.devices.pid import split
+from drivers.devices.probes import ProbeSettings
 from drivers.devices.relays import HEAT, RelaysSettings
 from drivers.devices.software_regulator import SoftwareRegulatorSettings
 from drivers.devices.stage import AxisSettings
 from drivers.devices.thermal_imager import ThermalImagerSettings
-from drivers.devices.thermometers import ThermometerSettings
+from drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings
 from drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
 from drivers.wires.bus import BusSettings
 from experiments.parameters import Chamber_degC
@@ -161,10 +162,11 @@ class StandConfig(Document):
     regulator: RegulatorSettings | None = None
     climate_chamber: ClimateChamberSettings | None = None
     relays: RelaysSettings | None = None
-    thermometer_module: OnBus
+    thermometer_module: ThermometerModuleSettings
     thermometers: dict[DeviceName, ThermometerSettings]
+    probes: dict[DeviceName, ProbeSettings] = Field(default_factory=dict)
     axes: dict[DeviceName, AxisSettings] = Field(default_factory=dict)
-    flap: FlapSettings
+    flap: FlapSettings | None = None
     inputs: InputsSettings | None = None
     imager: ThermalImagerSettings | None = None
     cameras: dict[DeviceName, AnyCameraSettings] = Field(default_factory=dict)
@@ -228,22 +230,23 @@ class StandConfig(Document):
 
     def _unfit_devices(self) -> Iterator[str]:
         regulator = self.regulator_unit
-        units = [each.unit for each in (regulator, self.relays, self.thermometer_module) if each is not None]
+        units = [each.unit for each in (regulator, self.relays) if each is not None]
+        units += self.thermometer_module.units
         if len(set(units)) < len(units):
             yield f"regulator, relays and thermometer_module need different units on one bus, not {units}"
-        others = [each.unit for each in (regulator, self.thermometer_module) if each is not None]
+        others = [*self.thermometer_module.units, *((regulator.unit,) if regulator is not None else ())]
         if self.inputs is not None and self.inputs.unit in others:
             yield "inputs.unit is that of the regulator or the thermometers; take the relay board's, or another"
-        addresses = [self.bus.address, *(axis.address for axis in self.axes.values())]
+        addresses = [self.bus.address, *(each.address for each in (*self.axes.values(), *self.probes.values()))]
         addresses += [self.climate_chamber.address] if self.climate_chamber is not None else []
         addresses += [camera.address for camera in self.cameras.values()]
         if twice := [address for address in addresses if addresses.count(address) > 1]:
-            yield f"bus, axes and cameras need addresses of their own, {twice[0]} is given twice"
+            yield f"bus, axes, probes and cameras need addresses of their own, {twice[0]} is given twice"
         if unknown := [] if self.simulation is None else sorted(set(self.simulation.cameras) - set(self.cameras)):
             yield f"simulation.cameras has {unknown[0]}, and no camera of the stand is named so"
-        names = [*self.axes, *self.cameras, *_DEVICES]
+        names = [*self.axes, *self.cameras, *self.probes, *_DEVICES]
         if twice := [name for name in names if names.count(name) > 1]:
-            yield f"the name {twice[0]} is that of two devices; axes and cameras need names of their own"
+            yield f"the name {twice[0]} is that of two devices; axes, cameras and probes need names of their own"
         if missing := _GUARDED - self.thermometers.keys():
             yield f"thermometers lacks {', '.join(sorted(missing))}, without which nothing is heated"
         if len({entry.channel for entry in self.thermometers.values()}) < len(self.thermometers):
@@ -267,13 +270,17 @@ class StandConfig(Document):
             yield "limits.chamber_degC and the ambient_degC of the cameras have no temperature in common"
         if self.dew is not None and self.dew.humidity_percent is not None and "laboratory" not in self.thermometers:
             yield "dew.humidity_percent needs a thermometer named laboratory; give dew.dew_point_degC instead"
+        if self.dew is not None and self.dew.hygrometer is not None:
+            hygrometer = self.probes.get(self.dew.hygrometer)
+            if hygrometer is None or hygrometer.protocol != "vaisala":
+                yield f"dew.hygrometer {self.dew.hygrometer}: none of probes that measures humidity is named so"
         for name, limit_degC in (("granite", guard.max_granite_degC), ("camera", guard.max_camera_degC)):
             if limit_degC < highest_degC:  # they follow the air
                 yield f"guard.max_{name}_degC {limit_degC} is below the upper limits.chamber_degC"
 
     def _unfit_periods(self) -> Iterator[str]:
         guard, cameras_s = self.guard, [camera.poll_s for camera in self.cameras.values()]
-        if self.flap.poll_s * 2 > guard.flap_open_s:
+        if self.flap is not None and self.flap.poll_s * 2 > guard.flap_open_s:
             yield f"guard.flap_open_s must be at least twice flap.poll_s ({self.flap.poll_s} s)"
         slowest_s = max(self.controller.poll_s, self.thermometer_module.poll_s, *cameras_s)
         if slowest_s * 2 > guard.stale_after_s:
@@ -321,15 +328,26 @@ class StandConfig(Document):
 
 
 def load_config(path: Path) -> StandConfig:
-    """The configuration file, checked. Register maps that lie beside it are named by their whole path."""
+    """The configuration file, checked. Register maps that lie beside it, and GenICam files, are named by their whole
+    path."""
     config = load_document(path, StandConfig)
+    simulation = config.simulation and config.simulation.model_copy(
+        update={"cameras": {name: _dressed(path, each) for name, each in config.simulation.cameras.items()}}
+    )
     named: dict[str, object] = {name: getattr(config, name) for name in (*MAPPED, "inputs")}
     units = {name: unit for name, unit in named.items() if isinstance(unit, OnBus)}
     return config.model_copy(
         update={
             name: unit.model_copy(update={"registers": _beside(path, unit.registers)}) for name, unit in units.items()
         }
+        | {"simulation": simulation}
     )
+
+
+def _dressed(path: Path, camera: SimulatedCamera) -> SimulatedCamera:
+    """Its GenICam file from where the stand's file at `path` is."""
+    file = None if camera.genicam is None else (path.parent / camera.genicam).absolute()
+    return camera.model_copy(update={"genicam": file})
 
 
 def _beside(path: Path, name: str) -> str:

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from drivers.devices.stage import PROFILES, AxisSettings
+from drivers.devices.stage import AxisSettings
+from drivers.devices.stage_profiles import StageProfile
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -42,25 +43,13 @@ COOL_DOWN_AS_FOUND = "cool down as found"  # of a camera that the run finds as w
 LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """A stage's speeds (full steps/s) and accelerations (full steps/s2)."""
-
-    speed: float
-    acceleration: float
-    deceleration: float
-    homing_speed: float
-
-    def move_s(self, steps: float) -> float:
-        """From rest to rest over so many full steps, s: a trapezoid of speed, a triangle when it is short."""
-        way = abs(steps)
-        slow = 1.0 / self.acceleration + 1.0 / self.deceleration  # s to start and stop, per step/s
-        speed = min(self.speed, math.sqrt(2.0 * way / slow))
-        return way / speed + speed * slow / 2.0 if speed > 0.0 else 0.0
-
-
-# libximc, python-profiles/STANDA: Speed, Accel, Decel, FastHome. A controller set otherwise shows in the overhead.
-_PACES = {"8MT160-300": Pace(1000.0, 2000.0, 4000.0, 500.0), "8MR151": Pace(2000.0, 2000.0, 5000.0, 100.0)}
+def move_s(stage: StageProfile, steps: float) -> float:
+    """From rest to rest over so many full steps, s: a trapezoid of speed, a triangle when it is short. A controller
+    that is set otherwise shows in the overhead."""
+    way = abs(steps)
+    slow = 1.0 / stage.acceleration + 1.0 / stage.deceleration  # s to start and stop, per step/s
+    speed = min(stage.speed, math.sqrt(2.0 * way / slow))
+    return way / speed + speed * slow / 2.0 if speed > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,11 +159,11 @@ def _boot_s(config: StandConfig) -> float:
 
 def _move_s(axis: AxisSettings, begin: float, end: float) -> float:
     """As the driver moves: when not from below, past the end first, then up to it."""
-    profile, pace = PROFILES[axis.profile], _PACES[axis.profile]
+    profile = axis.stage
     below = end - profile.overshoot
     ways = (begin - below, profile.overshoot) if begin > below else (end - begin,)
-    return sum(pace.move_s(way / profile.unit_per_step) for way in ways)
+    return sum(move_s(profile, way / profile.unit_per_step) for way in ways)
 
 
 def _to_home_s(axis: AxisSettings, position: float) -> float:
-    return abs(position) / PROFILES[axis.profile].unit_per_step / _PACES[axis.profile].homing_speed
+    return abs(position) / axis.stage.unit_per_step / axis.stage.homing_speed

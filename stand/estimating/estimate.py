@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from drivers.devices.stage import PROFILES
 from experiments.steps import (
     AnySoak,
     Capture,
@@ -192,7 +191,7 @@ def _minutes(duration_s: float) -> str:
 
 def _messages_per_s(config: StandConfig) -> float:
     polled = (config.regulator, config.climate_chamber, config.relays, config.thermometer_module, config.flap)
-    polled = (*polled, *config.cameras.values(), *config.axes.values())
+    polled = (*polled, *config.cameras.values(), *config.axes.values(), *config.probes.values())
     return sum(1.0 / device.poll_s for device in polled if device is not None)
 
 
@@ -236,7 +235,7 @@ def _check(planned: PlannedStep, config: StandConfig) -> None:
                 f"{where}: {step.position} {axis.unit} is outside the limits {axis.limits} of {step.axis}"
             )
         # An axis without scale is homed before it moves, which ends at 0; a home check begins at the profile's place.
-        home_from = PROFILES[axis.profile].home_from if isinstance(step, CheckHome) else None
+        home_from = axis.stage.home_from if isinstance(step, CheckHome) else None
         outside = [place for place in (0.0, home_from) if place is not None and not low <= place <= high]
         if outside:
             raise ConfigError(

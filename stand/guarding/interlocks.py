@@ -159,13 +159,25 @@ def stage_alarm(position: str) -> Rule:
     return rule
 
 
-def dewed(flap: str, channels: tuple[str, ...], laboratory: str, lowest_degC: Callable[[float], float]) -> Rule:
+def settings_changed(channel: str) -> Rule:
+    """A stage's controller is set otherwise than its profile says."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        reading = readings.known(channel)
+        if reading is not None and reading.quality is Quality.GOOD and reading.reason:
+            return Fault("settings_changed", f"{channel.partition('.')[0]}: {reading.reason}")
+        return None
+
+    return rule
+
+
+def dewed(flap: str, channels: tuple[str, ...], lowest_degC: Callable[[Readings], float]) -> Rule:
     """The flap is open while one of the channels is below what water of the laboratory's air would settle on."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         if not value_of(readings, flap) > _OPEN_ABOVE:
             return None
-        limit_degC = lowest_degC(value_of(readings, laboratory))
+        limit_degC = lowest_degC(readings)
         for channel in channels:
             value_degC = value_of(readings, channel)
             if value_degC < limit_degC:

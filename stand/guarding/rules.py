@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
 
 from experiments.steps import Capture
 from foundation.items import Event, Item, StepMark, StepState
+from stand.config.dew import dew_point_degC
 from stand.config.stand_config import StandConfig
-from stand.fault import Action
+from stand.fault import Action, Readings, value_of
 from stand.gate import OPERATOR
 from stand.guarding.felt_air import camera_feels, granite_feels
 from stand.guarding.first_heat import first_heat
@@ -30,6 +33,7 @@ from stand.guarding.interlocks import (
     permit_missing,
     recording_ended,
     reported_fault,
+    settings_changed,
     stage_alarm,
     stopped_while_permitted,
     trustworthy,
@@ -189,11 +193,19 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
         Watch(reported_fault("regulator.fault"), limits.keys_s, "hold"),
         Watch(stopped_while_permitted(RUNNING, PERMIT), limits.keys_s, "hold"),
         *(Watch(stage_alarm(f"{name}.position"), action="hold") for name in config.axes),
+        *(Watch(settings_changed(f"{name}.homed"), action="warn") for name in config.axes),
+        *(_flap_watches(config, announced) if config.flap is not None else ()),
+        Watch(frames_stopped(lambda: announced.frames_stopped), limits.disk_low_s, "hold"),
+        Watch(paused(lambda: announced.is_paused), 3600.0 * limits.pause_limit_h, "hold"),
+    )
+
+
+def _flap_watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
+    limits = config.guard
+    return (
         Watch(flap_open(FLAP, lambda: announced.is_capturing), limits.flap_open_s, "hold"),
         Watch(flap_open(FLAP), limits.flap_capture_s, "hold"),
         Watch(trustworthy(FLAP, limits.flap_open_s / 2), limits.flap_open_s / 2, "hold"),
-        Watch(frames_stopped(lambda: announced.frames_stopped), limits.disk_low_s, "hold"),
-        Watch(paused(lambda: announced.is_paused), 3600.0 * limits.pause_limit_h, "hold"),
     )
 
 
@@ -209,7 +221,20 @@ def _dew(config: StandConfig) -> tuple[Watch, ...]:
     dew = config.dew
     if dew is None:
         return ()
-    return (Watch(dewed(FLAP, cold_parts(config), LABORATORY, dew.lowest_degC), dew.flap_s, "hold"),)
+    return (Watch(dewed(FLAP, cold_parts(config), partial(dew_limit_degC, config)), dew.flap_s, "hold"),)
+
+
+def dew_limit_degC(config: StandConfig, readings: Readings) -> float:
+    """What nothing may be below that meets the laboratory's air; NaN while that is unknown, or on a stand that is not
+    asked to look."""
+    if config.dew is None:
+        return math.nan
+    probe, measured_degC = config.dew.hygrometer, math.nan
+    if probe is not None:
+        humidity_percent = value_of(readings, f"{probe}.humidity")
+        if humidity_percent > 0:
+            measured_degC = dew_point_degC(value_of(readings, f"{probe}.temperature"), humidity_percent)
+    return config.dew.lowest_degC(value_of(readings, LABORATORY), measured_degC)
 
 
 def _contacts(config: StandConfig) -> tuple[Watch, ...]:

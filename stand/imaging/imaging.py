@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 
-from drivers.devices.flap import Flap
+from drivers.devices.protocols import Shutter
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import Unreachable
 from foundation.hub import Hub
@@ -27,7 +27,7 @@ class Imaging:
     def __init__(
         self,
         cameras: Cameras,
-        flap: Flap,
+        flap: Shutter,
         supply: CameraSupply,
         interlock: Interlock,
         gate: Gate,

@@ -49,9 +49,11 @@ def addresses(config: StandConfig) -> tuple[Address, ...]:
         found += [Address(name, place) for place in _places(axis.address)]
         if is_real:
             found.append(Address(name, f"stage {axis.serial_number}"))
-    if flap.backend_address is not None:
+    for name, probe in config.probes.items():
+        found += [Address(name, place) for place in _places(probe.address)]
+    if flap is not None and flap.backend_address is not None:
         found += [Address("flap", place) for place in _places(flap.backend_address)]
-    else:
+    elif flap is not None:
         found.append(Address("flap", f"usb {flap.serial_number}"))
     for name, camera in config.cameras.items():
         found.append(Address(name, _of_host("camera", camera.address)))

@@ -129,7 +129,7 @@ class House:
             *(poller.run() for poller in self._pollers),
             self.guard.run(),
             stand.chamber.keeper.run(),
-            keep_shut_in_holds(stand, hub, clock),
+            *((keep_shut_in_holds(stand, hub, clock),) if self.assembly.config.flap is not None else ()),
             stand.imaging.supply.opening.keep_open(),
         ]
         self._tasks.extend(map(asyncio.create_task, works))
@@ -279,6 +279,8 @@ async def _open(assembly: Assembly) -> None:
     stand.opened(devices.regulator)
     await devices.regulator.stop()
     await devices.thermometers.open()
+    for probe in devices.probes.values():
+        await probe.open()
     await devices.flap.open()
     stand.opened(devices.flap)
     await devices.flap.move_closed()
@@ -294,7 +296,14 @@ async def close_devices(assembly: Assembly) -> None:
     """Let go of every wire; actuators stay as they are."""
     devices = assembly.devices
     imagers = (devices.imager,) if devices.imager is not None else ()
-    for device in (*devices.cameras.values(), *devices.axes.values(), *imagers, devices.flap, devices.regulator):
+    for device in (
+        *devices.cameras.values(),
+        *devices.axes.values(),
+        *devices.probes.values(),
+        *imagers,
+        devices.flap,
+        devices.regulator,
+    ):
         with suppress(StandError):  # closing never decides a run, and one device must not keep the next from it
             await device.close()
     await assembly.bus.close()

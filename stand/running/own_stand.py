@@ -99,7 +99,8 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
             "guard": recorded.guard.model_copy(update=notified),
             "compressor": recorded.compressor.model_copy(update=state_file),
             "recording": recorded.recording.model_copy(update={"directory": own.recording.directory}),
-            "flap": recorded.flap.model_copy(update={"backend": simulated.flap.backend}),
+            "flap": recorded.flap
+            and recorded.flap.model_copy(update={"backend": simulated.flap and simulated.flap.backend}),
         }
     )
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml
 
+from drivers.devices.flap import FlapSettings
 from drivers.settings import CameraSettings, OnBus
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -38,9 +39,11 @@ def rehearsed(order: Order) -> Order:
         "axes": {
             name: axis.model_copy(update={"address": there.axes[name].address}) for name, axis in config.axes.items()
         },
-        "flap": config.flap.model_copy(
-            update={"backend": there.flap.backend, "backend_address": there.flap.backend_address}
-        ),
+        "probes": {
+            name: probe.model_copy(update={"address": f"tcp:127.0.0.1:{_PROBES + number}"})
+            for number, (name, probe) in enumerate(config.probes.items())
+        },
+        "flap": config.flap and _flap(config.flap, there.flap),
         "cameras": {name: _camera(camera, there.cameras["camera"]) for name, camera in config.cameras.items()},
         "guard": config.guard.model_copy(update={"notify": ()}),
         "compressor": config.compressor.model_copy(update={"state_file": None}),
@@ -53,10 +56,17 @@ def rehearsed(order: Order) -> Order:
 
 
 _CHAMBER = "tcp:127.0.0.1:15023"
+_PROBES = 15024  # and on
 
 
 def _at(unit: OnBus, registers: str) -> OnBus:
     return unit.model_copy(update={"registers": registers})
+
+
+def _flap(own: FlapSettings, there: FlapSettings | None) -> FlapSettings:
+    return own.model_copy(
+        update={name: getattr(there, name) for name in ("backend", "backend_address")} if there is not None else {}
+    )
 
 
 def _camera(own: CameraSettings, there: CameraSettings) -> CameraSettings:

@@ -275,7 +275,8 @@ def device_kinds(assembly: Assembly) -> dict[str, str]:
         "regulator": "regulator",
         "relays": "relays",
         "thermometers": "thermometers",
-        "flap": "flap",
+        **({} if assembly.config.flap is None else {"flap": "flap"}),
+        **dict.fromkeys(devices.probes, "thermometers"),
         **dict.fromkeys(devices.axes, "axis"),
         **dict.fromkeys(devices.cameras, "camera"),
     }

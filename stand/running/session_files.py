@@ -14,6 +14,7 @@ from pathlib import Path
 from foundation.clock import NS_PER_S, Clock, VirtualClock
 from foundation.documents import parse_document
 from foundation.hub import Hub
+from foundation.items import Event
 from markers.target import Target
 from recording.format.roi import RoiEncoder
 from recording.writing.disk import Disk
@@ -21,6 +22,7 @@ from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from recording.writing.settings import VIRTUAL_COMMIT_S
 from stand.assembly import Assembly
 from stand.config.stand_config import RecordingConfig, StandConfig
+from stand.estimating.absent import absences
 from stand.identities import identity_event
 from stand.running.order import Order
 
@@ -55,12 +57,16 @@ def camera_serials(assembly: Assembly) -> str:
 
 
 def tell_identities(assembly: Assembly) -> None:
-    """Which devices have answered, but for the cameras, as events; those are told when they are on."""
+    """Which devices have answered, as events, but for the cameras, which are told when they are on; and what the stand
+    lacks."""
     devices, now_ns = assembly.devices, assembly.clock.now_ns()
     units = (devices.regulator, devices.relays, devices.thermometers, devices.inputs, devices.flap)
-    for device in (*units, *devices.axes.values()):
+    for device in (*units, *devices.axes.values(), *devices.probes.values()):
         if device is not None and device.identity is not None:
             assembly.hub.publish(identity_event(device.name, device.identity, now_ns))
+    for text in absences(assembly.config):
+        what = text.partition(":")[0].removeprefix("no ")
+        assembly.hub.publish(Event(now_ns, "info", "absent", text, {"what": what}))
 
 
 def recorder_of(
@@ -120,4 +126,6 @@ def _kinds(config: StandConfig) -> dict[str, str]:
     kinds |= dict.fromkeys(config.cameras, "camera")
     kinds |= {} if config.inputs is None else {"inputs": "relays"}  # contacts, as those of the relays
     kinds |= {} if config.imager is None else {"imager": "imager"}
-    return {**kinds, "flap": "flap", **dict.fromkeys(config.axes, "axis")}
+    kinds |= {} if config.flap is None else {"flap": "flap"}
+    kinds |= dict.fromkeys(config.probes, "thermometers")
+    return {**kinds, **dict.fromkeys(config.axes, "axis")}

@@ -15,7 +15,7 @@ from foundation.items import Event
 from stand.config.stand_config import StandConfig
 from stand.fault import value_of
 from stand.gate import INTERLOCK
-from stand.guarding.rules import AIR, LABORATORY, cold_parts
+from stand.guarding.rules import AIR, LABORATORY, cold_parts, dew_limit_degC
 from stand.interlock import Interlocked
 from stand.stand import Stand
 
@@ -69,7 +69,7 @@ def _lacks(hub: Hub, config: StandConfig) -> str:
     air_degC = value_of(hub, AIR)
     if abs(air_degC - ambient_degC) > band_K:
         return f"the air is {air_degC:.1f} degC"
-    dew_degC = math.nan if config.dew is None else config.dew.lowest_degC(value_of(hub, LABORATORY))
+    dew_degC = dew_limit_degC(config, hub)
     lowest_degC = ambient_degC - band_K if math.isnan(dew_degC) else min(dew_degC, ambient_degC)
     cold = [(value_of(hub, channel), channel) for channel in cold_parts(config)]
     value_degC, channel = min((each for each in cold if each[0] < lowest_degC), default=(math.nan, ""))

@@ -32,11 +32,17 @@ def seen_state(config: StandConfig, stand: Stand, hub: Hub, clock: Clock) -> Sta
         heater_permitted=stand.chamber.permits.granted,
         compressor_on=bool(_value(readings.get("relays.compressor"))),
         camera_on=stand.imaging.supply.is_on,
-        flap="moving" if stand.motions.moves("flap") else "open" if stand.imaging.flap_open else "closed",
+        flap=_flap(config, stand),
         axes={name: _value(readings.get(f"{name}.position")) for name in stand.devices.axes},
         moving=tuple(stand.motions.texts),
         busy=stand.motions.names,
     )
+
+
+def _flap(config: StandConfig, stand: Stand) -> str:
+    if config.flap is None:
+        return "none"
+    return "moving" if stand.motions.moves("flap") else "open" if stand.imaging.flap_open else "closed"
 
 
 def _value(reading: Reading | None) -> float | None:

@@ -280,6 +280,20 @@ async def test_one_that_restarted_stopped_is_told_and_not_started_by_itself(make
         assert not bench.fake.running
 
 
+@pytest.mark.parametrize("make", MAKES)
+async def test_one_that_restarted_running_at_its_old_set_point_is_told_and_left(make: str, tmp_path: Path):
+    async with bench_of(make, "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        await bench.driver.set_temperature(30.0)
+        await bench.driver.run()
+        bench.fake.restart(running_at_degC=55.0)
+        for _ in range(2):
+            found = await bench.read()
+        assert (found["running"].value, found["sp"].value) == (1, 55)
+        assert found["fault"].reason == "set point changed at the unit, from 30 to 55 degC"
+        assert bench.fake.setpoint_degC == 55
+
+
 @pytest.mark.parametrize("make", ["espec", "ascii2"])
 async def test_humidity_that_is_on_from_before_is_switched_off_at_each_start_and_watched(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:

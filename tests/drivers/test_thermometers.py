@@ -1,4 +1,4 @@
-"""The thermometer driver against pymodbus servers with the words of an M-7015 and of an ADAM-4015."""
+"""The thermometer driver against pymodbus servers with the words of an M-7015."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
 
 MAPS = Path(__file__).parents[2] / "configs" / "registers"
 M7015 = load_register_map(MAPS / "icpdas-m7015.yaml")
-ADAM4015 = load_register_map(MAPS / "adam-4015.yaml")
 UNIT = 3
 SENSORS = {
     "granite_inside": ThermometerSettings(channel=0),
@@ -118,7 +117,7 @@ async def test_a_poll_is_one_read_of_words_and_one_of_bits(thermometers: Thermom
     assert module.requests == [4, 2]
 
 
-@pytest.mark.parametrize(("word", "reason"), [(0x7FFF, "over range"), (-0x8000, "under range")])
+@pytest.mark.parametrize(("word", "reason"), [(0x7FFF, "over range or open"), (-0x8000, "under range")])
 async def test_a_fault_word_spoils_its_own_sensor_only(
     thermometers: Thermometers, module: Module, word: int, reason: str
 ) -> None:
@@ -169,24 +168,6 @@ async def test_a_module_exchanged_while_unreachable_is_found_out(thermometers: T
     module.types = [0x2E] * 6
     with pytest.raises(DeviceFault, match="type_code_0"):
         await thermometers.read()
-
-
-async def test_an_adam_4015_is_driven_by_its_own_map(serve_modbus: Serve) -> None:
-    words = [26874, 0, 0, 0, 0, 0xFFFF]
-    registers = [
-        SimData(0, values=words, datatype=DataType.REGISTERS),
-        SimData(210, values=[0x40, 0x15], datatype=DataType.REGISTERS),
-    ]
-    address = await serve_modbus([SimDevice(UNIT, simdata=registers)], [])
-    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.1), WallClock())
-    await bus.open()
-    sensors = {"granite_inside": ThermometerSettings(channel=0), "air": ThermometerSettings(channel=5)}
-    adam = Thermometers("thermometers", bus, ADAM4015, sensors, WallClock())
-    await adam.open()
-    found = await readings(adam)
-    assert found["granite_inside"].value == pytest.approx(32.0142, abs=1e-4)
-    assert found["air"].reason == "over range or open"
-    await bus.close()
 
 
 def test_a_sensor_on_a_channel_the_module_has_not_is_a_config_error() -> None:

@@ -10,8 +10,9 @@ import pytest
 
 from drivers.sim.control import Control
 from drivers.sim.fault_schedule import FaultSchedule, PlannedFault, parse_fault
-from drivers.sim.laboratory import Laboratory, LaboratorySpec
+from drivers.sim.laboratory import Laboratory
 from drivers.sim.laboratory_faults import FAULTS, inject
+from drivers.sim.laboratory_spec import LaboratorySpec
 from foundation.documents import parse_document
 from foundation.errors import ConfigError
 from stand.config.stand_config import load_config, packaged

@@ -50,7 +50,7 @@ def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
         ("bus.address", "/dev/ttyUSB0", "bus.address: expected serial:PATH"),
         ("bus.parity", "even", "bus.parity: must be 'N', 'E' or 'O'"),
         ("relays.unit", 1, "need different units on one bus"),
-        ("relays.channels", {"heater_enable": 0}, "relays: channels lacks compressor"),
+        ("relays.channels", {"compressor": 0}, "relays: channels lacks heater_enable"),
         ("relays.channels", {"heater_enable": 0, "compressor": 0}, "relays: two channels share one relay"),
         ("thermometers.air.channel", 0, "thermometers: two thermometers share one channel"),
         ("axes.linear.limits", [10, 0], "axes.linear.limits: (10.0, 0.0) is not in ascending order"),

@@ -56,7 +56,12 @@ def test_a_file_of_before_opens_as_if_it_had_todays_form():
     found = parse_document(OLDER, StandConfig, "older.yaml")
     assert found.cameras.keys() == {"camera"}
     assert found.cameras["camera"].exposure_s == 0.2
-    assert found.thermometer_module.model_dump() == {"registers": "icpdas-m7015", "unit": 3, "poll_s": 5.0}
+    assert found.thermometer_module.model_dump() == {
+        "registers": "icpdas-m7015",
+        "unit": 3,
+        "poll_s": 5.0,
+        "further_units": (),
+    }
     assert found.thermometers["air"].polynomial == (0.0, 0.2)
     assert found.accepted() == {"thermometers.air.polynomial": 20.0}
 
@@ -111,7 +116,10 @@ def test_a_plan_says_which_device_it_lacks(sections: list[str], recipe: str, sen
         (lambda data: data["cameras"].update(left=data["cameras"].pop("camera")), "cameras: one of them has to be nam"),
         (lambda data: data["axes"].update(flap=data["axes"].pop("linear")), "the name flap is that of two devices"),
         (lambda data: data["relays"]["channels"].pop("camera_power"), "relays.channels lacks camera_power"),
-        (lambda data: data["cameras"].update(left=data["cameras"]["camera"]), "bus, axes and cameras need addresses"),
+        (
+            lambda data: data["cameras"].update(left=data["cameras"]["camera"]),
+            "bus, axes, probes and cameras need addresses",
+        ),
         (
             lambda data: data["cameras"].update({"Left": data["cameras"]["camera"]}),
             "cameras.Left: begins with a lower-case letter",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from drivers.devices.stage_profiles import PROFILES
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -32,7 +33,7 @@ from foundation.errors import ConfigError
 from foundation.items import Event, StepMark, StepState
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.estimating.durations import Pace, Situation, expect
+from stand.estimating.durations import Situation, expect, move_s
 from stand.estimating.estimate import PricedStep, price, way_back_s
 from stand.estimating.eta import Eta
 from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
@@ -78,7 +79,7 @@ def marks(plan: Iterable[PlannedStep], durations_s: Iterable[float]) -> list[Ste
     ],
 )
 def test_a_move_is_a_trapezoid_of_speed(steps: float, duration_s: float):
-    assert Pace(1000.0, 2000.0, 4000.0, 500.0).move_s(steps) == pytest.approx(duration_s, abs=1e-3)
+    assert move_s(PROFILES["8MT160-300"], steps) == pytest.approx(duration_s, abs=1e-3)
 
 
 def test_a_move_is_priced_by_the_way_from_where_the_axis_stands(config: StandConfig):

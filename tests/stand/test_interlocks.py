@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -16,6 +17,7 @@ from stand.guarding.interlocks import (
     over_temperature,
     permit_missing,
     reported_fault,
+    settings_changed,
     stage_alarm,
     stopped_while_permitted,
     trustworthy,
@@ -208,6 +210,12 @@ def test_regulator_and_permit_belong_together(running: float, permit: float, obj
 def test_only_an_alarm_of_a_stage_is_one(reason: str, cause: Cause, trips: bool):
     position = Reading("linear.position", 1.0, "mm", 0, STALE if reason else Quality.GOOD, reason, cause)
     assert (rule_of(stage_alarm("linear.position")(hub_of(position), 0)) == "stage_alarm") is trips
+
+
+def test_a_stage_that_is_set_otherwise_is_a_warning():
+    homed = Reading("linear.homed", 1.0, "1", 0, reason="speed 500 steps/s, not 1000 steps/s as in its profile")
+    assert rule_of(settings_changed("linear.homed")(hub_of(homed), 0)) == "settings_changed"
+    assert rule_of(settings_changed("linear.homed")(hub_of(replace(homed, reason="")), 0)) is None
 
 
 def test_an_open_flap_may_be_excused():

@@ -95,8 +95,8 @@ def test_no_dataclass_repeats_settings():
         and len(dataclasses.fields(each)) > 1
         and any({field.name for field in dataclasses.fields(each)} <= keys for keys in settings)
     }
-    # Devices are made from them; the line of a stage's controller is fixed by its vendor.
-    assert repeated == {"Devices", "SerialSettings"}
+    # Devices are made from them.
+    assert repeated == {"Devices"}
 
 
 @pytest.mark.parametrize(

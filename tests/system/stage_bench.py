@@ -154,11 +154,22 @@ class Bench:
             self.clock,
         )
 
+    def set_speed(self, steps_s: int) -> None:
+        """As somebody with the vendor's program would."""
+        self._change("mov", "<IBHHIBB9x", 0, steps_s)
+
+    def set_power_off(self, after_s: int | None) -> None:
+        """After how long at rest its motor goes off, None for never."""
+        self._change("pwr", "<BHHHB6x", 4, 5 if after_s is None else 7)
+
+    def _change(self, name: str, layout: str, field: int, value: int) -> None:
+        fields = list(struct.unpack(layout, self.fake.engine().feed(f"g{name}".encode())[4:-2]))
+        fields[field] = value
+        self.fake.engine().feed(encode(f"s{name}", struct.pack(layout, *fields)))
+
     def change_microsteps(self, mode: int) -> None:
         """As somebody with the vendor's program would, and saved."""
-        fields = list(struct.unpack(ENGINE_LAYOUT, self.fake.engine().feed(b"geng")[4:-2]))
-        fields[6] = mode
-        self.fake.engine().feed(encode("seng", struct.pack(ENGINE_LAYOUT, *fields)))
+        self._change("eng", ENGINE_LAYOUT, 6, mode)
         self.fake.engine().feed(b"save")
 
 

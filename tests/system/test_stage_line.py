@@ -129,7 +129,23 @@ async def test_a_port_unplugged_and_plugged_in_again_is_read_again_its_identity_
     bench.tap.requests.clear()
     bench.plug(bench.tap)
     assert (await bench.position()).quality is Quality.GOOD
-    assert bench.tap.requests == ["gser", "geti", "gfwv", "geng", "gmov", "gets"]
+    assert bench.tap.requests == ["gser", "geti", "gfwv", "geng", "gmov", "gpwr", "gets"]
+
+
+async def test_what_somebody_has_set_otherwise_meanwhile_is_told_when_it_is_back(bench: Bench) -> None:
+    axis = await bench.ready()
+    assert [each.reason for each in await axis.read()] == ["", "", ""]
+    bench.unplug()
+    bench.set_speed(500)
+    bench.set_power_off(None)
+    with pytest.raises(Unreachable):
+        await axis.read()
+    bench.plug(bench.tap)
+    position, _, homed = await axis.read()
+    assert position.quality is homed.quality is Quality.GOOD
+    assert homed.reason == (
+        "speed 500 steps/s, not 1000 steps/s as in its profile; power-off delay none, not 60 s as in its profile"
+    )
 
 
 @pytest.mark.parametrize("wire", ["tcp"])

@@ -1,0 +1,176 @@
+"""Instruments with a serial line of their own that answer in text: a precision thermometer, a hygrometer.
+
+hart: Fluke Calibration / Hart Scientific 1502A, 1504 and their like. T -> `t:   25.587 C`; *IDN? -> maker, model,
+serial number, version (1504 user's guide, 7.3). vaisala: HMT330 and its like as delivered, in STOP mode. SEND ->
+`RH=  38.3 %RH T=  22.2 'C` (HMT330 user's guide M210566EN, p. 102); it tells no serial number. Neither has a checksum,
+and either may echo what it was asked. Read from guides, not from units.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.devices.thermometers import Calibration
+from drivers.settings import Identity, Polled, PollPeriod_s, same_device
+from drivers.wires.line_client import LineClient
+from drivers.wires.link import SerialSettings, open_link
+from foundation.addresses import ByteAddress
+from foundation.clock import Clock
+from foundation.errors import Refused, Unreachable
+from foundation.lane import Lane
+from foundation.readings import Reading, bad_reading
+
+_GAP_S = 0.02
+_FAILED = re.compile(r"\*+")  # in the place of a number: not measured
+
+
+@dataclass(frozen=True, slots=True)
+class _Language:
+    """line: as delivered. read: the request; values: what its reply has, by channel with its unit."""
+
+    line: SerialSettings
+    read: bytes
+    values: Mapping[str, tuple[str, re.Pattern[str]]]
+    vendor: str
+    model: str
+    is_named: bool = False  # by *IDN?
+
+
+_NUMBER = r"\s*(-?\d+(?:\.\d+)?|\*+)\s*"
+_LANGUAGES = {
+    "hart": _Language(
+        SerialSettings(2400, 1),
+        b"T\r",
+        {"temperature": ("degC", re.compile(rf"^t:{_NUMBER}(\w)", re.MULTILINE))},
+        "Hart",
+        "1502A",
+        is_named=True,
+    ),
+    "vaisala": _Language(
+        SerialSettings(4800, 1, "E", 7),
+        b"SEND\r",
+        {
+            "temperature": ("degC", re.compile(rf"\bT={_NUMBER}'(\w)")),
+            "humidity": ("%", re.compile(rf"\bRH={_NUMBER}(%)RH")),
+        },
+        "Vaisala",
+        "HMT330",
+    ),
+}
+_UNITS = {"degC": "C", "%": "%"}
+_IDENTITY = re.compile(r"^([^,\r\n]+),([^,\r\n]+),([^,\r\n]+),([^,\r\n]+)\r?\n", re.MULTILINE)
+
+
+class ProbeSettings(Polled):
+    """protocol: which kind answers. baud: as the unit is set, none as delivered. serial_number: refused when the unit
+    tells another one. calibration: of its temperature."""
+
+    protocol: Literal["hart", "vaisala"]
+    address: ByteAddress
+    baud: int | None = Field(default=None, ge=300, le=115200)
+    serial_number: str | None = Field(default=None, pattern=r"^[ -~]{1,32}$")
+    timeout_s: float = Field(default=1.0, gt=0, le=10)
+    poll_s: PollPeriod_s = 5.0
+    calibration: Calibration = Calibration()
+
+
+class Probe:
+    """temperature (degC), and humidity (% of saturation) of a hygrometer."""
+
+    def __init__(self, name: str, settings: ProbeSettings, clock: Clock) -> None:
+        self.name = name
+        self.identity: Identity | None = None  # which unit has answered
+        self._settings = settings
+        self._clock = clock
+        self._language = _LANGUAGES[settings.protocol]
+        self._lane: Lane | None = None
+        self._lock = asyncio.Lock()
+        as_delivered = self._language.line
+        line = SerialSettings(
+            settings.baud or as_delivered.baud, as_delivered.stopbits, as_delivered.parity, as_delivered.databits
+        )
+        self._client = LineClient(
+            name,
+            lambda: open_link(name, settings.address, line),
+            settings.timeout_s,
+            _GAP_S,
+            is_kept=settings.address.startswith("serial:"),
+        )
+
+    async def open(self) -> None:
+        """Which unit answers; Refused when it is another one."""
+        if self._lane is None:
+            self._lane = Lane(self.name, self._clock)
+        await self.read()
+
+    async def close(self) -> None:
+        """Let go of the port; may be called twice."""
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._client.close)
+            lane.close()
+
+    async def read(self) -> tuple[Reading, ...]:
+        """All it measures; what it cannot measure now is BAD. DeviceError when it does not answer in its language."""
+        if self._lane is None:
+            raise Unreachable(self.name, "not open")
+        async with self._lock:
+            values = await self._lane.call(self._values)
+        now_ns, calibration = self._clock.now_ns(), self._settings.calibration
+        readings: list[Reading] = []
+        for channel, (unit, _) in self._language.values.items():
+            name, value = f"{self.name}.{channel}", values[channel]
+            if math.isnan(value):
+                readings.append(bad_reading(name, unit, now_ns, "the instrument measures nothing"))
+            elif channel == "temperature":
+                readings.append(calibration.reading(name, value, now_ns))
+            else:
+                readings.append(Reading(name, value, unit, now_ns))
+        return tuple(readings)
+
+    # Below: in the lane's thread.
+
+    def _values(self) -> dict[str, float]:
+        if not self._client.connected:
+            self._identify()
+        return self._client.query(self._language.read, self._heard)
+
+    def _identify(self) -> None:
+        """On each new link."""
+        if not self._language.is_named:
+            self.identity = Identity(self._language.vendor, self._language.model, "", "", by_map=True)
+            return
+        vendor, model, serial_number, version = self._client.query(b"*IDN?\r", _named)
+        wanted = self._settings.serial_number
+        if wanted is not None and serial_number != wanted:
+            self._client.close()
+            raise Refused(self.name, f"serial number {serial_number} answers, expected {wanted}")
+        self.identity = same_device(self.name, Identity(vendor, model, serial_number, version), self.identity)
+
+    def _heard(self, data: bytes) -> dict[str, float] | None:
+        """The values once their line has ended."""
+        text = data.decode("latin-1")
+        found = {channel: pattern.search(text) for channel, (_, pattern) in self._language.values.items()}
+        line_end = max((match.end() for match in found.values() if match is not None), default=-1)
+        if any(match is None for match in found.values()) or "\n" not in text[line_end:]:
+            return None
+        values: dict[str, float] = {}
+        for channel, (unit, _) in self._language.values.items():
+            match = found[channel]
+            if match is None or match[2] != _UNITS[unit]:
+                raise ValueError(f"{channel} is not in {unit}; set the instrument so")
+            values[channel] = math.nan if _FAILED.fullmatch(match[1]) else float(match[1])
+        return values
+
+
+def _named(data: bytes) -> tuple[str, str, str, str] | None:
+    """The four fields of *IDN?."""
+    match = _IDENTITY.search(data.decode("latin-1"))
+    return None if match is None else (match[1].strip(), match[2].strip(), match[3].strip(), match[4].strip())

@@ -1,0 +1,29 @@
+"""What a stand lacks, and what it therefore cannot do: told with its plan and recorded with its runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from stand.config.stand_config import StandConfig
+
+
+def absences(config: StandConfig) -> tuple[str, ...]:
+    """A sentence for each thing that a stand may have and this one has not."""
+    return tuple(_absences(config))
+
+
+def _absences(config: StandConfig) -> Iterator[str]:
+    if config.flap is None:
+        yield "no flap: cameras see the target all the time; what opens or closes it takes no time"
+    if not config.axes:
+        yield "no stages: a recipe that moves one is refused"
+    if not config.cameras:
+        yield "no cameras: a recipe that takes frames is refused"
+    if config.relays is None:
+        yield "no relay board: nothing of the stand's own ends the heat, and cameras stay on"
+    elif "compressor" not in config.relays.channels:
+        yield "no compressor: it cools by losing heat only, so not below the laboratory's temperature"
+    if config.cameras and all(not camera.has_temperature for camera in config.cameras.values()):
+        yield "no camera measures its own temperature: drift is fitted to the air and its history"
+    if "laboratory" not in config.thermometers:
+        yield "no thermometer in the laboratory: a night ends at ending.ambient_degC"
