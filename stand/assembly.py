@@ -165,7 +165,9 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     return Assembly(config, hub, clock, bus, devices, stand, notifier)
 
 
-def bus_units(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> tuple[Controller, Switches, Thermometers | SeveralModules]:
+def bus_units(
+    config: StandConfig, bus: Bus, hub: Hub, clock: Clock
+) -> tuple[Controller, Switches, Thermometers | SeveralModules]:
     """Regulator or climate chamber, relays, thermometers; ConfigError when a register map is missing or wrong, or that
     of another kind of unit."""
 

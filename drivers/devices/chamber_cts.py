@@ -1,6 +1,7 @@
 """CTS (ITC, Cadimac): short ASCII commands, framed on RS-232, bare over TCP. Source: the maker's interface manual.
 
 A0  -> A0 024.5 025.0      actual and set temperature          a0 025.0 -> a     s1 1 -> s1     s1 0 -> s1
+O   -> O, start, error, unused, flags (x4: door closed); its length differs from unit to unit
 S   -> S, run, error, not paused, humidity on, 4 more, code    F -> F and 32 characters of error text
 framed: STX, 80+address, text, CHK, ETX; between STX and ETX every byte has bit 7 set, CHK = XOR of address and text
 """
@@ -24,6 +25,7 @@ Found = TypeVar("Found")
 _STX, _ETX, _HIGH = 0x02, 0x03, 0x80
 _TEMPERATURES = re.compile(r"A0 (-?\d{2,3}\.\d) (-?\d{2,3}\.\d)")
 _STATE = re.compile(r"S([01?]{8})(.)", re.DOTALL)
+_DOOR_CLOSED = 0x04
 _NO_ERROR = {0x00, 0x30}  # code bytes
 
 
@@ -54,6 +56,7 @@ class Language:
     def __init__(self, name: str, settings: CtsSettings) -> None:
         self._name = name
         self._unit = settings.unit
+        self._door_reply = settings.door_reply
         self._is_serial = settings.address.startswith("serial:")
         line = SerialSettings(settings.baud, 1, settings.parity)
         self._client = LineClient(
@@ -86,7 +89,10 @@ class Language:
         actual, nominal = self._client.query(*self._asked("A0", 14, self._temperatures))
         flags, code = self._client.query(*self._asked("S", 10, self._flags))
         alarms = (self._error_text(code),) if flags[1] == "1" or ord(code) & 0x7F not in _NO_ERROR else ()
-        return ChamberState(actual, nominal, flags[0] == "1", alarms, humidity_on=flags[3] == "1")
+        is_open = self._door_reply is not None and self._client.query(*self._asked("O", self._door_reply, _door_open))
+        return ChamberState(
+            actual, nominal, flags[0] == "1", alarms, humidity_on=flags[3] == "1", door_open=bool(is_open)
+        )
 
     def set_temperature(self, degC: float) -> None:
         """a0 025.0."""
@@ -132,6 +138,11 @@ class Language:
             return found
 
         return framed(self._unit, text) if self._is_serial else text.encode("ascii"), answer
+
+
+def _door_open(text: str) -> bool | None:
+    """Of O, start, error, unused, flags: bit 2 is set while the door is closed (example of the manual)."""
+    return not ord(text[4]) & _DOOR_CLOSED if text[:1] == "O" else None
 
 
 def _expecting(word: str) -> Callable[[str], str | None]:

@@ -9,7 +9,8 @@ from typing import Protocol
 @dataclass(frozen=True, slots=True)
 class ChamberState:
     """One look: temperatures in degC, whether it controls, its alarms in words; `humidity_on`: None when it cannot be
-    told; program: a program of its own runs. ramp_degC: the set-point on its way, None when it does not move."""
+    told; program: a program of its own runs; door_open: as far as it tells. ramp_degC: the set-point on its way, None
+    when it does not move."""
 
     actual_degC: float
     set_degC: float
@@ -18,6 +19,7 @@ class ChamberState:
     humidity_on: bool | None = None
     program: bool = False
     ramp_degC: float | None = None
+    door_open: bool = False
 
 
 class ChamberLanguage(Protocol):

@@ -33,12 +33,14 @@ class EspecSettings(ChamberUnitSettings):
 
 
 class CtsSettings(ChamberUnitSettings):
-    """CTS (ITC, Cadimac): framed ASCII on RS-232 (19200 8O1), bare text over TCP (port 1080)."""
+    """CTS (ITC, Cadimac): framed ASCII on RS-232 (19200 8O1), bare text over TCP (port 1080). door_reply: how many
+    characters this unit's reply to O has, whose flags tell whether its door is closed; none: it is not asked."""
 
     protocol: Literal["cts"]
     unit: int = Field(default=1, ge=1, le=32)
     baud: int = Field(default=19200, ge=1200, le=115200)
     parity: Literal["N", "E", "O"] = "O"
+    door_reply: int | None = Field(default=None, ge=5, le=64)
 
 
 class Ascii2Settings(ChamberUnitSettings):

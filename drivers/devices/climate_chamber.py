@@ -224,10 +224,12 @@ class ClimateChamber:
                 faults.append(f"set point changed at the unit, from {self._sp_degC:g} to {sp_degC:g} degC")
         if state.program:
             faults.append("a program of its own runs")
+        doubt = "the door is open" if state.door_open else ""
+        faults += [doubt] if doubt and self._is_run else []
         if state.humidity_on and self._is_run:
             faults.append("humidity is on")
         return (
-            Reading(f"{self.name}.pv", state.actual_degC, "degC", now_ns),
+            Reading(f"{self.name}.pv", state.actual_degC, "degC", now_ns, reason=doubt),
             Reading(f"{self.name}.sp", sp_degC, "degC", now_ns),
             Reading(f"{self.name}.running", float(state.running), "1", now_ns),
             Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason=", ".join(faults)),

@@ -29,8 +29,8 @@ class Chamber(Timeline, Protocol):
 class FakeClimateChamber:
     """What they share. limits_degC: of the controller. Faults: silent; ignores_writes (local, or an old firmware);
     clamps (a set-point outside the limits is taken as far as they go, and acknowledged); alarm (its code; "" none);
-    humidity_on; protected (the panel refuses remote control); stuck_degC. `press_setpoint`, `press_stop`: at the panel.
-    is_alone: no relay in series enables its heat.
+    humidity_on; door_open; protected (the panel refuses remote control); stuck_degC. `press_setpoint`, `press_stop`:
+    at the panel. is_alone: no relay in series enables its heat.
     """
 
     def __init__(self, plant: Chamber, clock: Now) -> None:
@@ -41,7 +41,7 @@ class FakeClimateChamber:
         self.ignores_writes = False
         self.clamps = False
         self.alarm = ""
-        self.humidity_on = False
+        self.humidity_on = self.door_open = False
         self.protected = False
         self.stuck_degC: float | None = None
         self.setpoint_writes = 0
@@ -231,6 +231,9 @@ class FakeCts(FakeClimateChamber):
                 flags = (self.running, bool(self.alarm), True, self.humidity_on, False, False, False, False)
                 code = chr(int(self.alarm, 16)) if self.alarm else "0"
                 return "S" + "".join(str(int(flag)) for flag in flags) + code
+            case "O":
+                closed = chr(0x30 | (0 if self.door_open else 4))
+                return f"O{int(self.running)}{int(bool(self.alarm))}0{closed}0000"
             case "F":
                 text = f"error {self.alarm}" if self.alarm else ""
                 return f"F{text:<32}"

@@ -20,7 +20,7 @@ from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.wire import PtyWire, TcpWire
 from foundation.clock import FollowedClock, WallClock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
-from foundation.readings import Reading
+from foundation.readings import Quality, Reading
 
 START_NS = 1_700_000_000_000_000_000
 ALLOWED_DEGC = (-10.0, 60.0)
@@ -292,6 +292,20 @@ async def test_one_that_restarted_running_at_its_old_set_point_is_told_and_left(
         assert (found["running"].value, found["sp"].value) == (1, 55)
         assert found["fault"].reason == "set point changed at the unit, from 30 to 55 degC"
         assert bench.fake.setpoint_degC == 55
+
+
+@pytest.mark.parametrize("wire", WIRES)
+async def test_an_open_door_flags_what_is_measured_and_is_a_fault_while_it_controls(wire: str, tmp_path: Path):
+    async with bench_of("cts", wire, tmp_path, door_reply=9) as bench:
+        await bench.driver.open()
+        await bench.driver.run()
+        assert (await bench.read())["fault"].reason == ""
+        bench.fake.door_open = True
+        found = await bench.read()
+        assert (found["pv"].quality, found["pv"].reason) == (Quality.GOOD, "the door is open")
+        assert found["fault"].reason == "the door is open"
+        bench.fake.door_open = False
+        assert (await bench.read())["pv"].reason == ""
 
 
 @pytest.mark.parametrize("make", ["espec", "ascii2"])

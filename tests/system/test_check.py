@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from stand.config.checked import doubt, load_checked
 from stand.config.stand_config import load_config
 from stand.running.claim import claimed
 from stand.running.order import Order, load_order, register_texts
+from stand.running.stop import Interrupted
 from stand.simulator import ControlSocket, Simulator
 from tests.system.conftest import require_aravis
 
@@ -130,6 +133,21 @@ def test_with_moves_timer_flap_and_camera_are_measured_and_all_is_as_before(conf
     state = laboratory(config, {"do": "state"})
     assert not state["heater_enabled"]
     assert not state["camera_powered"]
+
+
+async def test_one_that_is_broken_off_switches_the_cameras_off_again_that_it_has_switched_on(config: Path) -> None:
+    known = yaml.safe_load(config.read_text())
+    del known["axes"]
+    known["cameras"]["camera"]["boot_s"] = 4.0
+    config.write_text(yaml.safe_dump(known))
+    found: list[Finding] = []
+    checking = asyncio.create_task(commission(load_config(config), found.extend, has_moves=True))
+    while not (await asyncio.to_thread(laboratory, config, {"do": "state"}))["camera_powered"]:
+        await asyncio.sleep(0.1)
+    os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(Interrupted, match="the stand is safe"):
+        await checking
+    assert not (await asyncio.to_thread(laboratory, config, {"do": "state"}))["camera_powered"]
 
 
 async def test_a_stand_that_another_program_has_is_not_touched(config: Path, tmp_path: Path) -> None:

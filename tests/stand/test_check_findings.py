@@ -1,0 +1,40 @@
+"""What `stand check` says of a thermal imager's folder and of a camera's packets."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.devices.thermal_imager import ThermalImagerSettings
+from drivers.sim.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from stand.commissioning.camera_lines import packet_finding
+from stand.commissioning.imager import imager_finding
+
+WARM = np.full((HEIGHT, WIDTH), 31.0)
+
+
+def looked(folder: Path, **settings: object) -> tuple[str, str, str]:
+    spots = {"lens": {"x_px": 80, "y_px": 60, "emissivity": 1.0}}
+    found = imager_finding(ThermalImagerSettings.model_validate({"folder": folder, "spots": spots, **settings}))
+    return found.what, found.verdict, found.text
+
+
+def test_the_newest_picture_of_an_imager_is_looked_at(tmp_path: Path):
+    assert looked(tmp_path / "card")[1:] == (
+        "failed",
+        f"{tmp_path / 'card'} cannot be read (No such file or directory)",
+    )
+    assert looked(tmp_path)[:2] == ("reading", "unverified")
+    (tmp_path / "IR_0001.jpg").write_bytes(jpeg_of(Shot(WARM, 1.7e9)))
+    what, verdict, text = looked(tmp_path, serial_number="49001234")
+    assert (what, verdict) == ("reading", "ok")
+    assert text == "FLIR E40, serial number 49001234; its newest picture, IR_0001.jpg, shows lens 31.0 degC"
+    assert looked(tmp_path, serial_number="5")[:2] == ("identity", "failed")
+    assert looked(tmp_path, spots={"lens": {"x_px": 500, "y_px": 60}})[:2] == ("settings", "failed")
+    (tmp_path / "IR_0001.jpg").write_bytes(b"\xff\xd8\xff\xd9")
+    assert looked(tmp_path)[:2] == ("reading", "failed")
+
+
+@pytest.mark.parametrize(("packet_size", "verdict"), [(8000, "ok"), (65_600, "failed")])
+def test_packets_larger_than_the_interface_takes_are_told(packet_size: int, verdict: str):
+    assert packet_finding("camera", "127.0.0.9", packet_size).verdict == verdict
