@@ -358,7 +358,7 @@ def _aravis() -> None:
 
 
 NIGHTS = [
-    pytest.param(SHORT_RECIPE, id="short"),
+    pytest.param(SHORT_RECIPE.replace("600", "300"), id="short"),
     pytest.param(packaged("recipes", "demo").read_text(), id="demo", marks=pytest.mark.nightly),
 ]
 

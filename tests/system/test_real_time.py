@@ -88,7 +88,7 @@ async def test_an_interrupt_leaves_the_stand_safe_and_the_session_readable(
     assert any("stopped by the operator" in event.text for event in session.events())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 async def test_a_simulated_laboratory_that_is_ended_leaves_nothing_behind(
     tmp_path: Path, order: Callable[..., Order], number: signal.Signals
 ):
