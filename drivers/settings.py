@@ -5,13 +5,14 @@ A driver's settings are one frozen model beside it: what a stand's file has, wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
 from foundation.documents import Document
 from foundation.errors import DeviceFault
+from foundation.items import Event
 
 DeviceName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]  # the first part of its channels
 PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]
@@ -117,3 +118,16 @@ def same_device(device: str, found: Identity, before: Identity | None) -> Identi
             device, f"was exchanged: {found} answers where {before} answered before; not used until a new start"
         )
     return found
+
+
+def identity_event(device: str, identity: Identity, now_ns: int, camera: CameraSettings | None = None) -> Event:
+    """With the device's name, what it tells of itself, and of a camera the lens that its settings state ("" when they
+    do not)."""
+    data: dict[str, object] = {"device": device, **asdict(identity)}
+    text = f"{device}: {identity}"
+    if not identity.serial_number:
+        text += "; it tells no serial number"
+    if camera is not None:
+        data["lens"] = camera.lens
+        text += f", lens {camera.lens}" if camera.lens else ", its lens is not stated"
+    return Event(now_ns, "info", "device_identity", text, data)

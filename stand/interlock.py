@@ -1,8 +1,9 @@
-"""Whether anything may move: what every verb of the stand asks first, and again after every wait."""
+"""Whether anything may move, which every verb asks first and again after every wait, and what moves now."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
 from typing import Protocol
 
 from foundation.errors import StandTripped
@@ -49,3 +50,37 @@ class Interlock:
             raise Interlocked("an interlock holds the stand until an operator clears it")
         for mover in self._movers:
             mover.allow()  # what making safe has barred, and bars again should it begin before the command is sent
+
+
+class Motions:
+    """What moves at this moment (an axis, the flap), and where to: whether an operator may put a hand in."""
+
+    def __init__(self) -> None:
+        self._under_way: dict[str, str] = {}
+
+    @property
+    def texts(self) -> list[str]:
+        """As in `["linear to 250 mm", "flap closing"]`."""
+        return [f"{name} {text}" for name, text in self._under_way.items()]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What moves: axes, the flap."""
+        return tuple(self._under_way)
+
+    def moves(self, name: str) -> bool:
+        """Whether this one is under way."""
+        return name in self._under_way
+
+    @contextmanager
+    def under_way(self, name: str, text: str) -> Generator[None]:
+        """It moves while inside; where one motion is part of another, the inner one is shown."""
+        before = self._under_way.get(name)
+        self._under_way[name] = text
+        try:
+            yield
+        finally:
+            if before is None:
+                self._under_way.pop(name, None)
+            else:
+                self._under_way[name] = before

@@ -19,8 +19,7 @@ from stand.gate import OPERATOR, Gate
 from stand.imaging.camera_supply import CameraSupply, SupplyLimits
 from stand.imaging.cameras import Cameras
 from stand.imaging.imaging import Imaging
-from stand.interlock import Interlock
-from stand.motions import Motions
+from stand.interlock import Interlock, Motions
 from stand.safety import Safety
 from stand.table.stages import Table
 

@@ -18,7 +18,7 @@ from compensation.calibration.calibrate import Calibration
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES, Pinhole
 from compensation.calibration.rays import RayLens, exponents
-from compensation.calibration.stages import PARAMETERS, Table
+from compensation.calibration.stages import PARAMETERS
 from foundation.documents import Document
 from foundation.errors import SessionError
 from foundation.files import write_whole
@@ -153,14 +153,6 @@ class CameraFile(Document):
         """The board as the calibration left it."""
         part = self.board
         return Board(np.array(part.points_mm), np.array(part.sigma_mm), np.array(part.diameters_mm))
-
-    @property
-    def adjusted_table(self) -> Table:
-        """The table's axes in the camera's frame; `frame` turns camera coordinates into its own."""
-        part = self.table
-        return Table(
-            *(np.array(value) for value in (part.base_mm, part.linear, part.rotary, part.mount, part.offset_mm))
-        )
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all; SessionError when the place refuses."""

@@ -120,11 +120,6 @@ class Plant:
             self.camera_power_on_ns = self.now_ns
         self._camera_powered = powered
 
-    @property
-    def compressor_running(self) -> bool:
-        """Whether the compressor turns: as commanded, it has no protection of its own."""
-        return self.compressor_on
-
     def advance(self, now_ns: int) -> None:
         """Integrate whole steps up to `now_ns`; an earlier time changes nothing."""
         while self.now_ns + STEP_ns <= now_ns:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import cast
 
 JOURNAL_NAME = "journal.jsonl"
-CRC_DIGITS = 8
 LIMIT_BYTES = 32_000_000  # an entry a minute for 200 days; all of them are in memory
 
 

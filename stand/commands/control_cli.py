@@ -21,10 +21,10 @@ from foundation.output import output, show
 from foundation.usage import one_line
 from stand.commands.reached import on_stand
 from stand.commands.session_text import size
-from stand.gate import INTERLOCK, OPERATOR, STOPPING
+from stand.gate import INTERLOCK, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import RunStatus, StandState
-from stand.watching.remedies import next_command
+from stand.watching.remedies import for_reason, next_command
 
 app = App()
 
@@ -262,8 +262,7 @@ def _still(answer: Mapping[str, object]) -> str:
     reasons = cast("list[str]", answer.get("reasons", []))
     if not reasons:
         return "the run continues"
-    remedies = {OPERATOR: "`stand continue` ends the pause", INTERLOCK: "`stand clear` once the cause is gone"}
-    known = [remedies[reason] for reason in reasons if reason in remedies]
+    known = [remedy for reason in reasons if (remedy := for_reason(reason))]
     return "; ".join([f"still held: {', '.join(reasons)}", *known])
 
 

@@ -30,9 +30,9 @@ from stand.estimating.room import existing, small_disk
 from stand.running.order import Order, load_order
 from stand.running.resume import interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
+from stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
 from stand.running.stop import Interrupted
 from stand.serving.client import Server
-from stand.session_report import REPORT_NAME, NotReported, check_reportable, report_session
 from stand.watching.live import followed
 
 app = App()

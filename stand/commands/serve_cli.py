@@ -19,7 +19,6 @@ from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.output import Output, output, say
 from foundation.usage import one_line
-from stand.aside import aside
 from stand.commands.checked_cli import warn_unchecked
 from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.interface import load_tokens
@@ -31,6 +30,7 @@ from stand.serving.api.interface import Interface
 from stand.serving.api.server import serve as serve_clients
 from stand.serving.secop.door import door_at
 from stand.serving.viewing import Viewing
+from stand.watching.aside import aside
 from stand.watching.remedies import next_command
 
 app = App()

@@ -14,7 +14,6 @@ from foundation.items import Event
 from recording.repair.salvage import salvage_line, salvage_unfinished
 from recording.writing.disk import FILES_LINE
 from stand.assembly import assemble
-from stand.clock_watch import ClockWatch
 from stand.config.checked import ATTACHMENT
 from stand.config.safe_ranges import accepted_text
 from stand.config.stand_config import StandConfig
@@ -25,6 +24,7 @@ from stand.daemon.kept import KeptFile, kept_in
 from stand.daemon.orders import Orders
 from stand.daemon.reports import Reports
 from stand.running.claim import claimed
+from stand.running.clock_watch import ClockWatch
 from stand.running.house import opened
 from stand.running.stop import Stop
 from stand.serving.alerts import alerting

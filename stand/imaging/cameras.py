@@ -6,11 +6,11 @@ import asyncio
 from collections.abc import Collection, Iterable, Mapping
 
 from drivers.devices.protocols import Camera
+from drivers.settings import identity_event
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import ConfigError
 from foundation.items import Event
 from foundation.readings import Frame
-from stand.identities import identity_event
 
 _APART_S = 0.001  # between two cameras' frames: an image and its description are found by their instant
 

@@ -17,8 +17,7 @@ from stand.gate import CAMERA_LOST, Gate
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
 from stand.imaging.camera_supply import CameraSupply
 from stand.imaging.cameras import Cameras
-from stand.interlock import Interlock
-from stand.motions import Motions
+from stand.interlock import Interlock, Motions
 
 
 class Imaging:

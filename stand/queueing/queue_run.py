@@ -19,8 +19,8 @@ from stand.running.entries import Ended
 from stand.running.journal import Journal
 from stand.running.resume import Interruption, interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
+from stand.running.session_report import NotReported, check_reportable, report_session
 from stand.running.stop import Interrupted
-from stand.session_report import NotReported, check_reportable, report_session
 from stand.watching.live import followed
 
 

@@ -25,7 +25,7 @@ from foundation.addresses import SerialPlace, place_of
 from foundation.errors import InUse, SessionError
 from foundation.lock_file import remove, take, try_lock
 from stand.config.stand_config import StandConfig
-from stand.runtime import runtime_folder, runtime_folders
+from stand.serving.presence import runtime_folder, runtime_folders
 
 
 class Address(NamedTuple):

@@ -19,13 +19,13 @@ from recording.writing.disk import Disk
 from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from recording.writing.settings import SessionInfo
 from stand.assembly import Assembly, assemble
-from stand.clock_watch import ClockWatch
 from stand.config.safe_ranges import accepted_text
-from stand.one_cpu import one_cpu
 from stand.running.camera_temperature import check_temperature
 from stand.running.claim import claimed
+from stand.running.clock_watch import ClockWatch
 from stand.running.guest import Guest, Job
 from stand.running.house import House, Time, opened
+from stand.running.one_cpu import one_cpu
 from stand.running.order import Order
 from stand.running.rehearsal import rehearsed
 from stand.running.resume import Interruption, is_of_virtual_time

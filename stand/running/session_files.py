@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from drivers.settings import identity_event
 from foundation.clock import NS_PER_S, Clock, VirtualClock
 from foundation.documents import parse_document
 from foundation.hub import Hub
@@ -23,7 +24,6 @@ from recording.writing.settings import VIRTUAL_COMMIT_S
 from stand.assembly import Assembly
 from stand.config.stand_config import RecordingConfig, StandConfig
 from stand.estimating.absent import absences
-from stand.identities import identity_event
 from stand.running.order import Order
 
 

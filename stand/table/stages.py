@@ -8,8 +8,7 @@ from drivers.devices.stage import Axis
 from foundation.clock import Clock
 from foundation.errors import ConfigError
 from foundation.hub import Hub
-from stand.interlock import Interlock
-from stand.motions import Motions
+from stand.interlock import Interlock, Motions
 from stand.table.stage_care import check_home, ready
 
 

@@ -19,10 +19,10 @@ from foundation.clock import NS_PER_S, Now, WallClock
 from foundation.hub import Hub
 from foundation.output import output
 from foundation.usage import one_line
-from stand.aside import aside
 from stand.estimating.night import Night
 from stand.running.order import Order
 from stand.running.resume import Interruption
+from stand.watching.aside import aside
 from stand.watching.drift import drift_watched
 from stand.watching.follow import Follow
 from stand.watching.moment import Moment, free_bytes

@@ -51,5 +51,5 @@ def next_command(kind: str, data: Mapping[str, object]) -> str:
 
 
 def for_reason(reason: str) -> str:
-    """What ends a hold; "" when nothing has to be typed."""
+    """What ends a hold of that reason; "" when nothing has to be typed."""
     return _OF_REASON[reason] if reason in (OPERATOR, INTERLOCK) else ""

@@ -12,7 +12,6 @@ import yaml
 from drivers.devices.regulator import Regulator
 from drivers.sim.faults import LinkFaults
 from drivers.sim.modbus import TcpEngine
-from drivers.sim.other_regulators import DEGC, FakeEurotherm, FakeEzZone, FakeF4t, float_words
 from drivers.sim.plant import Plant, PlantSpec
 from drivers.sim.wire import TcpWire
 from drivers.wires.bus import Bus, BusSettings
@@ -22,6 +21,7 @@ from foundation.documents import parse_document
 from foundation.errors import ConfigError, DeviceFault, Refused, Unreachable
 from foundation.readings import Quality, Reading
 from stand.config.stand_config import packaged
+from tests.drivers.other_regulators import DEGC, FakeEurotherm, FakeEzZone, FakeF4t, float_words
 
 START_NS = 1_700_000_000_000_000_000
 Fake = FakeEurotherm | FakeEzZone | FakeF4t

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ from stand.gate import Gate
 from stand.running.state import RunState
 from stand.running.status import StatusBoard
 from stand.running.stop import Stop
-from stand.serving.api.access import this_user
+from stand.serving.api.access import user_name
 from stand.serving.client import ask
 from stand.serving.desk import RunStatus
 from tests.host import Host
@@ -129,7 +130,7 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         ("extend", {"step_id": "0-soak", "by_s": 1800.0}),
         ("stop", {}),
     ]
-    assert {(who.name, who.how) for who, _, _ in desk.orders} == {(this_user(), "socket")}
+    assert {(who.name, who.how) for who, _, _ in desk.orders} == {(user_name(os.geteuid()), "socket")}
 
 
 async def test_the_plan_and_what_happens_are_shown(tmp_path: Path):

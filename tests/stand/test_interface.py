@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import SessionError
-from stand import runtime
+from stand.serving import presence as runtime
 from stand.serving.api.listening import MOST_CLIENTS
 from stand.serving.client import ask, ask_status, running_sessions, server_of
 from stand.serving.desk import RunStatus

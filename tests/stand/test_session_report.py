@@ -7,7 +7,7 @@ import json
 import pytest
 
 from compensation.reporting import report
-from stand.session_report import report_session
+from stand.running.session_report import report_session
 
 MOVED = "the image moved by +30 (1) mpx along I and -40 (1) along J (standard uncertainty)"
 

@@ -18,7 +18,7 @@ from stand.commands.commands import app
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.running.order import load_order
-from stand.session_report import MODEL_NAME, REPORT_NAME
+from stand.running.session_report import MODEL_NAME, REPORT_NAME
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 EVERY_SEQUENCE = """

@@ -15,7 +15,6 @@ import asyncio
 import hashlib
 import hmac
 import ipaddress
-import os
 import pwd
 import secrets
 import socket
@@ -164,11 +163,6 @@ def user_name(uid: object) -> str:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
         return str(uid)
-
-
-def this_user() -> str:
-    """Whose daemon this is."""
-    return user_name(os.geteuid())
 
 
 def is_loopback(host: str) -> bool:
