@@ -65,7 +65,7 @@ class Unrepeated:
             case Cause.SETTLING:
                 return (
                     f"{along:.1f} mpx RMS of the image's place do not repeat, in no single direction ({across:.1f} "
-                    "across): as of fixings that settle anew after each change"
+                    "across): as of fixings that settle differently after each change"
                 )
             case Cause.NOTHING:
                 return f"what does not repeat of the image's place is at most {along:.1f} mpx RMS"

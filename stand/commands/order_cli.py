@@ -46,7 +46,7 @@ def submit(
 @app.command()
 def device(
     name: Annotated[str, typer.Argument(help="The device; without one all are listed, with what they take.")] = "",
-    verb: Annotated[str, typer.Argument(help="What it is told.")] = "",
+    verb: Annotated[str, typer.Argument(help="What it is to do.")] = "",
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="What the verb takes.")
     ] = None,

@@ -74,7 +74,7 @@ def clock() -> Finding:
     except (OSError, AttributeError):
         state = -1
     if state < 0:
-        text = "it cannot be told whether the clock follows a time server"
+        text = "it is not known whether the clock follows a time server"
         return Finding("clock", "sync", "unverified", text, "compare it with another clock")
     longs = (int.from_bytes(timex.raw[at : at + 8], "little", signed=True) for at in (_ESTIMATE_AT, _MAXIMUM_AT))
     estimate_s, maximum_s = (value / 1e6 for value in longs)

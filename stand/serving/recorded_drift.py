@@ -72,7 +72,7 @@ def session_drift(path: Path | str, target_text: str) -> SessionDrift:
     table = session.frames_table()
     usable = np.isin(table.role, [role for role in DRIFT_ROLES if role]) & ~table.superseded
     if not usable.any():
-        return SessionDrift("", (), "no frames that a drift is told of")
+        return SessionDrift("", (), "no frames whose drift is measured")
     camera = str(table.camera[usable][0])
     usable &= table.camera == camera
     chosen = np.flatnonzero(usable)

@@ -165,7 +165,7 @@ class Viewing:
                 self._roles_seen[recalled.shot.camera] = recalled.last_role
                 self._fresh.discard(recalled.shot.camera)
         except StandError as error:
-            self._warn(f"drift is told against the first frame from now on, the run's own is not found: {error}")
+            self._warn(f"drift is measured against the first frame from now on, the run's own is not found: {error}")
 
     def _plot(self, camera: str, preview: Preview) -> None:
         if preview.mean_px is not None and preview.worst_px is not None:

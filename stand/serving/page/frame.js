@@ -74,7 +74,7 @@ export class FramePanel {
     const { frame, facts } = this;
     const when = clock(seconds(frame.time_ns, this.app.state?.utc_offset_ns ?? 0), true);
     say(this.caption, `${when}${frame.role ? `, ${frame.role.replaceAll("_", " ")}` : ""}`);
-    const drift = frame.mean_px === null ? "no drift is told of this frame" : `mean drift ${number(frame.mean_px * 1000, 0)} millipixels`;
+    const drift = frame.mean_px === null ? "no drift of this frame is known" : `mean drift ${number(frame.mean_px * 1000, 0)} millipixels`;
     this.canvas.setAttribute("aria-label", `The last frame: ${frame.markers.length} markers found; ${drift}`);
     if (this.choice.options.length !== frame.cameras.length) {
       fill(this.choice, frame.cameras.map((name) => h("option", { value: name }, name)));
