@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.budget.air import Index, ciddor_1996, edlen_1966
 from compensation.budget.correction import granite_mm, indices, post_mm, refraction_px, target_strain, varied
 from compensation.budget.geometry import Geometry, StandState
-from compensation.budget.refraction import tilted_shift_mm
+from compensation.budget.refraction import Index, ciddor_1996, edlen_1966, tilted_shift_mm
 from compensation.budget.repeatability import Repeatability, home_residuals, v0_repeats
 from compensation.budget.states import capture_states, mean_state, states_at
 from foundation.errors import SessionError

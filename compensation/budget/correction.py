@@ -16,9 +16,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.budget.air import Index, ciddor_1996, saturation_Pa
 from compensation.budget.geometry import Geometry, Quantity, StandState
-from compensation.budget.refraction import appears_px
+from compensation.budget.refraction import Index, appears_px, ciddor_1996, saturation_Pa
 
 Float = NDArray[np.float64]
 

@@ -5,9 +5,11 @@ report.json has every number of report.html under the names of compensation/repo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from compensation.budget.budget import Budget, Contribution
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import Evaluation, evaluate
@@ -18,16 +20,18 @@ from compensation.reporting.data_section import data_section, utc
 from compensation.reporting.drift_section import drift_section
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
+from compensation.reporting.figures import as_svg
 from compensation.reporting.gather import numbers_of
 from compensation.reporting.numbers import Numbers, as_json
-from compensation.reporting.page import Heading, Paragraph, Part, page
+from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table, page
 from compensation.reporting.result_section import result_section
-from compensation.reporting.space_section import space_section
-from compensation.reporting.stand_section import stand_section
-from compensation.reporting.table_positions import table_positions
+from compensation.reporting.table_positions import TablePositions, positions_figure, table_positions
+from compensation.reporting.validation_report import validation_parts
+from compensation.validation3d.validation import Validation
 from experiments.steps import Role
 from foundation.errors import SessionError
 from foundation.files import check_writable, write_whole
+from markers.target import Target
 from recording.reading.session import Session
 
 
@@ -152,3 +156,51 @@ def _lead(numbers: Numbers) -> str:
     frames = sum(session.frames for session in numbers.sessions)
     text = f"Recipe {recipes}, recorded {utc(begin)} to {utc(end)}, {frames} frames."
     return text + (" Recorded in a simulated laboratory." if numbers.simulated else "")
+
+
+def space_section(positions: TablePositions, target: Target, validation: Validation | None) -> Iterator[Part]:
+    """What there is of it; nothing when the target was never moved on purpose."""
+    if validation is None and not positions.calibration and not positions.poses:
+        return
+    yield Heading("In three dimensions")
+    if positions.calibration or positions.poses:
+        yield Drawing(
+            as_svg(positions_figure(positions, target), "table"),
+            "Where the table held the target, seen from above; the camera looks from the left.",
+        )
+    if validation is not None:
+        yield Paragraph(f"Validated in session {validation.session_id}.", aside=True)
+        yield from validation_parts(validation, level=3)
+
+
+def stand_section(numbers: Numbers) -> Iterator[Part]:
+    """A table for each session whose budget was asked for."""
+    if not numbers.budgets:
+        return
+    yield Heading("The stand's budget")
+    yield Paragraph(
+        "What the stand itself does to the image, at its largest over the session's captures, with standard "
+        "uncertainties; a line without one is a scatter. It is part of the drift above unless it was corrected."
+    )
+    for session_id, budget in numbers.budgets.items():
+        yield Paragraph(f"{session_id}: {_state(budget)}", aside=True)
+        heads = ("contribution", "µm", "± µm", "mpx", "± mpx", "at", "correctable")
+        yield Table(heads, [_line(one) for one in budget.contributions])
+
+
+def _state(budget: Budget) -> str:
+    reference, (low, high) = budget.reference, budget.air_degC
+    return (
+        f"reference with air {reference.air_degC:.2f} °C, granite {reference.granite_inside_degC:.2f} °C inside and "
+        f"{reference.granite_outside_degC:.2f} °C outside, artifact {reference.artifact_degC:.2f} °C, laboratory "
+        f"{reference.laboratory_degC:.2f} °C; captures with air of {low:.1f} to {high:.1f} °C."
+    )
+
+
+def _line(one: Contribution) -> tuple[str, ...]:
+    numbers = (_number(one.um), _number(one.u_um), _number(1e3 * one.px), _number(1e3 * one.u_px))
+    return (one.name, *numbers, one.where, "yes" if one.corrected else "")
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if math.isfinite(value) else ""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from compensation.calibration.camera_file import CameraFile
 from compensation.calibration.pose import find_pose
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.training import frame_states
 from compensation.observations import Float, Observations
-from compensation.validation3d.correction import Corrected, corrected
 from compensation.validation3d.deviations import Camera, Deviations, deviations
 from compensation.validation3d.positions import ValidationFrames
 from compensation.validation3d.stand_part import StandPart
@@ -184,3 +184,28 @@ def _outside(frames: ValidationFrames, compensated: Corrected, positions: int) -
 def _camera_degC(observations: Observations, frames: ValidationFrames) -> Float:
     """(T,): mean of the camera's own temperature over a temperature's frames."""
     return np.array([observations.camera_degC[np.concatenate(row)].mean() for row in frames.frames])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """centres_px (F, N, 2): corrected, NaN in other frames, for missing markers and where the model has no answer.
+    model_px2 (F, N, 2, 2): covariance of the correction alone. flags (F, N): of drift_model.Outside."""
+
+    centres_px: Float
+    model_px2: Float
+    flags: NDArray[np.uint8]
+
+
+def corrected(observations: Observations, frames: ValidationFrames, model: DriftModel) -> Corrected:
+    """Every marker of the frames that are used."""
+    states = frame_states(observations, model.memory)
+    centres_px = np.full(observations.centres_px.shape, np.nan)
+    model_px2 = np.full(observations.covariance_px2.shape, np.nan)
+    flags = np.zeros(centres_px.shape[:2], np.uint8)
+    for index in frames.used.tolist():
+        seen = np.isfinite(observations.centres_px[index, :, 0])
+        found, state = observations.centres_px[index, seen], states.where(np.array([index]))
+        centres_px[index, seen] = model.correct(found, state)
+        model_px2[index, seen] = model.covariance(found, state)
+        flags[index, seen] = model.flags(found, state)
+    return Corrected(centres_px, model_px2, flags)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import BaseModel
 
+from drivers.wires.registers import RegisterMap
 from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.errors import ConfigError
@@ -14,15 +17,23 @@ from foundation.exit_codes import one_line_errors
 from foundation.files import write_whole
 from foundation.output import say, show
 from foundation.schemas import write_schemas
+from markers.target import Target
 from stand.config.migration import migrated
-from stand.config.schemas import DOCUMENTS
-from stand.config.stand_config import packaged
+from stand.config.recipe import Recipe
+from stand.config.stand_config import StandConfig, packaged
 
 app = App(
     no_args_is_help=True,
     help="Configuration files: JSON Schemas for editors, and files of older versions.\n\n"
     "Example: stand config migrate my-stand.yaml",
 )
+
+DOCUMENTS: Mapping[str, type[BaseModel]] = {
+    "stand": StandConfig,
+    "recipe": Recipe,
+    "registers": RegisterMap,
+    "target": Target,
+}
 
 
 @app.command()

@@ -1,8 +1,8 @@
-"""What a whole run will take on this stand, by what its last nights have taught."""
+"""What a whole run will take, by what the stand's last nights have taught, and whether the disk has room for it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,3 +30,16 @@ def price_night(plan: Sequence[PlannedStep], config: StandConfig, directory: Pat
     """Of a plan whose session will lie in `directory`; ConfigError as price."""
     learned = load_learned(directory)
     return Night(price(plan, config, learned), way_back_s(plan, config, learned))
+
+
+def existing(directory: Path) -> Path:
+    """`directory`, or the nearest folder above it that is there."""
+    return next(path for path in (directory, *directory.absolute().parents) if path.exists() or path.is_symlink())
+
+
+def small_disk(free_bytes: int, steps: Iterable[PricedStep], config: StandConfig) -> str:
+    """What is wrong with so much room for a run that would stop in the middle of the night; "" when it will do."""
+    plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
+    if free_bytes / 1e9 >= plan_GB + least_GB:
+        return ""
+    return f"{free_bytes / 1e9:.1f} GB are free; the plan records {plan_GB:.1f} GB and waits below {least_GB:.1f} GB"

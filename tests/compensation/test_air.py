@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from compensation.budget.air import Index, birch_downs_1994, ciddor_1996, edlen_1966, saturation_Pa
+from compensation.budget.refraction import KELVIN, Index, ciddor_1996, edlen_1966, saturation_Pa
+
+
+def birch_downs_1994(temperature_degC: float, pressure_Pa: float, vapour_Pa: float, wavelength_um: float) -> float:
+    """n - 1 by K. P. Birch and M. J. Downs, Metrologia 31 (1994) 315: NIST's modified Edlen equation."""
+    S, t = wavelength_um**-2, temperature_degC
+    standard = (8342.54 + 2406147 / (130 - S) + 15998 / (38.9 - S)) * 1e-8
+    density = pressure_Pa / 96095.43 * (1 + 1e-8 * (0.601 - 0.00972 * t) * pressure_Pa) / (1 + 0.003661 * t)
+    return standard * density - 1e-10 * (292.75 / (t + KELVIN)) * (3.7345 - 0.0401 * S) * vapour_Pa
+
 
 EQUATIONS = (edlen_1966, birch_downs_1994, ciddor_1996)
 DRY_550_nm = {

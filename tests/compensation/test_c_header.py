@@ -14,7 +14,7 @@ import pytest
 
 from compensation.apply.c_header import export_c, header_text
 from compensation.apply.export import runtime_model
-from compensation.apply.warp import warp
+from compensation.apply.images import warp
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift_runtime import AMBIENT, CAMERA, HISTORY, STATE, SWITCHED_ON, Drift

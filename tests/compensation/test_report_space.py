@@ -13,8 +13,7 @@ import pytest
 from compensation.reporting.extras import Extras
 from compensation.reporting.gather import numbers_of
 from compensation.reporting.page import page as page_of
-from compensation.reporting.report import report_page
-from compensation.reporting.space_section import space_section
+from compensation.reporting.report import report_page, space_section
 from compensation.reporting.table_positions import TablePositions, table_positions
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.document import as_json

@@ -15,7 +15,7 @@ from compensation.cli import app as compensate
 from compensation.commands.schema_cli import DOCUMENTS as OFFLINE
 from foundation.schemas import schema_text
 from stand.commands.commands import app as stand
-from stand.config.schemas import DOCUMENTS
+from stand.commands.config_cli import DOCUMENTS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FILES = sorted(CONFIGS.rglob("*.yaml"))

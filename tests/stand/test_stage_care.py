@@ -11,7 +11,7 @@ from foundation.errors import DeviceFault
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.readings import Quality
-from stand.table.stage_care import check_home, ready
+from stand.table.stages import check_home, ready
 from tests.system.stage_bench import OVERSHOOT, UNIT_PER_STEP, Bench, Kind, running_bench
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from stand.commands.commands import app
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
-from stand.estimating.room import small_disk
+from stand.estimating.night import small_disk
 from stand.running.order import load_order
 
 runner = CliRunner()
