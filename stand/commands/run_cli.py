@@ -176,7 +176,7 @@ def _show_session(session: Path, folder: Path, line: str, *, report: bool) -> No
     if not output().as_json:
         typer.echo(line)  # before the report, which takes a minute
     try:
-        lines = report_session(session, folder) if report else []
+        lines = report_session(session, folder).lines if report else []
         show({"session": session, "report": folder / REPORT_NAME if report else None}, lines)
     except NotReported as error:
         if output().as_json:

@@ -14,8 +14,8 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.lane import Lane
 from foundation.tasks import cancelled, failure_text
+from stand.running.session_report import report_session
 from stand.serving.preview_process import MODULE
-from stand.session_report import WARNING, report_session
 
 _REPORT = "report"
 
@@ -26,8 +26,7 @@ def session_report(path: str) -> list[str]:
     import cv2
 
     cv2.setNumThreads(1)
-    lines = report_session(Path(path), Path(path))
-    return [line.removeprefix(WARNING) for line in lines if line.startswith(WARNING)]
+    return list(report_session(Path(path), Path(path)).unexplained)
 
 
 class Reports:

@@ -87,7 +87,7 @@ def conclude(entry: Entry, session: Path, tell: Callable[[str], None], *, report
         return
     try:
         check_reportable(order.recipe.plan())
-        for line in report_session(session, session):
+        for line in report_session(session, session).lines:
             tell(line)
     except (ConfigError, NotReported) as error:
         tell(f"{session.name}: {error}")

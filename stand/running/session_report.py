@@ -5,13 +5,26 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from experiments.steps import Capture, PlannedStep
 from foundation.errors import ConfigError, StandError
 from foundation.progress import progress
 
 MODEL_NAME, REPORT_NAME = "model.json", "report.html"
-WARNING = "warning: "  # begins a line that says what no temperature explains
+
+
+class Reported(NamedTuple):
+    """unexplained: what no temperature explains, a sentence each. results: the table beside the paper's, and where the
+    files are."""
+
+    unexplained: tuple[str, ...]
+    results: tuple[str, ...]
+
+    @property
+    def lines(self) -> list[str]:
+        """All of it, to be shown."""
+        return [*(f"warning: {text}" for text in self.unexplained), *self.results]
 
 
 class NotReported(StandError):
@@ -24,9 +37,8 @@ def check_reportable(plan: Iterable[PlannedStep]) -> None:
         raise ConfigError("--report needs a recipe that takes frames; this one has no capture")
 
 
-def report_session(session: Path, folder: Path) -> list[str]:
-    """Fit and report a session into `folder`; the lines to show: the table beside the paper's and where the files are.
-    Without reference and fit frames there is a report of the drift, and no model.
+def report_session(session: Path, folder: Path) -> Reported:
+    """Fit and report a session into `folder`. Without reference and fit frames there is a report of the drift alone.
 
     The session's own folder will do: readers of a session look only at the files that a run has left there. NotReported
     when the frames do not allow it or a file cannot be written; what was recorded is as it was.
@@ -44,12 +56,12 @@ def report_session(session: Path, folder: Path) -> list[str]:
         remedy = f"`compensate report {session} -o report.html` tries again"
         raise NotReported(f"{session} is recorded, but not reported: {error}; {remedy}") from error
     fitted = [] if evaluation is None else [table(evaluation), f"model    {model}"]
-    return [*_moved(report.with_suffix(".json")), *fitted, f"report   {report}"]
+    return Reported(tuple(_moved(report.with_suffix(".json"))), (*fitted, f"report   {report}"))
 
 
 def _moved(numbers: Path) -> Iterator[str]:
-    """What no temperature explains, a line for each: steps of the image, slips, fixings that settle anew."""
+    """Steps of the image, slips, fixings that settle differently each time."""
     found = json.loads(numbers.read_text())
     for bump in found["bumps"]:
-        yield f"{WARNING}between {bump['after']} and {bump['before']} {bump['text']}; no temperature explains it"
-    yield from (f"{WARNING}{one['text']}" for one in found["unrepeated"] if one["cause"] != "nothing")
+        yield f"between {bump['after']} and {bump['before']} {bump['text']}; no temperature explains it"
+    yield from (one["text"] for one in found["unrepeated"] if one["cause"] != "nothing")

@@ -21,7 +21,7 @@ def test_a_step_and_slips_are_said_when_the_night_is_reported(tmp_path, monkeypa
         (tmp_path / "report.json").write_text(json.dumps({"bumps": [bump], "unrepeated": kinds}))
 
     monkeypatch.setattr(report, "analyse", analysed)
-    lines = report_session(tmp_path / "night", tmp_path)
+    lines = report_session(tmp_path / "night", tmp_path).lines
     assert lines == [
         f"warning: between 2026-01-02T06:00:00Z and 2026-01-02T06:40:00Z {MOVED}; no temperature explains it",
         "warning: a joint sticks and slips",
