@@ -159,6 +159,8 @@ def _found(root: yaml.Node | None, place: Place) -> tuple[int | None, yaml.Node 
 
 def _written(fault: ErrorDetails, root: yaml.Node | None) -> tuple[int | str, ...]:
     """Its place as the document has it: without the tags of unions, which stand between a key and those below it."""
+    if len(fault["loc"]) == 1:  # thousands of keys at the top are not looked up one by one
+        return fault["loc"]
     kept, node = list[int | str](), root
     for number, part in enumerate(fault["loc"]):
         line, inner = _found(node, (part,))
