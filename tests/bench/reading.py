@@ -121,7 +121,7 @@ def _batches(second: int) -> Iterator[Batch]:
         values = random.Random(second * len(DEVICES) + index)
         readings = [
             Reading(f"{device}.{quantity.name}", round(values.gauss(20, 1), 2), quantity.unit, time_ns)
-            for quantity in messages.KINDS[kind].quantities
+            for quantity in kinds.KINDS[kind].quantities
             if (device, quantity.unit) not in {("linear", "deg"), ("rotary", "mm")}
         ]
         yield Batch(device, time_ns, tuple(readings))
@@ -225,7 +225,7 @@ def _peer_temperatures(session: Path) -> list[NDArray[np.float64]]:
 
 
 def _peer_rows(path: Path) -> Iterable[list[float]]:
-    topic = messages.KINDS["thermometers"].topic
+    topic = kinds.KINDS["thermometers"].topic
     parse = messages.CLASSES[topic].FromString
     with path.open("rb") as file:
         for _, _, message in make_reader(file, validate_crcs=True).iter_messages([topic]):
