@@ -260,7 +260,7 @@ class Drift:
         away, matrix = self._away(), np.array(self._model["leverage_matrix"])
         found |= _beyond(away @ matrix @ away, (0.0, self.most_leverage), STATE)
         if self._model["taus_s"]:
-            found |= _beyond(self._state.ambient_lag[-1], self.limits("ambient_range_degC"), AMBIENT)
+            found |= _beyond(self._state.ambient_lag[1], self.limits("ambient_range_degC"), AMBIENT)
         return found | _beyond(self._state.settled_s, (self.memory_s, math.inf), HISTORY)
 
     def limits(self, name):

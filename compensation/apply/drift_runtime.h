@@ -75,7 +75,7 @@ static inline unsigned drift_state_flags(const drift_state *state, const double 
     if (!state->begun) return DRIFT_CAMERA | DRIFT_AMBIENT | DRIFT_SWITCHED_ON | DRIFT_HISTORY | DRIFT_STATE;
     found |= drift_beyond(3600.0 / drift_taus_s[0] * (state->air_degC - state->ambient_lag[0]),
                           drift_rate_range_K_per_h[0], drift_rate_range_K_per_h[1], DRIFT_AMBIENT);
-    found |= drift_beyond(state->ambient_lag[DRIFT_LAGS - 1], drift_ambient_range_degC[0], drift_ambient_range_degC[1],
+    found |= drift_beyond(state->ambient_lag[1], drift_ambient_range_degC[0], drift_ambient_range_degC[1],
                           DRIFT_AMBIENT);
     found |= drift_beyond(state->on_s, DRIFT_LEAST_ON_S, HUGE_VAL, DRIFT_SWITCHED_ON);
     found |= drift_beyond(state->settled_s, DRIFT_MEMORY_S, HUGE_VAL, DRIFT_HISTORY);

@@ -19,13 +19,11 @@ import numpy as np
 from compensation.design.courses import Known, best_course
 from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
 from compensation.drift.terms import Origin, features
-from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
 from compensation.history.states import Float
 from compensation.observations import Observations
 from experiments.steps import Role
-from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
 
 _GRID, _PLACES = 13, 7
@@ -75,7 +73,7 @@ def decide(observations: Observations, wanted: Wanted) -> Decision:
         return Decision("enough", math.nan, 0.0, predicted_px, reason)
     known = Known(
         model.leverage_matrix,
-        _noise_px2(model, observations),
+        float(model.discrepancy_px @ model.discrepancy_px),
         _features(model, asked),
         lambda situation: _features(model, situation),
     )
@@ -128,12 +126,3 @@ def _asked(around: Surroundings, model: ThermalModel, wanted: Wanted) -> Situati
 def _features(model: ThermalModel, situation: Situation) -> Float:
     origin = Origin(model.facts.reference_degC, model.reference_ambient_degC)
     return features(situation.states, model.terms, origin) - model.reference_features
-
-
-def _noise_px2(model: ThermalModel, observations: Observations) -> float:
-    """What one instant leaves open, px^2: the hat matrix of all instants has as many ones as there are terms."""
-    frames = np.flatnonzero(observations.of(Role.REFERENCE, Role.FIT, Role.WARM_UP))
-    minute = observations.time_ns[frames] // (60 * NS_PER_S)
-    _, first = np.unique(minute, return_index=True)
-    leverage = model.leverage(frame_states(observations, model.memory).where(frames[first]))
-    return float(np.nansum(leverage)) / len(model.terms)

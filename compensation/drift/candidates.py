@@ -22,15 +22,15 @@ class Candidate(Document):
     """One form and what leave-temperatures-out says of it; a fold is one chamber set-point with all its visits.
 
     form: paper or thermal. name: in words. terms: coefficients of both coordinates together. rms_px: held-out RMS along
-    I and J, all folds counting the same; fold_rms_px: of each fold. bic: None for the paper's form, which learns from
-    other frames. chosen: whether it is the best of its form.
+    I and J, all folds counting the same; fold_rms_px: of each fold. bic: in older files.
+    chosen: whether it is the best of its form.
     """
 
     form: str
     name: str
     terms: int
     rms_px: Pair
-    bic: float | None
+    bic: float | None = None
     chosen: bool
     fold_chamber_degC: tuple[float, ...]
     fold_rms_px: tuple[Pair, ...]

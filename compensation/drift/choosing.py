@@ -14,7 +14,7 @@ from compensation.drift.candidates import NO_MATTER_PX, Candidate
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_fit import check_degree, fit_paper
 from compensation.drift.paper_model import PaperModel
-from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.observations import Observations
 from foundation.errors import ConfigError, SessionError

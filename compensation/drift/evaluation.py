@@ -12,7 +12,7 @@ from compensation.drift.displacements import Displacements, displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_fit import degrees_for, left_out, scaling_of
 from compensation.drift.paper_model import PaperModel
-from compensation.drift.thermal_choice import left_out_thermal
+from compensation.drift.thermal_learning import left_out_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.observations import Float, Mask, Observations

@@ -1,7 +1,7 @@
 """Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null.
 
 A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form, those
-before version 4 know of no bumps.
+before version 4 know of no bumps, those before version 5 have correlations between the motions, which are dropped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from foundation.errors import SessionError
 from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 
 Positive = Annotated[int, Field(gt=0)]
 Rows = tuple[tuple[float, ...], ...]
@@ -39,7 +39,7 @@ class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Literal[2, 3, 4] = SCHEMA_VERSION
+    schema_version: Literal[2, 3, 4, 5] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]
@@ -75,7 +75,8 @@ class TermFile(Document):
 
 
 class ThermalFile(_File):
-    """The thermal form. least_on_s: null when the camera was never switched on within the record."""
+    """The thermal form. coefficient_covariance_px2 (8 H, H): of each motion one below the other. least_on_s: null when
+    the camera was never switched on within the record. usual_leverage_px2: in older files."""
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[TermFile, ...]
@@ -178,12 +179,11 @@ def _thermal_fields(model: ThermalModel) -> dict[str, object]:
         "self_heating_K": model.self_heating_K,
         "has_warm_up": model.has_warm_up,
         "coefficients_px": model.coefficients.tolist(),
-        "coefficient_covariance_px2": model.coefficient_covariance.tolist(),
+        "coefficient_covariance_px2": np.concatenate(model.coefficient_covariance).tolist(),
         "ambient_range_degC": model.valid.ambient_degC,
         "rate_range_K_per_h": model.valid.rate_K_per_h,
         "least_on_s": _finite(model.valid.least_on_s),
         "leverage_px2": _finite(model.valid.leverage),
-        "usual_leverage_px2": model.valid.usual_leverage,
         "history_s": model.valid.history_s,
     }
 
@@ -222,9 +222,7 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         self_heating_K=file.self_heating_K,
         reference_features=_shaped("reference_features", file.reference_features, (count,)),
         coefficients=_shaped("coefficients_px", file.coefficients_px, (MOTIONS, count)),
-        coefficient_covariance=_shaped(
-            "coefficient_covariance_px2", file.coefficient_covariance_px2, (MOTIONS * count, MOTIONS * count)
-        ),
+        coefficient_covariance=_blocks(file, count),
         discrepancy_px=np.array(file.discrepancy_px),
         valid=ThermalRange(
             ambient_degC=file.ambient_range_degC,
@@ -232,11 +230,18 @@ def _thermal(file: ThermalFile) -> ThermalModel:
             least_on_s=math.inf if file.least_on_s is None else file.least_on_s,
             leverage=math.inf if file.leverage_px2 is None else file.leverage_px2,
             history_s=file.history_s,
-            usual_leverage=file.usual_leverage_px2,
         ),
         has_warm_up=file.has_warm_up,
         candidates=file.candidates,
     )
+
+
+def _blocks(file: ThermalFile, count: int) -> Float:
+    """(8, H, H)."""
+    told = file.coefficient_covariance_px2
+    whole = bool(told) and len(told[0]) == MOTIONS * count
+    rows = _shaped("coefficient_covariance_px2", told, (MOTIONS * count, MOTIONS * count if whole else count))
+    return np.stack([rows[k : k + count, k if whole else 0 :][:, :count] for k in range(0, len(rows), count)])
 
 
 def _facts(file: PaperFile | ThermalFile) -> ModelFacts:

@@ -163,7 +163,6 @@ def candidates_of(scores: tuple[DegreeScore, ...], degree: int) -> tuple[Candida
             name=f"P^{score.degree}",
             terms=2 * score.terms,
             rms_px=score.rms_px,
-            bic=None,
             chosen=score.degree == degree,
             fold_chamber_degC=score.fold_chamber_degC,
             fold_rms_px=score.fold_rms_px,

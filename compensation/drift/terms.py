@@ -43,6 +43,21 @@ class Term:
 POLYNOMIAL = (Term(Kind.CONSTANT), Term(Kind.CAMERA), Term(Kind.CAMERA_SQUARE))
 """1, T, T^2: what the camera's own temperature explains."""
 
+TAUS_S = tuple(60.0 * minutes for minutes in (4, 8, 15, 27, 50, 100, 210, 450))
+"""The slowest are for what creeps, and for a night that begins before all is warm; lags between two of these are sums
+of them."""
+
+PLAYS_K = (3.0, 6.0, 10.0, 14.0)
+
+
+TERMS = (
+    *POLYNOMIAL,
+    *(Term(kind, tau_s) for kind in (Kind.AMBIENT_LAG, Kind.CAMERA_LAG) for tau_s in TAUS_S),
+    *(Term(Kind.PLAY, radius_K) for radius_K in PLAYS_K),
+)
+"""What a camera may be moved by. Its own temperature brings its self-heating with it: with lags of the supply, or of
+the square of its temperature, a warm-up in other air is predicted worse. Older models have them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Origin:

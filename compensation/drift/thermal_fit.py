@@ -1,83 +1,169 @@
-"""Normal equations of motions times features, and their solutions: any subset of features, any fold left out."""
+"""What instants teach of the terms' coefficients, each motion by itself.
+
+amount = features . c + wander + noise. The coefficients c of each kind of term are Gaussian about 0, as wide as makes
+the night most likely (its evidence: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.1
+and 5.4): a camera that no play moves gets coefficients of plays near 0, and a state unlike those of the night an
+uncertain answer. The wander (Ornstein-Uhlenbeck) is of fixings that slip or settle anew; without it a hundred frames of
+one dwell would count as a hundred answers.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
-from compensation.drift.instants import Instants
-from compensation.drift.terms import MOTIONS
+from compensation.drift.instants import Index, Instants
+from compensation.drift.terms import MOTIONS, Kind, Term
 from compensation.history.states import Float
 
-Columns = NDArray[np.int64]
-
-RIDGE, RIDGE_WITH_PLAYS = 1e-7, 1e-5
-"""Relative to the mean of the diagonal: keeps features that hardly differ from running away."""
+_WANDERS, _WANDER_TAUS_S = (1.0, 2.0, 4.0), (1800.0, 7200.0)
+"""Standard deviation of the wander over that of an instant's noise."""
+_USUAL, _UNSURE = math.log(20.0), 3.0
+"""A coefficient is expected to be 20 times the noise, within a factor of e^3: a weak prior on the widths."""
+_WIDTHS, _NOISES = (math.log(1e-3), math.log(1e4)), (0.0, math.log(1e4))
+_ROUNDS = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Equations:
-    """normal (8, H, 8, H), moment (8, H) of `instants` instants, and the square sum of what they measured."""
+class _Equations:
+    """Normal equations of the features (H, H), moments (H, 8) and square sums (8,) of the amounts, weighted with the
+    precision of wander and noise; count of instants, log determinant of their covariance."""
 
-    normal: Float
+    gram: Float
     moment: Float
-    square: float
-    instants: int
-
-    def __sub__(self, fold: Equations) -> Equations:
-        """Without the instants of a fold."""
-        return Equations(
-            self.normal - fold.normal,
-            self.moment - fold.moment,
-            self.square - fold.square,
-            self.instants - fold.instants,
-        )
+    square: Float
+    count: int
+    log_determinant: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ThermalSolution:
-    """coefficients (8, H), px; covariance (8, H, 8, H), px^2, times chi^2 per degree of freedom: the weights
-    of instants are relative. bic: Bayesian information criterion, less is better."""
+class _Weighting:
+    """One size and time constant of the wander. precision (I, I) of wander and noise, in units of the noise."""
 
+    wander: float
+    precision: Float
+    log_determinant: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Believed:
+    """Of one motion. widths (H,): of the prior, noise: of an instant, both in units of the noise that markers have."""
+
+    weighting: _Weighting
+    widths: Float
+    noise: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """coefficients (8, H), px, and their covariance (8, H, H), px^2. wander_px2 (8,): variance of what wanders."""
+
+    instants: Instants
     coefficients: Float
     covariance: Float
-    bic: float
+    wander_px2: Float
+    _scale_px: Float
+    _believed: tuple[_Believed, ...]
+
+    def without(self, left_out: NDArray[np.bool_]) -> Float:
+        """(8, H): what the instants teach without some of them (I,), with the same prior and noise."""
+        found = np.empty_like(self.coefficients)
+        rows = np.flatnonzero(left_out)
+        amounts = self.instants.amounts_px / self._scale_px
+        for motion, own in enumerate(self._believed):
+            known = _equations(self.instants.features, amounts, own.weighting, rows)
+            found[motion] = _solved(known, motion, own)[0] * self._scale_px[motion]
+        return found
 
 
-def equations(instants: Instants) -> Equations:
-    """The weighted normal equations for all features."""
-    count, features = instants.features.shape
-    products = (instants.features[:, :, None] * instants.features[:, None, :]).reshape(count, -1)
-    normal = instants.normal.reshape(count, -1).T @ products
-    return Equations(
-        normal.reshape(MOTIONS, MOTIONS, features, features).transpose(0, 2, 1, 3),
-        instants.moment.T @ instants.features,
-        instants.square,
-        count,
+def learn(instants: Instants, terms: Sequence[Term]) -> Learned:
+    """The most likely prior and noise of each motion, and what they make of these instants."""
+    kinds = list(Kind)
+    kind = np.array([kinds.index(term.kind) for term in terms])
+    scale_px = np.sqrt(np.median(instants.variance_px2, axis=0))
+    amounts = instants.amounts_px / scale_px
+    best: list[tuple[float, Float, _Weighting] | None] = [None] * MOTIONS
+    for weighting in _weightings(instants, (instants.variance_px2 / scale_px**2).mean(axis=1)):
+        known = _equations(instants.features, amounts, weighting)
+        for motion, before in enumerate(best):
+            start = np.append(np.full(len(kinds), _USUAL), 0.0) if before is None else before[1]
+            value, found = _most_likely(known, motion, kind, start)
+            if before is None or value < before[0]:
+                best[motion] = value, found, weighting
+    believed = tuple(
+        _Believed(weighting, np.exp(found[kind]), math.exp(found[-1])) for _, found, weighting in filter(None, best)
+    )
+    solved = [
+        _solved(_equations(instants.features, amounts, own.weighting), motion, own)
+        for motion, own in enumerate(believed)
+    ]
+    return Learned(
+        instants,
+        np.array([coefficients for coefficients, _ in solved]) * scale_px[:, None],
+        np.array([covariance for _, covariance in solved]) * scale_px[:, None, None] ** 2,
+        np.array([(own.noise * own.weighting.wander) ** 2 for own in believed]) * scale_px**2,
+        scale_px,
+        believed,
     )
 
 
-def solve_thermal(known: Equations, columns: Columns, ridge: float) -> ThermalSolution:
-    """The fit with the features `columns`; LinAlgError when the instants do not determine it.
+def _weightings(instants: Instants, variance: Float) -> Iterator[_Weighting]:
+    apart_s = np.abs(instants.time_s[:, None] - instants.time_s)
+    same = instants.session[:, None] == instants.session
+    for wander, tau_s in [(0.0, 1.0), *product(_WANDERS, _WANDER_TAUS_S)]:
+        covariance = np.diag(variance) + wander**2 * np.where(same, np.exp(-apart_s / tau_s), 0.0)
+        half = np.linalg.inv(np.linalg.cholesky(covariance))
+        yield _Weighting(wander, half.T @ half, -2 * float(np.log(np.diagonal(half)).sum()))
 
-    BIC = n log(chi^2/n) + k log n with the n = 8 numbers that each instant gives and k coefficients.
-    """
-    count = MOTIONS * len(columns)
-    if known.instants * MOTIONS <= count:
-        raise np.linalg.LinAlgError(f"{known.instants} instants for {len(columns)} features")
-    normal = known.normal[:, columns][:, :, :, columns].reshape(count, count)
-    moment = known.moment[:, columns].ravel()
-    damped = normal + ridge * np.trace(normal) / count * np.eye(count)
-    inverse = np.linalg.inv(damped)
-    solution = inverse @ moment
-    chi2 = max(known.square - 2 * solution @ moment + solution @ normal @ solution, 1e-9)
-    numbers = known.instants * MOTIONS
-    shape = (MOTIONS, len(columns))
-    return ThermalSolution(
-        coefficients=solution.reshape(shape),
-        covariance=(inverse * (chi2 / (numbers - count))).reshape(shape * 2),
-        bic=numbers * math.log(chi2 / numbers) + count * math.log(numbers),
-    )
+
+def _equations(features: Float, amounts: Float, weighting: _Weighting, left_out: Index | None = None) -> _Equations:
+    """Without the instants that are left out: the precision of the others is B - B_rf B_ff^-1 B_fr."""
+    weighted, told = weighting.precision @ features, weighting.precision @ amounts
+    gram, moment, square = features.T @ weighted, features.T @ told, (amounts * told).sum(axis=0)
+    count = len(features)
+    if left_out is not None:
+        own = np.linalg.inv(weighting.precision[np.ix_(left_out, left_out)]) @ weighted[left_out]
+        gram, moment = gram - weighted[left_out].T @ own, moment - own.T @ told[left_out]
+        count -= len(left_out)
+    return _Equations(gram, moment, square, count, weighting.log_determinant)
+
+
+def _solved(known: _Equations, motion: int, own: _Believed) -> tuple[Float, Float]:
+    """Coefficients (H,) and their covariance (H, H), in units of the noise."""
+    precision = own.widths[:, None] * known.gram * own.widths / own.noise**2 + np.eye(len(own.widths))
+    inverse = np.linalg.inv(precision)
+    coefficients = inverse @ (own.widths * known.moment[:, motion]) / own.noise**2
+    return own.widths * coefficients, own.widths[:, None] * inverse * own.widths
+
+
+def _most_likely(known: _Equations, motion: int, kind: Index, start: Float) -> tuple[float, Float]:
+    """The least negative log evidence, and the logarithms of widths of each kind and noise that have it."""
+    moment, square, kinds = known.moment[:, motion], float(known.square[motion]), len(start) - 1
+
+    def negative(logs: Float) -> tuple[float, Float]:
+        widths, per_noise = np.exp(logs[kind]), math.exp(-2 * logs[-1])
+        explained = widths[:, None] * known.gram * widths * per_noise
+        inverse = np.linalg.inv(explained + np.eye(len(kind)))
+        told = widths * moment * per_noise
+        found = inverse @ told
+        free = np.diagonal(inverse)
+        beyond = (logs[:-1] - _USUAL) / _UNSURE
+        value = (
+            0.5 * float(square * per_noise - told @ found)
+            - 0.5 * float(np.linalg.slogdet(inverse)[1])
+            + known.count * float(logs[-1])
+            + 0.5 * (known.log_determinant + float(beyond @ beyond))
+        )
+        of_widths = np.bincount(kind, 1 - free - found**2, kinds) + beyond / _UNSURE
+        left = square * per_noise - 2 * told @ found + found @ explained @ found
+        return value, np.append(of_widths, known.count - left - (len(kind) - free.sum()))
+
+    limits = [_WIDTHS] * kinds + [_NOISES]
+    result = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": _ROUNDS})
+    return float(result.fun), np.asarray(result.x, np.float64)

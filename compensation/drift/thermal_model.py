@@ -2,7 +2,7 @@
 
 A function of the camera's temperature alone cannot distinguish a lens that is still warming from a warm one. This form
 uses the history of air, supply and own temperature, kept in first-order lags and plays.
-compensation/drift/thermal_choice.py makes the model.
+compensation/drift/thermal_learning.py makes the model.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from compensation.drift.drift_model import (
     states_of,
 )
 from compensation.drift.facts import ModelFacts
-from compensation.drift.terms import MOTIONS, Kind, Origin, Term, features, memory_of, motions
+from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
 from compensation.drift_runtime import SETTLED_TAUS
 from compensation.history.states import Float, Memory, States
 
@@ -35,10 +35,9 @@ _MARGIN = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThermalRange:
-    """What the calibration covered besides the camera's temperature: the slowest lag of the ambient, how fast the
+    """What the calibration covered besides the camera's temperature: the quickest lag of the ambient, how fast the
     ambient changed, K/h, and the shortest time since the camera was switched on, s. leverage: the largest of a training
-    state, inf in models that do not know it; usual_leverage: the mean of set-points that were left
-    out in turn, None there. history_s: how long a state must have been followed after a guess until
+    state, inf in models that do not know it. history_s: how long a state must have been followed after a guess until
     what is left of it does not matter; None: three of the longest time constants."""
 
     ambient_degC: Pair
@@ -46,18 +45,17 @@ class ThermalRange:
     least_on_s: float
     leverage: float = math.inf
     history_s: float | None = None
-    usual_leverage: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThermalModel:
     """Maps measured positions of one camera to those at the reference temperature.
 
-    terms: H features of the thermal state. coefficients (8, H) px, covariance (8 H, 8 H) px^2, in row order.
+    terms: H features of the thermal state. coefficients (8, H) px, each motion's with a covariance (8, H, H) px^2.
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
     the shift at the reference is about 0. discrepancy_px (2,): what the form leaves unexplained at temperatures not
     fitted, one standard deviation, marker noise taken off. has_warm_up: whether a warm-up was among the training
-    frames; without one there are no lags of the power. candidates, other: as in PaperModel.
+    frames. candidates, other: as in PaperModel.
     """
 
     facts: ModelFacts
@@ -81,7 +79,7 @@ class ThermalModel:
     @property
     def title(self) -> str:
         """The form in words."""
-        without = "" if self.has_warm_up else "; no warm-up was recorded: no lags of the power"
+        without = "" if self.has_warm_up else "; no warm-up was recorded"
         return f"{form_name(self.terms)}, {self.coefficients.size} coefficients{without}"
 
     @property
@@ -100,15 +98,14 @@ class ThermalModel:
         return xy_px + self.shift(xy_px, state)
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
-        """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself. What
-        the form leaves unexplained was seen at set-points that were left out, and is taken to grow with the leverage
-        beyond theirs."""
+        """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: of the coefficients, which
+        know little of a state unlike those of the fit, and of what the form leaves unexplained. That was seen at
+        set-points that were left out, and is taken to grow with the leverage beyond the largest of the fit."""
         found = self._features(state, len(xy_px))
-        terms = motions(xy_px, self.facts.image_size)[:, :, :, None] * found[:, None, None, :]
-        terms = terms.reshape(len(xy_px), 2, -1)
-        of_coefficients = (terms @ self.coefficient_covariance) @ terms.transpose(0, 2, 1)
-        usual = self.valid.leverage if self.valid.usual_leverage is None else self.valid.usual_leverage
-        more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / usual, 1.0)
+        moved = motions(xy_px, self.facts.image_size)
+        variance = np.einsum("nh,mhk,nk->nm", found, self.coefficient_covariance, found, optimize=True)
+        more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0)
+        of_coefficients = (moved * variance[:, None, :]) @ moved.transpose(0, 2, 1)
         return of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:
@@ -130,9 +127,7 @@ class ThermalModel:
     def leverage_matrix(self) -> Float:
         """(H, H), px^2: what the coefficients' covariance makes of the features of a state, for the shift along I and
         J."""
-        count = len(self.terms)
-        blocks = self.coefficient_covariance.reshape(MOTIONS, count, MOTIONS, count)
-        return blocks[0, :, 0] + blocks[1, :, 1]
+        return self.coefficient_covariance[0] + self.coefficient_covariance[1]
 
     def leverage(self, state: States) -> Float:
         """(N,), px^2: how far a state is from those of the fit, in terms of what they determine (the diagonal of the
@@ -151,7 +146,7 @@ class ThermalModel:
         found |= range_flags(states.rate_K_per_h, _widened(valid.rate_K_per_h, 1.0), Outside.AMBIENT)
         found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
         if self.memory.taus_s:
-            found |= range_flags(states.ambient_lag_degC[:, -1], _widened(valid.ambient_degC), Outside.AMBIENT)
+            found |= range_flags(states.ambient_lag_degC[:, 0], _widened(valid.ambient_degC), Outside.AMBIENT)
         found |= range_flags(self.leverage(states), (0.0, _MORE_LEVERAGE * valid.leverage), Outside.STATE)
         needed_s = self.history_s
         return found | range_flags(states.settled_s, (needed_s, np.inf), Outside.HISTORY)
@@ -163,10 +158,15 @@ def _widened(limits: Pair, least: float = 0.0) -> Pair:
 
 
 def form_name(terms: tuple[Term, ...]) -> str:
-    """`homography x (1, T, T^2), ambient lag 11, 70 min, camera lag 11 min`."""
+    """`homography x (1, T, T^2), ambient lag 4 to 450 min, plays 3 to 14 K`."""
     parts = ["homography x (1, T, T^2)"]
     for kind in (Kind.AMBIENT_LAG, Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE):
-        taus = ", ".join(f"{term.parameter / 60:g}" for term in terms if term.kind is kind)
-        parts += [f"{kind} {taus} min"] if taus else []
-    radii = ", ".join(f"{term.parameter:g}" for term in terms if term.kind is Kind.PLAY)
-    return ", ".join([*parts, *([f"plays {radii} K"] if radii else [])])
+        taus = [term.parameter / 60 for term in terms if term.kind is kind]
+        parts += [f"{kind} {_extent(taus)} min"] if taus else []
+    radii = [term.parameter for term in terms if term.kind is Kind.PLAY]
+    return ", ".join([*parts, *([f"plays {_extent(radii)} K"] if radii else [])])
+
+
+def _extent(values: list[float]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"

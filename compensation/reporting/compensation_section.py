@@ -124,7 +124,7 @@ def _candidates(model: ModelNumbers) -> Iterator[Part]:
     others.sort(key=lambda one: (not one.chosen, float(one.fold_squares.mean())))
     rows = [*paper, *others[:_MOST_THERMAL]]
     chosen = next((index for index, one in enumerate(rows) if one.chosen), None)
-    heads = ("candidate", "coefficients", "held-out RMS I, mpx", "J", "BIC")
+    heads = ("candidate", "coefficients", "held-out RMS I, mpx", "J")
     yield Table(heads, [_candidate(one) for one in rows], chosen=chosen)
     if len(others) > _MOST_THERMAL:
         yield Paragraph(f"{len(others) - _MOST_THERMAL} more are in the file beside this page.", aside=True)
@@ -146,7 +146,7 @@ def _why(model: ModelNumbers) -> str:
 def _candidate(one: Candidate) -> tuple[str, ...]:
     name = f"{one.form}: {one.name.removeprefix(_COMMON)}"
     rms = (f"{1e3 * value:.1f}" for value in one.rms_px)
-    return (name, str(one.terms), *rms, "" if one.bic is None else f"{one.bic:.0f}")
+    return (name, str(one.terms), *rms)
 
 
 def uncertainty_section(numbers: Numbers) -> Iterator[Part]:

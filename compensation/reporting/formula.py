@@ -7,7 +7,7 @@ import numpy as np
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.polynomial import exponents
-from compensation.drift.terms import MOTIONS, Kind, Term
+from compensation.drift.terms import Kind, Term
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift_runtime import SPAN_K
 from compensation.reporting.numbers import FormulaNumbers
@@ -54,8 +54,7 @@ def _thermal(model: ThermalModel) -> FormulaNumbers:
         "power(τ) = the supply (0 or 1) through such a lag − 1;  camera(τ): T through such a lag",
         "play(r) = T through a dead zone of radius r;  I, J in px, integers are pixel centres",
     )
-    count = len(model.terms)
-    sigma = np.sqrt(np.diagonal(model.coefficient_covariance)).reshape(MOTIONS, count)
+    sigma = np.sqrt(np.diagonal(model.coefficient_covariance, axis1=1, axis2=2))
     heads = tuple(f"{name}, px" for name in _MOTIONS)
     return FormulaNumbers(lines, heads, tuple(_feature(term) for term in model.terms), model.coefficients.T, sigma.T)
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from compensation.drift.choosing import fit
-from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_learning import fit_thermal
 from compensation.observations import concatenate
 from experiments.steps import Role
 from tests.bench.drift_drawn import effects_of, score

@@ -10,7 +10,7 @@ import pytest
 
 from compensation.drift.hysteresis import hysteresis
 from compensation.drift.paper_fit import fit_paper
-from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_learning import fit_thermal
 from compensation.observations import Observations
 
 from .reservoirs import cycle, reference, session, warm_up

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from compensation.drift.thermal_choice import fit_thermal
+from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.observations import concatenate
 

@@ -1,0 +1,169 @@
+"""Observations -> thermal model: every term there is, weighed by the night's own evidence (thermal_fit.py), and what
+that leaves at set-points, and at nights, that were left out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.drift.candidates import Candidate, discrepancy_px, fold_means
+from compensation.drift.displacements import Displacements
+from compensation.drift.facts import facts_of
+from compensation.drift.terms import MOTIONS, PLAYS_K, TAUS_S, TERMS, Kind, motions
+from compensation.drift.thermal_fit import Learned, learn
+from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
+from compensation.drift.training import Training, self_heating_K, training
+from compensation.drift_runtime import SETTLED_TAUS
+from compensation.history.states import Float, Memory
+from compensation.observations import Observations
+from experiments.steps import Role
+from foundation.errors import SessionError
+
+_FEWEST_FOLDS = 3
+_MOST_OF = 0.8
+_GUESSED = 0.25
+"""How wrong the first guess of a feature may be, 5 K of 20: of where the camera has been, and of its self-heating."""
+_OF_PLACE, _OF_HEATING = (Kind.AMBIENT_LAG, Kind.CAMERA_LAG), (Kind.CAMERA_LAG,)
+_LEAST_PX, _STEP_S = 0.003, 300.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Taught:
+    """What was learned from. rows: of the frames at set-points; held_out (M, 2): their residuals, px, each from what
+    the others teach."""
+
+    trained: Training
+    learned: Learned
+    rows: Displacements
+    held_out: Float
+
+
+def fit_thermal(observations: Observations) -> ThermalModel:
+    """The model of the REFERENCE, FIT and WARM_UP frames; SessionError when the sessions cannot support it."""
+    memory = Memory(TAUS_S, PLAYS_K, self_heating_K(observations))
+    return _model(_taught(training(observations, TERMS, memory)), memory.self_heating_K)
+
+
+def left_out_thermal(model: ThermalModel, observations: Observations) -> tuple[Displacements, Float]:
+    """The rows at set-points of other observations, and their residuals (M, 2), each from a new fit of the same terms
+    that has not seen its set-point."""
+    taught = _taught(training(observations, model.terms, model.memory))
+    return taught.rows, taught.held_out
+
+
+def _taught(trained: Training) -> _Taught:
+    instants = trained.instants()
+    set_points = np.unique(instants.chamber_degC[np.isfinite(instants.chamber_degC)]).tolist()
+    if len(set_points) < _FEWEST_FOLDS:
+        raise SessionError(
+            f"a thermal fit needs frames at {_FEWEST_FOLDS} chamber temperatures or more, found {len(set_points)}"
+        )
+    learned = learn(instants, trained.terms)
+    rows = trained.fold_rows.where(trained.at_rest)
+    return _Taught(trained, learned, rows, _held_out(trained, learned, rows, instants.chamber_degC, rows.chamber_degC))
+
+
+def _held_out(
+    trained: Training, learned: Learned, rows: Displacements, of_instant: NDArray[np.float64], of_row: Float
+) -> Float:
+    """Residuals (M, 2) of the rows, each from what is learned without the instants (I,) of its own fold (M,)."""
+    residual = rows.displacement_px.copy()
+    for fold in np.unique(of_row).tolist():
+        coefficients, here = learned.without(of_instant == fold), of_row == fold
+        amounts = trained.features[rows.frame[here]] @ coefficients.T
+        moved = motions(rows.measured_px[here], trained.observations.image_size)
+        residual[here] -= np.einsum("nak,nk->na", moved, amounts)
+    return residual
+
+
+def _discrepancy_px(taught: _Taught) -> Float:
+    """(2,): of set-points left out; of several nights also of nights left out, which shows what of the drift does not
+    repeat between them; and what wanders. The largest of them."""
+    trained, rows = taught.trained, taught.rows
+    moved = motions(rows.measured_px, trained.observations.image_size)
+    wander_px = np.sqrt((moved**2 @ taught.learned.wander_px2).mean(axis=0))
+    found = np.maximum(discrepancy_px(rows, taught.held_out), wander_px)
+    night = trained.observations.session[rows.frame].astype(float)
+    nights = [index for index in np.unique(night).tolist() if _others_know(rows.chamber_degC, night, index)]
+    if not nights:
+        return found
+    own = rows.where(np.isin(night, nights))
+    night = trained.observations.session[own.frame].astype(float)
+    left = _held_out(trained, taught.learned, own, taught.learned.instants.session.astype(float), night)
+    squares = left**2 - own.variance_px2
+    each = np.array([squares[night == index].mean(axis=0) for index in nights])
+    return np.maximum(found, np.sqrt(np.maximum(each.mean(axis=0), 0.0)))
+
+
+def _others_know(chamber_degC: Float, night: Float, index: float) -> bool:
+    """Whether the other nights were at all set-points of this one, and at most of all: else without it a fit has to
+    extrapolate."""
+    own, others = set(chamber_degC[night == index].tolist()), set(chamber_degC[night != index].tolist())
+    return bool(own) and own <= others and len(others) >= _MOST_OF * len(own | others)
+
+
+def _candidate(taught: _Taught) -> Candidate:
+    rows, terms = taught.rows, taught.trained.terms
+    squares = fold_means(rows, taught.held_out**2)
+    i, j = np.sqrt(squares.mean(axis=0))
+    return Candidate(
+        form="thermal",
+        name=form_name(terms),
+        terms=MOTIONS * len(terms),
+        rms_px=(float(i), float(j)),
+        chosen=True,
+        fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
+        fold_rms_px=tuple((float(i), float(j)) for i, j in np.sqrt(squares)),
+    )
+
+
+def _model(taught: _Taught, heating_K: float) -> ThermalModel:
+    trained, learned = taught.trained, taught.learned
+    camera_degC = _extent(trained.states.camera_degC[np.unique(trained.rows.frame)])
+    found = ThermalModel(
+        facts=facts_of(trained.observations, taught.rows, camera_degC, trained.origin.camera_degC),
+        terms=trained.terms,
+        reference_ambient_degC=trained.origin.ambient_degC,
+        self_heating_K=heating_K,
+        reference_features=trained.reference_features,
+        coefficients=learned.coefficients,
+        coefficient_covariance=learned.covariance,
+        discrepancy_px=_discrepancy_px(taught),
+        valid=_range(trained),
+        has_warm_up=bool(trained.observations.of(Role.WARM_UP).any()),
+        candidates=(_candidate(taught),),
+    )
+    largest = float(found.leverage(trained.states.where(np.unique(trained.rows.frame))).max())
+    return replace(found, valid=replace(found.valid, leverage=largest, history_s=_history_s(found)))
+
+
+def _history_s(model: ThermalModel) -> float:
+    """How long until what was guessed of the thermal state moves the image by less than the model is uncertain. A guess
+    is wrong by the same for all lags."""
+    limit_px = max(float(np.hypot(*model.discrepancy_px)), _LEAST_PX)
+    moved = motions(model.facts.hull_px, model.facts.image_size)
+    taus_s = np.array([term.parameter for term in model.terms])
+    guesses = [np.array([term.kind in kinds for term in model.terms]) for kinds in (_OF_PLACE, _OF_HEATING)]
+    longest_s = SETTLED_TAUS * max(model.memory.taus_s, default=0.0)
+    for after_s in np.arange(0.0, longest_s, _STEP_S).tolist():
+        left = [_GUESSED * model.coefficients[:, own] @ np.exp(-after_s / taus_s[own]) for own in guesses]
+        if math.hypot(*(float(np.linalg.norm(moved @ amounts, axis=1).mean()) for amounts in left)) < limit_px:
+            return float(after_s)
+    return float(longest_s)
+
+
+def _range(trained: Training) -> ThermalRange:
+    """What the training frames covered; the quickest lag stands for the ambient."""
+    states = trained.states.where(np.unique(trained.rows.frame))
+    return ThermalRange(
+        ambient_degC=_extent(states.ambient_lag_degC[:, 0]),
+        rate_K_per_h=_extent(states.rate_K_per_h),
+        least_on_s=float(states.on_s.min()),
+    )
+
+
+def _extent(values: Float) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
