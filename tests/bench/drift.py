@@ -18,11 +18,11 @@ from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
 from drivers.sim.optics import CameraKind
 from experiments.steps import Role
-from tests.bench import drift_beyond, drift_bumps, drift_drawn, drift_few
+from tests.bench import drift_beyond, drift_bumps, drift_drawn, drift_few, drift_moving
 from tests.bench.figures import Figure, at_most, progress, side_by_side
 from tests.compensation.plant_night import Dwell, Seen, WarmUp, night, warm_up_and_cycles
 
-SEEDS = (2, 3, 4, 5)  # the families of terms were chosen with nights of seed 1 in view
+SEEDS = (5, 6, 7, 8)  # the terms were chosen with nights of seeds 1 to 4 in view
 CYCLES = 2
 GOAL_MPX: dict[CameraKind, float] = {"modified": 5.0, "unmodified": 15.0}
 WARM_UP_GOAL_MPX = 3.0
@@ -39,7 +39,8 @@ def figures(directory: Path) -> list[Figure]:
         for what, unit, goal, pair in _values(seed):
             found.setdefault((what, unit, goal), []).append(pair)
     own = [_figure(what, unit, goal, pairs) for (what, unit, goal), pairs in found.items()]
-    return [*own, *drift_drawn.figures(), *drift_beyond.figures(), *drift_bumps.figures(), *drift_few.figures()]
+    parts = (drift_drawn, drift_moving, drift_beyond, drift_bumps, drift_few)
+    return [*own, *(figure for part in parts for figure in part.figures())]
 
 
 def _figure(what: str, unit: str, goal: float | None, pairs: list[tuple[float, float]]) -> Figure:
