@@ -159,8 +159,8 @@ def test_a_folder_that_was_renamed_under_a_daemon_is_seen_within_a_commit(tmp_pa
     with Daemon(tmp_path / "s") as daemon:
         daemon.until(lambda frames, messages, age_s, lost: frames >= 10)
         (tmp_path / "s").rename(tmp_path / "t")
-        *_, lost = daemon.until(lambda frames, messages, age_s, lost: lost)
-        assert f"it is {tmp_path / 't'}" in lost
+        # Renamed between the looks at the folder and at its journal, it is first the journal that has gone.
+        daemon.until(lambda frames, messages, age_s, lost: f"it is {tmp_path / 't'}" in lost)
         (tmp_path / "t").rename(tmp_path / "s")
         frames, *_ = daemon.until(lambda frames, messages, age_s, lost: not lost and age_s < 0.2)
         daemon.until(lambda more, messages, age_s, lost: more > frames)
