@@ -24,6 +24,7 @@ from stand.commands.session_text import size
 from stand.gate import INTERLOCK, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import RunStatus, StandState
+from stand.watching.moment import SET_POINT
 from stand.watching.remedies import for_reason, next_command
 
 app = App()
@@ -60,7 +61,7 @@ def watch(server: Server) -> None:
     Example: stand watch
     """
     from stand.watching.live import view
-    from stand.watching.there import There, event_line
+    from stand.watching.there import There
 
     there = There(server)
     with suppress(KeyboardInterrupt):
@@ -72,7 +73,7 @@ def watch(server: Server) -> None:
         with view() as shown:
             while True:
                 for event in there.events():
-                    shown.tell(event_line(event))
+                    shown.tell(there.line(event))
                 shown.show(there.moment(server.state()))
                 threading.Event().wait(_WATCH_S)
 
@@ -211,7 +212,9 @@ def idle_lines(name: str, state: StandState) -> Iterator[str]:
         yield _row("fault", f"{state.fault.rule}: {state.fault.text}")
     for channel, reading in state.readings.items():
         if reading.unit == "degC":
-            yield _row("temperatures", f"{channel} {'BAD' if reading.value is None else f'{reading.value:.2f} degC'}")
+            known = "BAD" if reading.value is None else f"{reading.value:.2f} degC"
+            is_idle = channel == SET_POINT and state.setpoint_degC is None
+            yield _row("temperatures", f"{channel} {'none' if is_idle else known}")
     waiting = sum(run.state in ("waiting", "interrupted") for run in state.queue)
     yield _row("queue", f"{waiting} to be run" + (f"; halted: {state.queue_halted}" if state.queue_halted else ""))
     if state.disk_free_bytes:  # 0 when nobody records, and it is not known

@@ -21,7 +21,7 @@ from stand.serving.desk import QueuedRun, StandState
 from stand.serving.presence import living
 from stand.watching.live import View, view
 from stand.watching.moment import Moment
-from stand.watching.there import There, event_line
+from stand.watching.there import There
 
 _LOOK_S = 0.5
 _QUEUE_LIMIT_S = 60.0  # the wires of the stand are asked when a run is queued
@@ -92,7 +92,7 @@ class _Follower:
                 state = self._server.state()
                 for event in self._there.events():
                     if event.get("level") in _LEVELS:
-                        shown.tell(event_line(event))
+                        shown.tell(self._there.line(event))
                 moment = self._there.moment(state)
             except SessionError:
                 silent_s += _LOOK_S

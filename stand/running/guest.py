@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from foundation.clock import NS_PER_S, Clock, VirtualClock, boot_of, utc_offset_ns
+from foundation.clock import Clock, VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
 from foundation.errors import StandError, StandTripped
 from foundation.hub import Hub
-from foundation.instants import utc_text
+from foundation.instants import duration, utc_text
 from foundation.items import Event, Item
 from foundation.lane import Lane
 from foundation.tasks import cause_of, failure_text, watched
@@ -231,9 +231,10 @@ class Guest:
 
     def _begin_data(self) -> dict[str, object]:
         """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For
-        counts of what is done: how many steps and frames the plan has. Which packages have made steps of it."""
+        counts of what is done: how many steps and frames the plan has. For who watches: the session. Which packages have made steps of it."""
         plan, boot = plan_hash(self.job.order.recipe.plan()), boot_of(self._assembly.clock)
-        data: dict[str, object] = {**self.log.state.size, "plan": plan, "seed": self.job.seed}
+        size, session = self.log.state.size, self.recorder.directory.name
+        data: dict[str, object] = {**size, "plan": plan, "seed": self.job.seed, "session": session}
         if packages := self.job.order.recipe.packages:
             data["packages"] = packages
         return data if boot is None else {**data, "boot_id": boot.id}
@@ -252,9 +253,9 @@ class Guest:
         if before.state.ended is None:
             ended = f"interrupted: killed after {utc_text(last_utc_ns)}"
             log.tell("error", RUN_END, ended, {"status": Run.INTERRUPTED})
-        gap_s = (now_ns - before.last_ns) / NS_PER_S
-        span = f"from {utc_text(last_utc_ns)} to {utc_text(now_ns + utc_offset_ns(clock))}"
-        log.tell("warning", "gap", f"nothing was recorded and nobody watched the stand {span} ({gap_s:.3f} s)")
+        data: dict[str, object] = {"from_ns": last_utc_ns, "to_ns": now_ns + utc_offset_ns(clock)}
+        lasted = duration(now_ns - before.last_ns)
+        log.tell("warning", "gap", f"until now nothing was recorded and nobody watched the stand, for {lasted}", data)
         if before.state.tripped:
             log.tell("warning", "cleared", f"an operator cleared: {before.state.tripped}")
         version = importlib.metadata.version("thermostand")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from types import MappingProxyType
 
 from experiments.words import mark_in_words
@@ -27,7 +28,7 @@ class Follow:
 
     `show(moment)`: gets how the run stands, from its first step on, without what the hub does not tell (drift, disk).
     `tell(line)`: gets warnings and errors as they come, with what to type then. `done`, `earned_s`: as Eta has them.
-    `tell_all`: events of no importance, too.
+    `tell_all`: events of no importance, too. `directory`: where sessions are.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Follow:
         earned_s: Mapping[str, float] = MappingProxyType({}),
         *,
         tell_all: bool = False,
+        directory: Path = Path(),
     ) -> None:
         self.eta = Eta(night.steps, done, earned_s, night.after_s)
         self._least_ns = seconds_ns(max(_LEAST_S, _SHARE * night.duration_s))
@@ -47,6 +49,7 @@ class Follow:
         frames = sum(step.frames for step in night.steps if step.planned.step_id in done)
         self._moment = Moment(0, title, frames=frames, frames_planned=self.eta.frames)
         self._reasons: set[str] = set()
+        self._directory, self._session = directory, ""
         self._begin_ns: int | None = None
         self._utc = UtcOffsets()  # as it is now
         self._next_ns = 0
@@ -79,6 +82,8 @@ class Follow:
     def _event(self, event: Event) -> None:
         self.eta.event(event)
         self._utc = offsets_of([event]) if event.kind == CLOCK_STEP else self._utc
+        if name := event.data.get("session") if event.kind in ("run.start", "run.resume") else "":
+            self._session = str(self._directory / str(name))
         if event.kind == "to_ambient":
             self._moment = replace(self._moment, doing="back to the laboratory's temperature")
         if event.kind in ("held", "released"):
@@ -88,7 +93,7 @@ class Follow:
             self._next_ns = event.time_ns
         if event.level != "info":
             line = f"{event.level}: {self._utc.local_text(event.time_ns)[11:]} {event.text}"
-            self._tell(f"{line}; {next_command(event.kind, event.data)}")
+            self._tell(f"{line}; {next_command(event.kind, event.data, self._session)}")
         elif self._tells_all:
             self._tell(f"{self._utc.local_text(event.time_ns)[11:]} {event.text}")
 

@@ -65,14 +65,20 @@ def followed(
     is shown by a thread of its own, for which the run never waits. In virtual time no frame is looked at for its drift:
     that would take longer than the run."""
     title = f"{order.recipe.name} on {order.config.name}"
-    with view(is_virtual=is_virtual) as shown, drift_watched(order.target_text) as drift, aside() as later:
+    with (
+        view(is_virtual=is_virtual) as shown,
+        drift_watched(order.target_text, before and before.directory) as drift,
+        aside() as later,
+    ):
 
         def show(moment: Moment) -> None:
             shown.show(replace(moment, disk_free_bytes=free_bytes(directory), drift_px=drift.mean_px))
 
         done, earned_s = ((), {}) if before is None else (before.kept.done, before.kept.earned_s)
-        tell_all = output().verbose
-        follow = Follow(title, night, later(show), later(shown.tell), done, earned_s, tell_all=tell_all)
+        tell_all, sessions = output().verbose, directory if before is None else before.directory.parent
+        follow = Follow(
+            title, night, later(show), later(shown.tell), done, earned_s, tell_all=tell_all, directory=sessions
+        )
 
         def watch(hub: Hub) -> None:
             hub.subscribe(follow)

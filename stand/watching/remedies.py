@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 
 from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
@@ -32,21 +33,22 @@ _OF_KIND = {
     "run_failed": "`stand queue list` shows the queue",
 }
 _BY_ITSELF = "it continues by itself when that is over"
-_TRIPPED = "once the cause is removed, `stand clear` where a daemon has the stand, else `stand resume DIR --clear`"
+_TRIPPED = "once the cause is removed, `stand clear` where a daemon has the stand, else"
 _ELSE = "`stand status` shows how it stands"
 
 
-def next_command(kind: str, data: Mapping[str, object]) -> str:
-    """What helps, or shows more, after a warning or an error of that kind."""
+def next_command(kind: str, data: Mapping[str, object], session: str = "") -> str:
+    """What helps, or shows more, after a warning or an error of that kind. session: the folder of the run's."""
+    folder = shlex.quote(session) if session else "DIR"
     if kind == "held":
         return _OF_REASON.get(str(data.get("reason")), _ELSE)
     if kind.startswith("guard."):
         action = data.get("action")
         if action == "hold":
             return _BY_ITSELF if data.get("ends_itself") else _OF_REASON[INTERLOCK]
-        return _TRIPPED if action == "abort" else _ELSE
+        return f"{_TRIPPED} `stand resume {folder} --clear`" if action == "abort" else _ELSE
     if kind == "run.end":
-        return "`stand resume DIR` continues it" if data.get("status") != "complete" else _ELSE
+        return f"`stand resume {folder}` continues it" if data.get("status") != "complete" else _ELSE
     return _OF_KIND.get(kind, _ELSE)
 
 

@@ -24,7 +24,10 @@ class There:
 
     def __init__(self, server: Server) -> None:
         self.server = server
-        self._seq = server.state().seq
+        self.session = ""  # the folder of the run that is or was under way
+        state = server.state()
+        self._seq = state.seq
+        self._know(state)
 
     def events(self) -> list[EventData]:
         """Since the last look, as the interface gives them."""
@@ -35,7 +38,15 @@ class There:
 
     def moment(self, state: StandState) -> Moment:
         """What is shown of a state."""
+        self._know(state)
         return moment_of(state, None if state.run is None else self._drift_px())
+
+    def line(self, event: EventData) -> str:
+        """An event as it is told, with what to type."""
+        return event_line(event, self.session)
+
+    def _know(self, state: StandState) -> None:
+        self.session = state.run.session if state.run is not None else self.session
 
     def _drift_px(self) -> float | None:
         """Of the last frame that the daemon looked at; None for a run of its own, which looks at none."""
@@ -46,11 +57,11 @@ class There:
         return None
 
 
-def event_line(event: EventData) -> str:
+def event_line(event: EventData, session: str = "") -> str:
     """`2026-01-01 19:00:04 CET  warning: what has happened; what to type`."""
     time_ns, offset_ns = cast("int", event["time_ns"]), cast("int", event["utc_offset_ns"])
     said = f"{local_text(time_ns + offset_ns)}  "
     if event["level"] == "info":
         return f"{said}{event['text']}"
     data = cast("EventData", event.get("data") or {})
-    return f"{said}{event['level']}: {event['text']}; {next_command(str(event['kind']), data)}"
+    return f"{said}{event['level']}: {event['text']}; {next_command(str(event['kind']), data, session)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -117,6 +118,14 @@ def test_each_warning_says_what_to_type(follow: tuple[Follow, list[Moment], list
 )
 def test_messages_name_the_next_command(kind: str, data: dict[str, object], command: str):
     assert command in next_command(kind, data)
+
+
+def test_a_run_that_has_ended_early_is_resumed_by_the_name_of_its_folder(tmp_path: Path):
+    lines: list[str] = []
+    follow = Follow("a night", Night(()), lambda moment: None, lines.append, directory=tmp_path / "all nights")
+    follow(Event(BEGIN_NS, "info", "run.start", "recipe demo", {"session": "20260101T180000Z-demo"}))
+    follow(Event(BEGIN_NS, "error", "run.end", "aborted: stopped by the operator", {"status": "stopped"}))
+    assert f"`stand resume '{tmp_path}/all nights/20260101T180000Z-demo'` continues it" in lines[0]
 
 
 def test_a_terminal_that_is_gone_does_not_end_what_it_follows():

@@ -159,7 +159,7 @@ export class Curves {
     ends.sort((one, other) => one.y - other.y);
     const line = 14 * scale;
     ends.forEach((each, n) => { if (n && each.y < ends[n - 1].y + line) each.y = ends[n - 1].y + line; });
-    for (let n = ends.length - 1, below = Infinity; n >= 0; n -= 1) { ends[n].y = Math.min(ends[n].y, below, top + height); below = ends[n].y - line; }
+    for (let n = ends.length - 1, below = Infinity; n >= 0; n -= 1) { ends[n].y = Math.min(ends[n].y, below, top + height - line / 2); below = ends[n].y - line; }
     context.save();
     context.font = `${12 * scale}px system-ui, sans-serif`;
     context.textAlign = "left";
