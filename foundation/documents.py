@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Hashable
 from contextlib import suppress
 from pathlib import Path
@@ -35,10 +34,11 @@ class _Strict(yaml.constructor.SafeConstructor):
     is a number that YAML 1.1 takes to another base: 0042 is 34 there, and 1:30 is 90."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        twice = next((key for key, count in Counter(keys).items() if count > 1), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"key {twice!r} is given twice", node.start_mark)
+        seen = set[str]()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key.value!r} is given twice", key.start_mark)
+            seen.add(key.value)
         return super().construct_mapping(node, deep)
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
@@ -84,7 +84,8 @@ def parse_document(text: str, model: type[Model], where: str) -> Model:
     """YAML text as `model`; `where` (a file name) begins every message of the ConfigError it may raise."""
     data, root = _read(text, where)
     if not isinstance(data, dict):
-        raise ConfigError(f"{where}: expected keys and values at the top, found {type(data).__name__}")
+        found = "nothing" if data is None else "a list" if isinstance(data, list) else "a value alone"
+        raise ConfigError(f"{where}: begins with keys and values, as in `name: my-stand`; there is {found}")
     try:
         return model.model_validate(data)
     except ValidationError as error:

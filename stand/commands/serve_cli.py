@@ -14,6 +14,7 @@ import typer
 from foundation.clock import WallClock
 from foundation.command_app import App
 from foundation.documents import read_document
+from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.hub import Hub
 from foundation.items import Event, Item
@@ -34,15 +35,20 @@ from stand.watching.aside import aside
 from stand.watching.remedies import next_command
 
 app = App()
+_HERE = "127.0.0.1"
 
 
 @app.command(has_json=False)
 def serve(
     config: Annotated[str, typer.Argument(help="A configuration file, or the name of an installed one.")] = "simulated",
     out: Annotated[Path | None, typer.Option(help="Where the sessions go; else recording.directory.")] = None,
-    port: Annotated[int | None, typer.Option(help="Listen by TCP, too; without it the Unix socket only.")] = None,
-    host: Annotated[str, typer.Option(help="The address to listen at, with --port.")] = "127.0.0.1",
-    secop: Annotated[int | None, typer.Option(help="Serve SECoP on this machine, usually at 10767.")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Listen by TCP, too; without it the Unix socket only.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="The address to listen at, with --port.")] = _HERE,
+    secop: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Serve SECoP on this machine, usually at 10767.")
+    ] = None,
     no_reports: Annotated[bool, typer.Option("--no-reports", help="Report no run when it is complete.")] = False,
 ) -> None:
     """Own the stand until it is told to end: status, devices by hand, and a queue whose runs are its guests.
@@ -52,6 +58,8 @@ def serve(
     Example: stand serve laboratory.yaml --out /data/sessions
     """
     with one_line_errors():
+        if port is None and host != _HERE:
+            raise ConfigError(f"--host {host}: give --port, too; without one nothing listens there")
         path = packaged("", config)
         stand = load_config(path)
         texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}

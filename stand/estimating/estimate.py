@@ -119,7 +119,9 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
                 expected.work,
                 expected.stated_s,
                 in_band_after_s,
-                _warning(step, approach, learned.chamber) or _unknown(expected.work, learned),
+                _warning(step, approach, learned.chamber)
+                or _in_the_dark(step, found)
+                or _unknown(expected.work, learned),
             )
         )
         found, approach = found.after(step), approach.after(step, duration_s)
@@ -158,6 +160,13 @@ def _frames(step: Step, duration_s: float, in_band_after_s: float | None) -> int
     if not isinstance(step, SoakUntilSettled):
         return frames_of(step)
     return max(0, math.ceil((duration_s - (in_band_after_s or 0.0)) / step.look_every_s))
+
+
+def _in_the_dark(step: Step, found: Situation) -> str:
+    """Of a capture of the target through a flap that no step has opened."""
+    if not isinstance(step, Capture) or found.flap_open:
+        return ""
+    return "the flap is closed, so these frames are dark; put open_flap before them, and close_flap after"
 
 
 def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:

@@ -231,7 +231,8 @@ class Guest:
 
     def _begin_data(self) -> dict[str, object]:
         """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For
-        counts of what is done: how many steps and frames the plan has. For who watches: the session. Which packages have made steps of it."""
+        counts of what is done: how many steps and frames the plan has. For who watches: the session. Which packages
+        have made steps of it."""
         plan, boot = plan_hash(self.job.order.recipe.plan()), boot_of(self._assembly.clock)
         size, session = self.log.state.size, self.recorder.directory.name
         data: dict[str, object] = {**size, "plan": plan, "seed": self.job.seed, "session": session}

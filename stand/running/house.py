@@ -12,7 +12,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Protocol, TypeVar
 
 from foundation.clock import VirtualClock
-from foundation.errors import StandError
+from foundation.errors import StandError, Unreachable
 from foundation.tasks import cancelled, watched
 from recording.writing.disk import FILES_LINE, Disk
 from stand.assembly import Assembly
@@ -271,7 +271,13 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
 async def _open(assembly: Assembly) -> None:
     """Connect everything; nothing may heat, cool or move before that."""
     devices, stand = assembly.devices, assembly.stand
-    await assembly.bus.open()
+    try:
+        await assembly.bus.open()
+    except Unreachable as error:
+        if assembly.config.simulation is None:
+            raise
+        remedy = "`stand simulate` starts the simulated laboratory, in another terminal"
+        raise Unreachable(error.device, f"{error.text}; {remedy}") from error
     await devices.relays.open()
     stand.opened(devices.relays)
     await stand.chamber.permits.withdraw_left_on()

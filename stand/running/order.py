@@ -63,7 +63,10 @@ def load_order(recipe: str, config: str) -> Order:
         )
     except ConfigError as error:
         raise ConfigError(f"{paths['config.yaml']}: {error}") from error
-    price(order.recipe.plan(), order.config)
+    try:
+        price(order.recipe.plan(), order.config)
+    except ConfigError as error:
+        raise ConfigError(f"{paths['recipe.yaml']}: {error}") from error
     return order
 
 

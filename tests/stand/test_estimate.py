@@ -125,9 +125,15 @@ def test_a_soak_says_when_the_chamber_arrives(config: StandConfig):
     ],
 )
 def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: StandConfig, dwell_s: float, warning: str):
-    plan = planned(StartChamber(24.0), SetTemperature(52.0), Soak(dwell_s / 2), Soak(dwell_s / 2), CAPTURE, CAPTURE)
+    soak = Soak(dwell_s / 2)
+    plan = planned(OpenFlap(), StartChamber(24.0), SetTemperature(52.0), soak, soak, CAPTURE, CAPTURE)
     warnings = [step.warning for step in price(plan, config, Learned(chamber=CHAMBER))]
-    assert warnings == ["", "", "", "", warning, ""]
+    assert warnings == ["", "", "", "", "", warning, ""]
+
+
+def test_a_capture_through_a_closed_flap_warns(config: StandConfig):
+    *_, capture = price(planned(OpenFlap(), CloseFlap(), CAPTURE), config)
+    assert capture.warning.startswith("the flap is closed, so these frames are dark; put open_flap before them")
 
 
 @pytest.mark.parametrize(
@@ -202,7 +208,7 @@ def test_a_soak_until_settled_is_priced_by_the_chamber_and_the_camera(config: St
     assert steps[2].duration_s == pytest.approx(arrives_s + follows_s + 600.0)
     assert steps[2].frames == math.ceil((follows_s + 600.0) / 120.0)
     assert steps[2].size_bytes > steps[2].frames * 0.4 * 2448 * 2048
-    assert steps[3].warning == ""
+    assert "the dwell" not in steps[3].warning
     assert steps[5].duration_s == 600.0  # nothing has to move: the shortest
     short = price(planned(StartChamber(24.0), SetTemperature(52.0), soak(1200.0), CAPTURE), config)
     assert short[2].duration_s == 1200.0

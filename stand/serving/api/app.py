@@ -85,12 +85,22 @@ def _answer_with(status: int) -> Callable[[Request, Exception], Response]:
 
 def _refused(_: Request, error: Exception) -> Response:
     refused = cast("HTTPException", error)
-    return _error(refused.status_code, str(refused.detail), refused.headers)
+    more = {404: "there is no such address; /openapi.json has those there are", 405: "this is not done at this address"}
+    text = more.get(refused.status_code, str(refused.detail))
+    return _error(refused.status_code, text, refused.headers)
 
 
 def _failed(_: Request, error: Exception) -> Response:
     """What should not happen; the gatekeeper is told as well."""
     return _error(500, f"failed ({type(error).__name__}); the stand's events say more")
+
+
+_SENTENCES = {
+    "extra_forbidden": "there is no such field; /openapi.json has those there are",
+    "model_attributes_type": "send a JSON object, with the header content-type: application/json",
+    "dict_type": "send a JSON object, with the header content-type: application/json",
+    "missing": "is needed",
+}
 
 
 def _invalid(_: Request, error: Exception) -> Response:
@@ -99,7 +109,7 @@ def _invalid(_: Request, error: Exception) -> Response:
     sentences: list[str] = []
     for fault in faults[:5]:
         where = ".".join(str(part) for part in fault["loc"] if part not in ("body", "query", "path", "header"))
-        sentences.append(f"{where or 'the body'}: {fault['msg']}")
+        sentences.append(f"{where or 'the body'}: {_SENTENCES.get(fault['type'], fault['msg'])}")
     return _error(422, "; ".join(sentences) or "the request is not understood")
 
 
