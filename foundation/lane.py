@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
 import asyncio
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
-from threading import Thread
+from threading import Event
 from typing import Any, TypeVar
 
 from foundation.clock import Clock, VirtualClock
@@ -18,6 +19,7 @@ Result = TypeVar("Result")
 # How long a lane's thread that computes (encoding, checksums) may keep the event loop from its turn; Python's own 5 ms
 # would make frames late by as much.
 _SWITCH_S = 0.0005
+_BEGIN_LIMIT_S = 3.0  # for a new thread's first step
 
 
 class Lane:
@@ -98,14 +100,29 @@ class Lane:
         if self._closed:
             raise ValueError(f"the lane {self._name} is closed")
         if self._work is None:
-            self._work = SimpleQueue()
-            # A daemon: an interpreter that ends waits for other threads, and this one may hang in the kernel.
-            Thread(target=_serve, args=(self._work,), name=self._name, daemon=True).start()
+            work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+            begun = Event()
+            # Not a threading.Thread, whose start waits for ever where memory does not suffice for its first steps. An
+            # interpreter that ends does not wait for this one, which may hang in the kernel.
+            try:
+                _thread.start_new_thread(_serve, (work, begun))
+            except RuntimeError as error:
+                raise MemoryError(f"no thread for {self._name}: {error}") from error
+            self._work = work
+            asyncio.get_running_loop().call_later(_BEGIN_LIMIT_S, self._check_begun, begun)
         return self._work
 
+    def _check_begun(self, begun: Event) -> None:
+        """A thread that memory did not suffice for does none of its work."""
+        if not begun.is_set():
+            self._work = None
+            for future in tuple(self._waiting):
+                _failed(future, MemoryError(f"no memory for the thread of {self._name}"))
 
-def _serve(queue: SimpleQueue[Callable[[], None] | None]) -> None:
+
+def _serve(queue: SimpleQueue[Callable[[], None] | None], begun: Event) -> None:
     """The thread: one call after the other, to the end."""
+    begun.set()
     while (work := queue.get()) is not None:
         work()
 

@@ -94,3 +94,23 @@ asyncio.run(main())
 
 def test_a_call_that_never_ends_does_not_keep_the_process_from_its_end():
     assert subprocess.run([sys.executable, "-c", HANGS], timeout=30, check=False).returncode == 0
+
+
+async def test_a_thread_that_memory_does_not_suffice_for_fails_its_calls_and_the_loop_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr("foundation.lane._BEGIN_LIMIT_S", 0.01)
+    monkeypatch.setattr("_thread.start_new_thread", lambda function, args: 0)  # it ends before its first step
+    died = Lane("disk", WallClock())
+    with pytest.raises(MemoryError, match="no memory for the thread of disk"):
+        await died.call(int)
+
+    def refuse(function: object, args: object) -> int:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("_thread.start_new_thread", refuse)
+    with pytest.raises(MemoryError, match="no thread for bus: can't start"):
+        await Lane("bus", WallClock()).call(int)
+    monkeypatch.undo()
+    assert await died.call(int) == 0
+    died.close()

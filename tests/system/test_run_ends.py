@@ -6,14 +6,17 @@ import json
 import os
 import signal
 import socket
+import sys
 import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
+from foundation import lane
 from foundation.errors import DeviceFault, StandTripped
 from foundation.items import Item, StepMark, StepState
 from recording.reading.session import Session
@@ -116,11 +119,21 @@ def held_now() -> Counter[str]:
     gc.collect()
     held = Counter[str](f"task {task.get_name()}" for task in asyncio.all_tasks() - {asyncio.current_task()})
     held.update(f"thread {each.name}" for each in threading.enumerate() if not each.name.startswith("asyncio_"))
+    held.update("thread of a lane" for frame in sys._current_frames().values() if is_of_lane(frame))
     held.update(f"{number!r} {signal.getsignal(number)}" for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     for number in os.listdir("/proc/self/fd"):
         with suppress(FileNotFoundError):  # of this listing itself
             held[f"file {os.readlink(f'/proc/self/fd/{number}').split(':')[0]}"] += 1
     return held
+
+
+def is_of_lane(frame: FrameType | None) -> bool:
+    """Whether the thread that is there now serves a lane; such threads are not the threading module's."""
+    while frame is not None:
+        if frame.f_code is lane._serve.__code__:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def left_since(before: Counter[str]) -> Counter[str]:
