@@ -33,7 +33,7 @@ class Keeper:
     clock: Clock
     renew_s: float
     coils_read: Callable[[Mapping[str, bool]], None]
-    _told: str = ""  # why the permits were not renewed
+    _kept_by: tuple[type[DeviceError], str] | None = None  # the kind of error, and the device, of the last renewal
 
     async def run(self) -> None:
         """Keep until cancelled. What keeps it from that is an event when it begins, and when it is another."""
@@ -41,10 +41,11 @@ class Keeper:
         while True:
             try:
                 await self.beat()
-                self._told = ""
+                self._kept_by = None
             except DeviceError as error:
-                if self._told != str(error):
-                    self._told = str(error)
+                kept_by = type(error), error.device
+                if self._kept_by != kept_by:
+                    self._kept_by = kept_by
                     self._tell("permit_not_renewed", f"heating and cooling permits not renewed: {error}")
             period_s = self.renew_s if self.permits.granted else min(self.renew_s, _SUPERVISED_S)
             due_ns = max(due_ns + seconds_ns(period_s), self.clock.now_ns())
