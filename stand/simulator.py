@@ -49,14 +49,38 @@ def laboratory_of(
         "chamber_seed": simulation.chamber_seed,
         "faults": list(simulation.faults),
         "bus": address_of(config.bus.address),
-        "regulator_unit": config.regulator_unit.unit if config.regulator_unit is not None else None,
         "chamber": _chamber_of(config, address_of),
+        **_bus_of(config),
+        **_lines_of(config, address_of),
+        "cameras": {
+            name: {
+                "address": None if is_anywhere else camera.address,
+                "serial_number": camera.serial_number,
+                **_dress_of(simulation.cameras.get(name, SimulatedCamera())),
+            }
+            for name, camera in config.cameras.items()
+        },
+        "imager": _imager_of(config, is_anywhere=is_anywhere),
+        "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
+    }
+
+
+def _bus_of(config: StandConfig) -> dict[str, object]:
+    """What answers on the Modbus line, by unit."""
+    return {
+        "regulator_unit": config.regulator_unit.unit if config.regulator_unit is not None else None,
         "relays_unit": config.relays.unit if config.relays is not None else None,
         "relay_channels": dict(config.relays.channels) if config.relays is not None else {},
         **_inputs_of(config),
         "thermometers_units": list(config.thermometer_module.units),
         "thermometers_model": _model_of(config.thermometer_module),
         "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.items()},
+    }
+
+
+def _lines_of(config: StandConfig, address_of: Callable[[str | None], str | None]) -> dict[str, object]:
+    """What has a line of its own: stages, instruments, the flap's motor."""
+    return {
         "axes": {
             name: {
                 "address": address_of(axis.address),
@@ -75,16 +99,6 @@ def laboratory_of(
         },
         "flap": config.flap
         and {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
-        "cameras": {
-            name: {
-                "address": None if is_anywhere else camera.address,
-                "serial_number": camera.serial_number,
-                **_dress_of(simulation.cameras.get(name, SimulatedCamera())),
-            }
-            for name, camera in config.cameras.items()
-        },
-        "imager": _imager_of(config, is_anywhere=is_anywhere),
-        "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
     }
 
 

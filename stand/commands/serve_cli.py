@@ -23,7 +23,7 @@ from foundation.usage import one_line
 from stand.commands.checked_cli import warn_unchecked
 from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.interface import load_tokens
-from stand.config.stand_config import load_config, packaged
+from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.daemon.desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
 from stand.serving.api.bridge import Bridge
@@ -62,11 +62,7 @@ def serve(
             raise ConfigError(f"--host {host}: give --port, too; without one nothing listens there")
         path = packaged("", config)
         stand = load_config(path)
-        texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
-        record = load_checked(path)
-        if record is not None:
-            texts[ATTACHMENT] = record.text
-        warn_unchecked(path, stand, record)
+        texts = _attachments(path, stand)
         directory = (out or stand.recording.directory).absolute()
         tokens, hosts = load_tokens(stand.interface.secrets), stand.interface.hosts
         secop_port = stand.interface.secop_port if secop is None else secop
@@ -96,6 +92,14 @@ def serve(
                         hub.unsubscribe(follow)
 
         asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))
+
+
+def _attachments(path: Path, stand: StandConfig) -> dict[str, str]:
+    """What each session of this stand keeps, by the attachment's name; a stand that was not checked since is told."""
+    texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
+    record = load_checked(path)
+    warn_unchecked(path, stand, record)
+    return texts if record is None else texts | {ATTACHMENT: record.text}
 
 
 def _page(viewing: Viewing) -> Callable[[Bridge], Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack
+from functools import partial
 
 from drivers.devices.protocols import Actuator
 from drivers.settings import Identity
@@ -92,15 +93,7 @@ async def _looks(assembly: Assembly, add: Callable[[Finding], None], *, has_move
     await look(links.flap, devices.flap, moves and moves.flap)
     yield
     for name, axis in devices.axes.items():
-
-        async def link(name: str = name) -> None:
-            await links.axis(name)
-
-        async def move(name: str = name) -> None:
-            if moves is not None:
-                await moves.axis(name)
-
-        await look(link, axis, move)
+        await look(partial(links.axis, name), axis, moves and partial(moves.axis, name))
         yield
     for name in devices.cameras:
         await links.camera(name, is_switched_on_later=has_moves)

@@ -101,7 +101,8 @@ class ProbeBench:
 
 @pytest.fixture(params=[("hart", True), ("vaisala", False)], ids=["hart", "vaisala"])
 async def probe(request: pytest.FixtureRequest, tmp_path: Path) -> AsyncIterator[ProbeBench]:
-    bench = ProbeBench(*request.param[:1], tmp_path, request.param[1])
+    kind, is_checked = request.param
+    bench = ProbeBench(kind, tmp_path, is_checked)
     yield bench
     await bench.driver.close()
     bench.wire.close()
