@@ -6,18 +6,24 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
 
-from foundation.clock import NS_PER_S
+from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import StandTripped
 from foundation.hub import Hub
 from foundation.items import Event
 from recording.reading.session import Session
+from stand.config.stand_config import packaged
+from stand.daemon.daemon import Daemon
+from stand.daemon.desk import DaemonDesk
+from stand.daemon.serve import serve
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
+from stand.serving.desk import RunRequest, Who
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, check_safe
 from tests.system.test_run import at_step, fault
@@ -121,6 +127,41 @@ async def test_without_an_operator_the_wait_ends_at_its_limit(tmp_path: Path, or
     last_ns = max(item.time_ns for item in session.items())
     assert 130 <= (last_ns - trip.time_ns) / NS_PER_S < 160
     assert len(cut.said()) >= 2
+
+
+async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_second_signal_ends_it(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object], monkeypatch: pytest.MonkeyPatch
+):
+    """A minute, here a tenth of a second."""
+    ordered = order(SOAK, **FAST | {"bus": QUICK})
+    await asyncio.to_thread(simulator, ordered.config, False)
+    monkeypatch.setattr("stand.safety._GIVEN_UP_AFTER_S", 0.1)
+    text = (tmp_path / "config.yaml").read_text()
+    texts = {"config.yaml": text, "target.yaml": packaged("targets", ordered.config.target).read_text()}
+    watcher = Watcher()
+
+    async def broken(daemon: Daemon, desk: DaemonDesk) -> None:
+        await desk.submit(Who(name="a test", how="terminal"), RunRequest(recipe_text=SOAK))
+        await heater_is(ordered, 1)
+        await fault(ordered, "bus.unplugged", True)
+        daemon.leave()
+        await asyncio.sleep(2.5)  # what waits for the run looks each second
+        tries = daemon.has_guest
+        await fault(ordered, "bus.unplugged", False)
+        assert tries
+
+    @asynccontextmanager
+    async def front(desk: DaemonDesk, hub: Hub, _: WallClock) -> AsyncGenerator[None]:
+        hub.subscribe(watcher)
+        breaking = asyncio.create_task(broken(getattr(desk, "_daemon"), desk))  # noqa: B009 - what only a test may ask for
+        yield
+        await breaking
+
+    async with asyncio.timeout(LIMIT_S):
+        await serve(ordered.config, "a stand", texts, tmp_path / "out", front)  # StandTripped when it is not safe
+    kinds = [event.kind for event in watcher.events]
+    assert kinds.index("not_confirmed_safe") < kinds.index("confirmed_safe")
+    assert await plant(ordered, "heater_enabled") == 0
 
 
 @pytest.mark.nightly
