@@ -88,7 +88,10 @@ async def test_a_temperature_that_goes_holds_the_run_until_it_is_back(tmp_path: 
     directory = await run_virtual(ordered, tmp_path / "out", None, watch)
     await asyncio.gather(*tasks)
     (held,) = [event for event in events if event.kind == "guard.camera_temperature_bad"]
-    assert (held.level, held.data) == ("error", {"rule": "camera_temperature_bad", "action": "hold"})
+    assert (held.level, held.data) == (
+        "error",
+        {"rule": "camera_temperature_bad", "action": "hold", "ends_itself": True},
+    )
     assert held.text == "camera.temperature is BAD: the camera shows exactly 0 degC, for 60 s"
     (over,) = [event for event in events if event.kind == "hold_ended"]
     assert over.data["rule"] == "camera_temperature_bad"

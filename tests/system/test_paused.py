@@ -60,7 +60,7 @@ async def test_a_pause_that_lasts_too_long_is_made_safe_and_held(tmp_path: Path,
         await asyncio.to_thread(ask, directory, "pause")
         await watcher.event("held", 60)
         trip = await watcher.event("guard.paused_too_long", 960)
-        assert trip.data == {"rule": "paused_too_long", "action": "hold"}
+        assert trip.data == {"rule": "paused_too_long", "action": "hold", "ends_itself": False}
         await watcher.wait(60)
         reasons.append((await asyncio.to_thread(ask, directory, "continue"))["reasons"])
         reasons.append((await asyncio.to_thread(ask, directory, "clear"))["reasons"])
