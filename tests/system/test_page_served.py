@@ -71,7 +71,7 @@ async def test_a_night_is_begun_watched_paused_and_stopped_in_a_browser(served_p
         await page.locator(".frame + .facts", has_text="markers found").wait_for()
         await page.get_by_text(", reference").wait_for()
         await page.goto(f"http://127.0.0.1:{port}/#plan")
-        await page.locator(".steps li[data-standing='under_way']", has_text="earned").wait_for()
+        await page.locator(".steps li[data-standing='under_way']", has_text="soak").wait_for()
         await page.get_by_role("button", name="Pause now").click()
         await page.locator("#phase", has_text="Held").wait_for()
         await until(served, lambda state: state.reasons == ("operator",))
