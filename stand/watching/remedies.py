@@ -40,7 +40,7 @@ _ELSE = "`stand status` shows how it stands"
 def next_command(kind: str, data: Mapping[str, object], session: str = "") -> str:
     """What helps, or shows more, after a warning or an error of that kind. session: the folder of the run's."""
     folder = shlex.quote(session) if session else "DIR"
-    if kind == "held":
+    if kind == "held" and data.get("reason") != INTERLOCK:  # what the guard says of its rule tells how that ends
         return _OF_REASON.get(str(data.get("reason")), _ELSE)
     if kind.startswith("guard."):
         action = data.get("action")

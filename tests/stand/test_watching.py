@@ -106,7 +106,7 @@ def test_each_warning_says_what_to_type(follow: tuple[Follow, list[Moment], list
 @pytest.mark.parametrize(
     ("kind", "data", "command"),
     [
-        ("held", {"reason": "interlock"}, "`stand clear`"),
+        ("held", {"reason": "interlock"}, "`stand status`"),  # some rules end by themselves
         ("guard.stuck", {"action": "hold"}, "`stand clear`"),
         ("guard.stuck", {"action": "abort"}, "`stand resume DIR --clear`"),
         ("guard.stuck", {"action": "abort"}, "`stand clear` where a daemon has the stand"),
