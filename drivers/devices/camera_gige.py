@@ -80,12 +80,16 @@ class Camera:
         self._heard_ns = self._clock.now_ns()
 
     async def close(self) -> None:
-        """Stop and let go of the camera; never raises, up to 7.5 s when it is dead."""
-        if self._lane is not None:
-            await self._lane.call(self._disconnect)
-            self._lane.close()
-            self._lane = None
-            self._heard_ns = None
+        """Stop and let go of the camera; never raises, up to 7.5 s when it is dead, 2.5 s when it is known to be. May
+        be called while another call is under way, and twice."""
+        lane = self._lane
+        if lane is None:
+            return
+        self._lost = self._lost or "closed"
+        await lane.call(self._disconnect)
+        lane.close()
+        if self._lane is lane:
+            self._lane = self._heard_ns = None
 
     async def start(self) -> None:
         """Start acquisition, always on a new stream."""

@@ -113,9 +113,9 @@ class CameraSupply:
             self._gate.clear(CAMERA_LOST)
 
     async def make_safe(self) -> None:
-        """Off, confirmed."""
+        """Off, confirmed; the cameras are let go meanwhile, since Aravis waits for seconds for one that is off."""
         self.is_on = False
-        await self._relays.switch(CAMERA_POWER, on=False)
+        await self._cameras.close(self._relays.switch(CAMERA_POWER, on=False))
 
     def compare(self, coils: Mapping[str, bool]) -> None:
         """What the relays read, by channel: a supply that is off though it was switched on has lost the camera's

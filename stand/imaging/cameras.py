@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Coroutine, Iterable, Mapping
 
 from drivers.devices.protocols import Camera
 from drivers.settings import identity_event
@@ -44,10 +44,10 @@ class Cameras:
         for camera in self._cameras:
             await camera.open()
 
-    async def close(self) -> None:
-        """Close every camera; never raises."""
-        for camera in self._cameras:
-            await camera.close()
+    async def close(self, *meanwhile: Coroutine[None, None, None]) -> None:
+        """Close every camera, all at once: a dead one takes seconds. Never raises by itself, only what is done
+        `meanwhile` does."""
+        await asyncio.gather(*(camera.close() for camera in self._cameras), *meanwhile)
 
     async def grab(self, exposure_s: float, due_ns: int = 0, names: Collection[str] = ()) -> tuple[Frame, ...]:
         """One frame of each, or of those named, the first at `due_ns` when that is still ahead, the others a little

@@ -302,14 +302,11 @@ async def close_devices(assembly: Assembly) -> None:
     """Let go of every wire; actuators stay as they are."""
     devices = assembly.devices
     imagers = (devices.imager,) if devices.imager is not None else ()
-    for device in (
-        *devices.cameras.values(),
-        *devices.axes.values(),
-        *devices.probes.values(),
-        *imagers,
-        devices.flap,
-        devices.regulator,
-    ):
-        with suppress(StandError):  # closing never decides a run, and one device must not keep the next from it
-            await device.close()
+    others = (*devices.axes.values(), *devices.probes.values(), *imagers, devices.flap, devices.regulator)
+    await asyncio.gather(*(_let_go(device.close()) for device in (*devices.cameras.values(), *others)))
     await assembly.bus.close()
+
+
+async def _let_go(closing: Coroutine[None, None, None]) -> None:
+    with suppress(StandError):  # closing never decides a run, and one device must not keep the others from it
+        await closing

@@ -67,7 +67,7 @@ async def main(directory):
         finally:
             recording.cancel()
             await asyncio.wait([recording])
-            await recorder.finish(FINISH_WITHIN_S)
+            await recorder.finish(FINISH_WITHIN_S / 4)
     finally:
         disk.close()
 

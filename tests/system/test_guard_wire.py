@@ -279,7 +279,9 @@ async def test_a_relay_board_that_stays_silent_holds_the_stand(order: Callable[.
     ordered = order(bus={"timeout_s": 0.05}, relays={"poll_s": 5.0}, guard={"keys_s": 10.0})
     async with bench_of(ordered, simulator) as bench:
         await bench.start(26, 60)
-        await bench.fault("relays.silent_s", 40)
+        await bench.fault("relays.silent_s", 22)
+        await bench.wait(19)
+        assert (bench.trips, await bench.plant("heater_enabled")) == ([], 0)
         trip = await bench.tripped(60)
         assert (trip.rule, trip.action) == ("sensor_bad", "hold")
         assert trip.text.startswith("relays.heater_enable is BAD")
