@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
+import pytest
 from hypothesis import Phase as HPhase
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -303,7 +304,16 @@ class RunMachine(RuleBasedStateMachine):
             assert not self.life.cancelled_before_safe
 
 
+def runs_of(examples: int, *, derandomize: bool) -> settings:
+    return settings(
+        max_examples=examples, stateful_step_count=25, deadline=None, derandomize=derandomize, phases=[HPhase.generate]
+    )
+
+
 TestRunMachine = RunMachine.TestCase
-TestRunMachine.settings = settings(
-    max_examples=400, stateful_step_count=25, deadline=None, derandomize=True, phases=[HPhase.generate]
-)
+TestRunMachine.settings = runs_of(150, derandomize=True)
+
+
+@pytest.mark.nightly
+class TestRunMachineByNight(RunMachine.TestCase):
+    settings = runs_of(4000, derandomize=False)
