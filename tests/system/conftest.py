@@ -20,7 +20,7 @@ from tests.sections import change
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.
-_CORNER: dict[str, object] = {"width_px": 612, "height_px": 256}
+CORNER: dict[str, object] = {"width_px": 612, "height_px": 256}
 # For runs in real time: what happens each second or in seconds on a stand happens several times a second.
 FAST: dict[str, dict[str, object]] = {
     "regulator": {"poll_s": 0.25},
@@ -64,7 +64,7 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
     Frames show the upper left corner of the sensor; whoever needs the target says `camera=WHOLE_SENSOR`. By night all
     have the whole sensor.
     """
-    frame = _CORNER if request.node.get_closest_marker("nightly") is None else WHOLE_SENSOR
+    frame = CORNER if request.node.get_closest_marker("nightly") is None else WHOLE_SENSOR
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
         data: Any = yaml_data(packaged("", "simulated").read_text(), "simulated")

@@ -14,6 +14,7 @@ import pytest
 from foundation.errors import SessionError
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
+from recording.writing import locks
 from recording.writing.disk import LEFT_NAME
 from stand.running.entries import Ended, read_lines
 from stand.running.journal import Journal
@@ -119,7 +120,8 @@ def test_after_kill_9_the_disk_process_is_gone_at_once_and_the_session_can_be_op
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_daemon_whose_disk_hangs_leaves_and_its_disk_process_ends_with_the_hang(tmp_path, number):
+def test_a_daemon_whose_disk_hangs_leaves_and_its_disk_process_ends_with_the_hang(tmp_path, monkeypatch, number):
+    monkeypatch.setattr(locks, "_LEFT_WITHIN_S", 0.2)
     with ext4(tmp_path / "disk", 64 << 20) as disk, Daemon(disk / "s") as daemon:
         daemon.until(lambda frames, messages, age_s, lost: frames >= 10)
         with frozen(disk):

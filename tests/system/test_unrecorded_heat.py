@@ -1,11 +1,9 @@
 """Heat only while it is recorded: in real time, on a disk that hangs, and in a folder that is taken away."""
 
 import asyncio
-import json
 import os
 import shutil
 import signal
-import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -21,6 +19,7 @@ from recording.writing.disk import MODULE
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_real
+from stand.serving.client import ask, ask_status
 from stand.simulator import ControlSocket
 from tests.recording.disks import ext4
 from tests.system.conftest import FAST, require_aravis
@@ -180,27 +179,17 @@ async def test_a_folder_that_is_taken_away_holds_the_run_until_an_operator_clear
             directory.rename(tmp_path / "elsewhere")
         await happens(watcher, "guard.folder_lost")
         await heater_is(ordered, 0)
-        answer = await stand_command("status", "--json", str(directory))
-        assert json.loads(answer)["state"] == "held"
-        await stand_command("clear", str(directory))
+        assert (await asyncio.to_thread(ask_status, directory)).state == "held"
+        await asyncio.to_thread(ask, directory, "clear")
         await happens(watcher, "restored")
         await heater_is(ordered, 1)
-        await stand_command("stop", str(directory))
+        await asyncio.to_thread(ask, directory, "stop")
         with pytest.raises(StandError, match="stopped by the operator"):
             await asyncio.wait_for(task, LIMIT_S)
     session = Session.open(directory)
     assert "recording_lost" in {event.kind for event in session.events()}
     numbers = [path.name for path in (directory / "telemetry").iterdir()]
     assert "0000.mcap" not in numbers
-
-
-async def stand_command(*arguments: str) -> str:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "stand.cli", *arguments, stdout=asyncio.subprocess.PIPE
-    )
-    out, _ = await asyncio.wait_for(process.communicate(), LIMIT_S)
-    assert process.returncode == 0
-    return out.decode()
 
 
 @pytest.mark.nightly
