@@ -77,7 +77,7 @@ async def test_somebody_is_told_of_a_step_that_fails(tmp_path: Path, order: Call
 async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_complete_run(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    told, ordered = tmp_path / "told", order(SHORTER, bus={"timeout_s": 0.05}, guard={"safe_limit_s": 5})
+    told, ordered = tmp_path / "told", order(SHORTER, bus={"timeout_s": 0.05}, guard={"safe_limit_s": 2})
     last = list(ordered.recipe.plan())[-1].step_id
 
     def follow(item: Item) -> None:
