@@ -55,7 +55,7 @@ def first_heat(limits: FirstHeatConfig, air: str, regulator: str, permit: str) -
         if state.sum_percent / state.count < limits.output_percent:
             return None, None  # too little heat to judge
         rises = " and ".join(
-            f"{name} by {risen_K:.1f} K" for name, risen_K in zip((pv, air), state.risen_K, strict=True)
+            f"{name} rose by {risen_K:.1f} K" for name, risen_K in zip((pv, air), state.risen_K, strict=True)
         )
         text = f"in the first {limits.within_s:g} s of heat {rises}; both should rise by {limits.rise_K:g} K"
         return None, Fault("first_heat", f"{text}: is this regulator the one of this chamber?")
