@@ -14,7 +14,7 @@ from foundation.items import Event
 from foundation.readings import Frame
 from stand.config.stand_config import LEADING
 from stand.gate import CAMERA_LOST, Gate
-from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
+from stand.imaging.camera_opening import LONGEST_RETRY_S, LOST_LIMIT_S, RETRY_S
 from stand.imaging.camera_supply import CameraSupply
 from stand.imaging.cameras import Cameras
 from stand.interlock import Interlock, Motions
@@ -70,7 +70,7 @@ class Imaging:
         try:
             self._publish(await self._cameras.grab(exposure_s, due_ns, cameras), step_id)
         except Unreachable as error:
-            await self._regain(error)
+            await self._regain(error, exposure_s, cameras)
             return False
         return True
 
@@ -84,7 +84,7 @@ class Imaging:
             lost = error
         finally:
             await self.close_flap()
-        await self._regain(lost)
+        await self._regain(lost, exposure_s)
         return None
 
     def _publish(self, frames: Iterable[Frame], step_id: str) -> dict[str, Frame]:
@@ -96,23 +96,43 @@ class Imaging:
             self._hub.publish(published[frame.channel])
         return published
 
-    async def _regain(self, lost: Unreachable) -> None:
-        """Hold the gate until the camera, lost for that reason, is open again, or is found to be without supply; `lost`
-        when there was no frame for 30 min of such waiting."""
+    async def _regain(self, lost: Unreachable, exposure_s: float, cameras: Collection[str] = ()) -> None:
+        """Hold the gate until the camera, lost for that reason, is open again, or is found to be without supply; the
+        second time in a row until it gives a frame, too. `lost` when there was no frame for 30 min of such waiting."""
         begin_ns, limit_ns = self._clock.now_ns(), seconds_ns(LOST_LIMIT_S)
         if self._without_camera_ns >= limit_ns:
             raise lost
         self._hub.publish(Event(begin_ns, "warning", "camera_lost", str(lost)))
         self._gate.hold(CAMERA_LOST)
         deadline_ns = begin_ns + limit_ns - self._without_camera_ns
-        supply = self.supply
         try:
-            is_open = await supply.opening.until_open(
-                self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on
-            )
+            if self._without_camera_ns:
+                is_back = await self._until_frame(exposure_s, cameras, deadline_ns)
+            else:
+                is_back = await self._until_open(deadline_ns)
         finally:
             self._gate.clear(CAMERA_LOST)
-            # One that opens at once and never gives a frame is given up in the end, too.
             self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
-        if is_open:
+        if is_back:
             self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
+
+    async def _until_open(self, deadline_ns: int) -> bool:
+        """False when the camera is without supply."""
+        supply = self.supply
+        return await supply.opening.until_open(self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on)
+
+    async def _until_frame(self, exposure_s: float, cameras: Collection[str], deadline_ns: int) -> bool:
+        """As `_until_open`, of a camera that opened and gave no frame: until it gives one, which is not kept. The gate
+        stays held meanwhile, or a hold would begin with each try, and the flap would never be shut in it."""
+        retry_s = RETRY_S
+        while await self._until_open(deadline_ns):
+            try:
+                await self._cameras.grab(exposure_s, 0, cameras)
+            except Unreachable:
+                if self._clock.now_ns() >= deadline_ns:
+                    raise
+            else:
+                return True
+            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(retry_s))
+            retry_s = min(2 * retry_s, LONGEST_RETRY_S)
+        return False
