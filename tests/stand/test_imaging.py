@@ -5,7 +5,9 @@ import asyncio
 import pytest
 
 from drivers.devices.relays import CAMERA_POWER
+from foundation.clock import NS_PER_S
 from foundation.errors import StandTripped, Unreachable
+from foundation.readings import Frame
 from stand.fault import Fault
 from stand.gate import CAMERA_LOST, INTERLOCK
 from stand.imaging.camera_opening import LOST_LIMIT_S
@@ -44,15 +46,23 @@ async def test_a_lost_camera_holds_the_gate_until_it_is_open_and_gives_no_frame(
         assert (here.frames, here.kinds) == ([], ["camera_lost", "camera_back"])
 
 
-async def test_a_camera_that_opens_and_never_gives_a_frame_ends_the_run_after_half_an_hour_of_waiting():
+async def test_a_camera_that_opens_and_never_gives_a_frame_ends_the_run_after_half_an_hour_of_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """In one hold of the gate, not in one for each try."""
+
+    async def gives_none(*_: object) -> Frame:
+        raise lost()
+
     async with rooms() as here:
         await with_camera(here)
-        for _ in range(round(LOST_LIMIT_S)):
-            here.camera.failures.append(lost())
-            assert not await here.stand.imaging.take_frame(0.01, "capture-1")
-        here.camera.failures.append(lost())
+        monkeypatch.setattr(here.camera, "grab", gives_none)
+        assert not await here.stand.imaging.take_frame(0.01, "capture-1")
+        begin_ns = here.clock.now_ns()
         with pytest.raises(Unreachable):
             await here.stand.imaging.take_frame(0.01, "capture-1")
+        assert (here.clock.now_ns() - begin_ns) / NS_PER_S == pytest.approx(LOST_LIMIT_S, abs=15)
+        assert here.kinds == ["camera_lost", "camera_back", "camera_lost"]
 
 
 async def test_a_look_opens_the_flap_for_its_frame_only_also_when_the_camera_is_lost():
