@@ -17,7 +17,7 @@ from stand.queueing.queue_file import Entry, State, working
 from stand.running.stop import Interrupted
 
 MOST_FRUITLESS_STARTS = 3
-_NOTED_WITHIN_S = 3.0  # real seconds that a disk may take for the note of a run's end; it is written later, then
+_NOTED_WITHIN_S = 1.0  # real seconds that a disk may take for the note of a run's end; it is written later, then
 
 
 @dataclass(frozen=True, slots=True)
