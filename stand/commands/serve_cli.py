@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, Callable, Generator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -78,18 +78,8 @@ def serve(
                 where = f"; http://{host}:{port}/" if port is not None else ""
                 where += f"; SECoP at {secop_port}" if secop_port is not None else ""
                 say(f"{stand.name} is open; sessions go to {directory}{where}")
-                with aside() as later:
-                    wanted, tell = output(), later(_tell)
-
-                    def follow(item: Item) -> None:
-                        if isinstance(item, Event) and _is_told(item, wanted):
-                            tell(_line(item))
-
-                    hub.subscribe(follow)
-                    try:
-                        yield
-                    finally:
-                        hub.unsubscribe(follow)
+                with _events_shown(hub):
+                    yield
 
         asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))
 
@@ -100,6 +90,23 @@ def _attachments(path: Path, stand: StandConfig) -> dict[str, str]:
     record = load_checked(path)
     warn_unchecked(path, stand, record)
     return texts if record is None else texts | {ATTACHMENT: record.text}
+
+
+@contextmanager
+def _events_shown(hub: Hub) -> Generator[None]:
+    """A terminal that is slow, or stopped, delays nothing."""
+    with aside() as later:
+        wanted, tell = output(), later(_tell)
+
+        def follow(item: Item) -> None:
+            if isinstance(item, Event) and _is_told(item, wanted):
+                tell(_line(item))
+
+        hub.subscribe(follow)
+        try:
+            yield
+        finally:
+            hub.unsubscribe(follow)
 
 
 def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
