@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from foundation.clock import seconds_ns
-from foundation.errors import ConfigError, DeviceFault, Occupied, StandTripped, Unreachable
+from foundation.errors import ConfigError, DeviceFault, GarbledReply, Occupied, StandTripped, Unreachable
 from foundation.tasks import cancelled
 from stand.chamber.permits import HEATER
 from stand.fault import Fault
@@ -121,7 +121,11 @@ async def test_permits_that_are_not_renewed_are_told_once_for_each_reason():
     async with rooms() as here:
         keeper, clock = here.stand.chamber.keeper, here.clock
         here.stand.chamber.permits.grant()
-        here.relays.failures = [Unreachable("relays", why) for why in ("gone", "gone", "another")]
+        here.relays.failures = [
+            Unreachable("relays", "gone"),
+            Unreachable("relays", "gone"),
+            GarbledReply("relays", "x"),
+        ]
         keeping = asyncio.create_task(keeper.run())
         await clock.sleep_until(clock.now_ns() + seconds_ns(10 * keeper.renew_s))
         await cancelled([keeping])
