@@ -179,8 +179,8 @@ async def test_a_process_that_ends_is_a_warning_and_the_curves_go_on(own_night):
 async def test_frames_are_skipped_and_never_queued(own_night):
     """A hundred at once: the newest is what is looked at."""
     time_ns = own_night.clock.now_ns()
-    for index in range(100):
-        own_night.hub.publish(frame_of(target_image(0, 0, (612, 512)), time_ns + index))
+    for frame in [frame_of(target_image(0, 0, (612, 512)), time_ns + index) for index in range(100)]:
+        own_night.hub.publish(frame)
     async with asyncio.timeout(120):
         while (answer := await ask(own_night, "/api/v1/frame"))[0] == 204:
             await asyncio.sleep(0.2)

@@ -136,6 +136,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
     ordered = order(SOAK, **FAST | {"bus": QUICK})
     await asyncio.to_thread(simulator, ordered.config, False)
     monkeypatch.setattr("stand.safety._GIVEN_UP_AFTER_S", 0.1)
+    monkeypatch.setattr("stand.daemon.daemon._LOOK_S", 0.2)
     text = (tmp_path / "config.yaml").read_text()
     texts = {"config.yaml": text, "target.yaml": packaged("targets", ordered.config.target).read_text()}
     watcher = Watcher()
@@ -145,7 +146,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
         await heater_is(ordered, 1)
         await fault(ordered, "bus.unplugged", True)
         daemon.leave()
-        await asyncio.sleep(2.5)  # what waits for the run looks each second
+        await asyncio.sleep(0.8)  # what waits for the run has looked four times
         tries = daemon.has_guest
         await fault(ordered, "bus.unplugged", False)
         assert tries
