@@ -7,6 +7,7 @@ between. Wire time is real time; what a reply says comes from the plant at the s
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
 import shutil
@@ -16,7 +17,7 @@ import threading
 import tty
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 from drivers.sim.faults import LinkFaults
 
@@ -45,7 +46,8 @@ class Lines:
 class PtyWire:
     """A serial port: `path` becomes a symlink to a fresh pseudo-terminal in raw mode; replug by making a new one.
 
-    Without a path it has one in a folder of its own. `address` is where.
+    Without a path it has one in a folder of its own. `address` is where. OSError when another simulator answers at
+    `path`, or something stands there that is no simulator's.
     """
 
     def __init__(self, path: Path | None, engine: Engine, faults: LinkFaults) -> None:
@@ -55,6 +57,8 @@ class PtyWire:
         self._faults = faults
         self._is_plugged = False
         self.address = f"serial:{self._path}"
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = _held(self._path)
         self.plug()
 
     def plug(self) -> None:
@@ -64,7 +68,6 @@ class PtyWire:
         self._master, self._slave = os.openpty()  # the slave stays open, or reads fail while no driver is connected
         tty.setraw(self._slave)
         terminal = os.ttyname(self._slave)
-        self._path.parent.mkdir(parents=True, exist_ok=True)
         self._path.unlink(missing_ok=True)
         self._path.symlink_to(terminal)
         self._stop_read, self._stop_write = os.pipe()
@@ -87,6 +90,7 @@ class PtyWire:
     def close(self) -> None:
         """Unplug for good; may be called twice."""
         self.unplug()
+        self._lock.close()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -102,6 +106,20 @@ class PtyWire:
         for descriptor in (self._master, self._slave, self._stop_read, self._stop_write):
             with contextlib.suppress(OSError):
                 os.close(descriptor)
+
+
+def _held(path: Path) -> BinaryIO:
+    """The lock of a path, which ends with the process: a link that a killed simulator has left is taken over, that of a
+    living one is not."""
+    if path.exists() and not path.is_symlink():
+        raise OSError(f"{path} exists, and is no line of a simulator")
+    lock = path.with_name(f".{path.name}.lock").open("wb")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        lock.close()
+        raise OSError(f"another simulator answers at serial:{path}") from error
+    return lock
 
 
 class TcpWire:

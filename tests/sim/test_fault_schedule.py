@@ -121,3 +121,11 @@ def test_an_unplugged_port_is_another_one_when_it_is_back(laboratory: Laboratory
 def test_the_simulator_lists_its_faults():
     listed = subprocess.run([sys.executable, "-m", "drivers.sim", "--faults"], capture_output=True, check=True).stdout
     assert [row["name"] for row in json.loads(listed)] == sorted(FAULTS)
+
+
+def test_a_second_laboratory_on_the_same_serial_lines_is_refused_with_a_sentence(laboratory: Laboratory):
+    text = laboratory.spec.model_dump_json()
+    spec = parse_document(text, LaboratorySpec, "laboratory")
+    spec = spec.model_copy(update={"cameras": {}})  # the other addresses are free ones
+    with pytest.raises(ConfigError, match=r"is one running already\? \(another simulator answers at serial:.*linear\)"):
+        Laboratory(spec)
