@@ -58,9 +58,56 @@ _UNITS: Mapping[str, Mapping[str, float]] = {  # by the end of a key: what may b
 _WITH_UNIT = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:e[-+]?\d+)?)\s*([a-zA-Z°%]*)\s*")
 
 
+class _Written:
+    """A document as its YAML has it. A mapping's keys are listed once, however many of them are looked up."""
+
+    def __init__(self, root: yaml.Node | None) -> None:
+        self._root = root
+        self._keys: dict[int, dict[str, tuple[yaml.Node, yaml.Node]]] = {}  # by id of the mapping: key, value
+
+    def found(self, place: Place) -> tuple[int | None, yaml.Node | None]:
+        """The line, from 1, of the key or entry at this place, or of what it is in when it is not there itself; and
+        its value, None when it is not there."""
+        line, node = None, self._root
+        for part in place:
+            key, node = self._inside(node, part)
+            if key is None:
+                break
+            line = key.start_mark.line + 1
+        return line, node
+
+    def place(self, fault: ErrorDetails) -> tuple[int | str, ...]:
+        """The fault's place, without the tags of unions, which pydantic puts between a key and those below it."""
+        kept, node = list[int | str](), self._root
+        for number, part in enumerate(fault["loc"]):
+            key, inner = self._inside(node, part)
+            is_last = number == len(fault["loc"]) - 1
+            is_between = isinstance(node, yaml.MappingNode) if not is_last else fault["type"] == "model_type"
+            if number and node is not None and key is None and is_between:
+                continue
+            kept.append(part)
+            node = inner
+        return tuple(kept)
+
+    def _inside(self, node: yaml.Node | None, part: int | str) -> tuple[yaml.Node | None, yaml.Node | None]:
+        """The key (of a list: the entry) of this name or number, and its value."""
+        if isinstance(node, yaml.MappingNode):
+            return self._keys_of(node).get(str(part), (None, None))
+        if isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+            return node.value[part], node.value[part]
+        return None, None
+
+    def _keys_of(self, node: yaml.MappingNode) -> dict[str, tuple[yaml.Node, yaml.Node]]:
+        if id(node) not in self._keys:
+            pairs = [(key, value) for key, value in node.value if isinstance(key, yaml.ScalarNode)]
+            self._keys[id(node)] = {key.value: (key, value) for key, value in pairs}
+        return self._keys[id(node)]
+
+
 def sentences(where: str, error: ValidationError, model: type[BaseModel], root: yaml.Node | None) -> str:
     """All faults of a document of this model, in one line; `root`: the YAML they are in."""
-    faults = _causes([{**fault, "loc": _written(fault, root)} for fault in error.errors()])
+    yaml_text = _Written(root)
+    faults = _causes([{**fault, "loc": yaml_text.place(fault)} for fault in error.errors()])
     more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
     listed: set[tuple[int | str, ...]] = set()  # places whose keys were listed
     told: list[str] = []
@@ -69,7 +116,7 @@ def sentences(where: str, error: ValidationError, model: type[BaseModel], root: 
         if fault["type"] == "extra_forbidden":
             advice = _about_key(fault["loc"], model, listed)
             listed.add(fault["loc"][:-1])
-        told.append(_sentence(where, fault, root, advice))
+        told.append(_sentence(where, fault, yaml_text, advice))
     return "; ".join(told) + more
 
 
@@ -110,19 +157,16 @@ def words(fault: ErrorDetails, written: str | None = None) -> str:
 
 def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
     """Without the faults that only follow from another one: a list is too short when its only entry is wrong."""
-    places = [fault["loc"] for fault in faults]
-    return [
-        fault
-        for fault in faults
-        if fault["type"] != "too_short"
-        or not any(place[: len(fault["loc"])] == fault["loc"] and place != fault["loc"] for place in places)
-    ]
+    if not any(fault["type"] == "too_short" for fault in faults):
+        return faults
+    above = {fault["loc"][:length] for fault in faults for length in range(len(fault["loc"]))}
+    return [fault for fault in faults if fault["type"] != "too_short" or fault["loc"] not in above]
 
 
-def _sentence(where: str, fault: ErrorDetails, root: yaml.Node | None, advice: str) -> str:
+def _sentence(where: str, fault: ErrorDetails, yaml_text: _Written, advice: str) -> str:
     """One fault as `file: path: what is wrong (got value, line N)`."""
     place = fault["loc"]
-    line, node = _found(root, place)
+    line, node = yaml_text.found(place)
     written = node.value if isinstance(node, yaml.ScalarNode) else None
     text = words(fault, written) + advice
     if not place:  # about the whole: the sentence names what it is about
@@ -136,41 +180,6 @@ def _sentence(where: str, fault: ErrorDetails, root: yaml.Node | None, advice: s
         told.append(f"line {line}")
     path = ".".join(str(part) for part in place if part != "[key]")
     return f"{where}: {path}: {text}" + (f" ({', '.join(told)})" if told else "")
-
-
-def _found(root: yaml.Node | None, place: Place) -> tuple[int | None, yaml.Node | None]:
-    """The line, from 1, of the key or entry at this place, or of what it is in when it is not there itself; and its
-    value, None when it is not there."""
-    line, node = None, root
-    for part in place:
-        inner: yaml.Node | None = None
-        if isinstance(node, yaml.MappingNode):
-            for key, value in node.value:
-                if isinstance(key, yaml.ScalarNode) and key.value == str(part):
-                    line, inner = key.start_mark.line + 1, value
-        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
-            inner = node.value[part]
-            line = node.value[part].start_mark.line + 1
-        if inner is None:
-            return line, None
-        node = inner
-    return line, node
-
-
-def _written(fault: ErrorDetails, root: yaml.Node | None) -> tuple[int | str, ...]:
-    """Its place as the document has it: without the tags of unions, which stand between a key and those below it."""
-    if len(fault["loc"]) == 1:  # thousands of keys at the top are not looked up one by one
-        return fault["loc"]
-    kept, node = list[int | str](), root
-    for number, part in enumerate(fault["loc"]):
-        line, inner = _found(node, (part,))
-        is_last = number == len(fault["loc"]) - 1
-        is_between = isinstance(node, yaml.MappingNode) if not is_last else fault["type"] == "model_type"
-        if number and node is not None and line is None and is_between:
-            continue
-        kept.append(part)
-        node = inner
-    return tuple(kept)
 
 
 def _number(place: Place, value: object, *, whole: bool) -> str:
