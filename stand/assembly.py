@@ -12,6 +12,7 @@ import usb.backend
 from drivers.devices.cameras import make_camera
 from drivers.devices.climate_chamber import ClimateChamber
 from drivers.devices.flap import Flap, FlapSettings
+from drivers.devices.heat_module import HeatModule
 from drivers.devices.heat_pulses import HeatPulses
 from drivers.devices.inputs import Inputs
 from drivers.devices.no_flap import NoFlap
@@ -26,6 +27,7 @@ from drivers.devices.thermal_imager import ThermalImager
 from drivers.devices.thermometers import SeveralModules, Thermometers
 from drivers.settings import EquilibriumSettings, OnBus
 from drivers.wires.bus import Bus
+from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import RegisterMap, load_register_map
 from foundation.clock import Clock, VirtualClock
 from foundation.errors import ConfigError
@@ -70,6 +72,11 @@ class Assembly:
             first.reverse()
         timed: list[tuple[Sensor, float]] = [
             *first,
+            *(
+                ((devices.heat_module, config.heat_module.poll_s),)
+                if devices.heat_module is not None and config.heat_module is not None
+                else ()
+            ),
             *((devices.probes[name], probe.poll_s) for name, probe in config.probes.items()),
             (devices.relays, config.relays.poll_s if config.relays is not None else _NO_BOARD_POLL_S),
             *(
@@ -135,11 +142,12 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     if missing := notifier.missing():
         raise ConfigError(missing)
     bus = Bus("bus", config.bus, clock)
-    regulator, relays, thermometers = bus_units(config, bus, hub, clock)
+    regulator, relays, thermometers, heat_module = bus_units(config, bus, hub, clock)
     devices = Devices(
         regulator=regulator,
         relays=relays,
         thermometers=thermometers,
+        heat_module=heat_module,
         axes={name: Axis(name, axis, clock) for name, axis in config.axes.items()},
         flap=_flap(config.flap, clock),
         cameras={
@@ -167,16 +175,17 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
 
 def bus_units(
     config: StandConfig, bus: Bus, hub: Hub, clock: Clock
-) -> tuple[Controller, Switches, Thermometers | SeveralModules]:
-    """Regulator or climate chamber, relays, thermometers; ConfigError when a register map is missing or wrong, or that
-    of another kind of unit."""
+) -> tuple[Controller, Switches, Thermometers | SeveralModules, HeatModule | None]:
+    """Regulator or climate chamber, relays, thermometers, and the module that a regulator of ours may heat by;
+    ConfigError when a register map is missing or wrong, or that of another kind of unit."""
+    relays, module = _switches(config.relays, bus, clock), _heat_module(config, bus, clock)
+    return _controller(config, bus, relays, module, hub, clock), relays, _thermometers(config, bus, clock), module
 
-    relays = _switches(config.relays, bus, clock)
-    return (
-        _controller(config, bus, relays, hub, clock),
-        relays,
-        _thermometers(config, bus, clock),
-    )
+
+def _heat_module(config: StandConfig, bus: Bus, clock: Clock) -> HeatModule | None:
+    if (settings := config.heat_module) is None:
+        return None
+    return HeatModule(ModbusUnit("heat_module", bus, register_map("heat_module", settings)), settings, clock)
 
 
 def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers | SeveralModules:
@@ -197,7 +206,9 @@ def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers |
     return modules[0] if len(modules) == 1 else SeveralModules(modules)
 
 
-def _controller(config: StandConfig, bus: Bus, relays: Switches, hub: Hub, clock: Clock) -> Controller:
+def _controller(
+    config: StandConfig, bus: Bus, relays: Switches, module: HeatModule | None, hub: Hub, clock: Clock
+) -> Controller:
     settings = config.controller
     if isinstance(settings, OnBus):
         return Regulator("regulator", bus, register_map("regulator", settings), clock)
@@ -205,7 +216,7 @@ def _controller(config: StandConfig, bus: Bus, relays: Switches, hub: Hub, clock
         return SoftwareRegulator(
             "regulator",
             settings,
-            HeatPulses(relays, settings.pulses, clock),
+            module or HeatPulses(relays, settings.pulses, clock),
             lambda: hub.known(f"thermometers.{settings.thermometer}"),
             config.limits.chamber_degC,
             config.guard.stale_after_s,

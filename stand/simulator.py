@@ -15,7 +15,8 @@ from drivers.settings import OnBus
 from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
 from foundation.errors import ConfigError, Unreachable
-from stand.config.stand_config import SimulatedCamera, StandConfig
+from stand.config.simulation import SimulatedCamera
+from stand.config.stand_config import StandConfig
 
 _STOP_LIMIT_S = 5.0
 _CAMERA_BOOT_S = 3.0  # a stand that waits for less has a camera that takes less
@@ -71,6 +72,8 @@ def _bus_of(config: StandConfig) -> dict[str, object]:
         "regulator_unit": config.regulator_unit.unit if config.regulator_unit is not None else None,
         "relays_unit": config.relays.unit if config.relays is not None else None,
         "relay_channels": dict(config.relays.channels) if config.relays is not None else {},
+        "heat_module_unit": config.heat_module.unit if config.heat_module is not None else None,
+        "heat_module_output": config.heat_module.channel if config.heat_module is not None else 0,
         **_inputs_of(config),
         "thermometers_units": list(config.thermometer_module.units),
         "thermometers_model": _model_of(config.thermometer_module),

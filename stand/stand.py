@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from drivers.devices.heat_module import HeatModule
 from drivers.devices.inputs import Inputs
 from drivers.devices.probes import Probe
 from drivers.devices.protocols import Actuator, Camera, Controller, Shutter, Switches
@@ -36,6 +37,7 @@ class Devices:
     axes: Mapping[str, Axis]
     flap: Shutter
     cameras: Mapping[str, Camera]
+    heat_module: HeatModule | None = None
     inputs: Inputs | None = None
     imager: ThermalImager | None = None
     probes: Mapping[str, Probe] = field(default_factory=dict[str, Probe])

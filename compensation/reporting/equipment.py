@@ -15,7 +15,8 @@ NOT_STATED = "not stated"
 Line = tuple[str, str]
 _DEVICES = (
     ("regulator", "Temperature controller"),
-    ("chamber", "Climate chamber"),
+    ("heat_module", "Heat output"),
+    ("climate_chamber", "Climate chamber"),
     ("thermometer_module", "Thermometer module"),
     ("pt100", "Thermometers"),
 )

@@ -52,6 +52,8 @@ def pulse_s(percent: float, owed_s: float, settings: PulsesSettings) -> tuple[fl
 class HeatPulses:
     """The relay `heat` of the board. What it reads before each pulse is compared with what the last one left."""
 
+    identity = None  # the board has one
+
     def __init__(self, board: Switches, settings: PulsesSettings, clock: Now) -> None:
         self._board = board
         self._settings = settings
@@ -60,6 +62,15 @@ class HeatPulses:
         self._due_ns = 0
         self._until_ns = 0  # when the relay drops by itself
         self._is_compared = False  # whether what it is left as is known
+
+    async def open(self) -> None:
+        """The board is opened by itself."""
+
+    async def arm(self) -> None:
+        """Each pulse ends by itself."""
+
+    async def test_dead_man(self) -> None:
+        """The board's timer is tested with the relay `heater_enable`, beside this one on the same board."""
 
     async def give(self, percent: float, *, at_once: bool = False) -> None:
         """The output from now on: of the next cycle, or at_once, with a cycle that begins now. DeviceFault when the

@@ -78,6 +78,35 @@ class Switches(Sensor, Actuator, Protocol):
         ...
 
 
+class HeatOutput(Protocol):
+    """By what a regulator of our own heats: pulses of a relay, or a current. Without us it ends by itself."""
+
+    @property
+    def identity(self) -> Identity | None:
+        """Of a device of its own that has answered; else None."""
+        ...
+
+    async def open(self) -> None:
+        """See that it answers, and is safe without us; DeviceError. Gives nothing."""
+        ...
+
+    async def arm(self) -> None:
+        """Before control begins; DeviceError when it could not be relied upon."""
+        ...
+
+    async def give(self, percent: float, *, at_once: bool = False) -> None:
+        """The output from now on, called at each step of the law; DeviceError."""
+        ...
+
+    async def off(self) -> None:
+        """No heat, confirmed; DeviceError."""
+        ...
+
+    async def test_dead_man(self) -> None:
+        """Whether it ends by itself, without heating; DeviceFault when not."""
+        ...
+
+
 class Shutter(Sensor, Actuator, Protocol):
     """What is between the cameras and their target: a flap, or nothing. is_shut: the last movement has confirmed it."""
 

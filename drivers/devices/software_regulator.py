@@ -1,7 +1,9 @@
-"""A regulator of our own, for a stand without a controller: the PID runs here, the heat goes out in pulses of a relay.
+"""A regulator of our own, for a stand without a controller: the PID runs here, the heat goes out in pulses of a relay
+or as a current.
 
-What keeps it safe does not rely on it: each pulse ends by the relay board's own timer, the enable relay in series is
-held by the guard's permission alone, and the compressor's keeper takes our output as no more than a demand.
+What keeps it safe does not rely on it: each pulse ends by the relay board's own timer, a current by the module's own
+watchdog, the enable relay in series is held by the guard's permission alone, and the compressor's keeper takes our
+output as no more than a demand.
 """
 
 from __future__ import annotations
@@ -14,10 +16,11 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.devices import pid, relay_tuning
-from drivers.devices.heat_pulses import HeatPulses, PulsesSettings
+from drivers.devices.heat_pulses import PulsesSettings
 from drivers.devices.pid import Law
+from drivers.devices.protocols import HeatOutput
 from drivers.devices.relay_tuning import Found, Tuning, TuningSettings
-from drivers.settings import DeviceName, Polled
+from drivers.settings import DeviceName, Identity, Polled
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, Occupied, Refused
 from foundation.items import Event, Item
@@ -46,13 +49,11 @@ class SoftwareRegulator:
     nothing is `permitted`, the output is 0 and the integral stays. publish: takes events.
     """
 
-    identity = None
-
     def __init__(
         self,
         name: str,
         settings: SoftwareRegulatorSettings,
-        heat: HeatPulses,
+        heat: HeatOutput,
         measured: Callable[[], Reading | None],
         allowed_degC: tuple[float, float],
         stale_s: float,
@@ -77,11 +78,17 @@ class SoftwareRegulator:
         self._tuning: Tuning | None = None
         self._trouble = ""
 
+    @property
+    def identity(self) -> Identity | None:
+        """Of what it heats by, where that is a device of its own."""
+        return self._heat.identity
+
     async def open(self) -> None:
-        """Nothing to connect to: thermometer and relay are devices of their own."""
+        """What it heats by; thermometer and relays are devices of their own."""
+        await self._heat.open()
 
     async def close(self) -> None:
-        """Give no more pulses; the last one ends by itself."""
+        """Give no more heat; what is given ends by itself."""
         await self._end()
 
     async def read(self) -> tuple[Reading, ...]:
@@ -120,11 +127,12 @@ class SoftwareRegulator:
         if self._sp_degC is None:
             raise Refused(self.name, "no set-point was given yet")
         if self._task is None or self._task.done():
+            await self._heat.arm()
             self._trouble, self._state, self._rests_ns = "", None, None
             self._task = asyncio.create_task(self._control())
 
     async def stop(self) -> None:
-        """Stop control; the heat's relay is off, confirmed."""
+        """Stop control; the heat is off, confirmed."""
         await self._end()
         await self._heat.off()
         self._trouble = ""
@@ -132,6 +140,10 @@ class SoftwareRegulator:
     async def make_safe(self) -> None:
         """Stopped, confirmed."""
         await self.stop()
+
+    async def test_dead_man(self) -> None:
+        """While it is stopped: does what it heats by end without us? DeviceFault when not."""
+        await self._heat.test_dead_man()
 
     async def autotune(self) -> Law:
         """Wait until the set-point is held, find the ultimate point about it, and go on with the law as it is. The law

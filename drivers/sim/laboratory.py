@@ -17,6 +17,7 @@ from drivers.sim.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec,
 from drivers.sim.faults import LinkFaults
 from drivers.sim.flap import FakeFlap
 from drivers.sim.genicam_file import read_genicam
+from drivers.sim.heat_module import FakeHeatModule
 from drivers.sim.laboratory_spec import CameraSpec, ChamberUnitSpec, LaboratorySpec
 from drivers.sim.link_faults import Link
 from drivers.sim.modbus import RtuEngine, TcpEngine, Unit
@@ -80,6 +81,7 @@ class Laboratory:
         self._links: dict[str, Link] = {}
         self._regulator: FakeRegulator | None = None
         self._relays: FakeRelays | None = None
+        self._heat_module: FakeHeatModule | None = None
         self._chamber: FakeClimateChamber | None = None
         self._imager: FakeThermalImager | None = None
         self._flap: FakeFlap | None = None
@@ -117,6 +119,11 @@ class Laboratory:
     def relays(self) -> FakeRelays:
         """The relay board; ValueError when there is none."""
         return _there(self._relays, "relay board")
+
+    @property
+    def heat_module(self) -> FakeHeatModule:
+        """The analog output that heats; ValueError when there is none."""
+        return _there(self._heat_module, "analog output")
 
     @property
     def chamber(self) -> FakeClimateChamber:
@@ -198,6 +205,9 @@ class Laboratory:
         if spec.relays_unit is not None:
             self._relays = FakeRelays(plant, clock, spec.relays_unit, spec.relay_channels)
             units.append(self._relays)
+        if spec.heat_module_unit is not None:
+            self._heat_module = FakeHeatModule(plant, clock, spec.heat_module_unit, spec.heat_module_output)
+            units.append(self._heat_module)
         plant.on_step.append(self._conduct)  # after the regulator's and the relays'
         units += self._rtd_modules()
         self.inputs: FakeRelays | None = self._relays  # a board that has both

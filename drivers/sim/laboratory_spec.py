@@ -115,6 +115,8 @@ class LaboratorySpec(Document):
     chamber: ChamberUnitSpec | None = None
     relays_unit: int | None
     relay_channels: dict[str, int]
+    heat_module_unit: int | None = None
+    heat_module_output: int = 0
     inputs_unit: int | None = None
     input_channels: dict[str, int] = Field(default_factory=dict[str, int])
     inputs_closed: tuple[int, ...] = ()

@@ -78,5 +78,8 @@ KINDS: Mapping[str, Kind] = {
             Quantity("clock_offset", "s", "clock_offset_s"),
         ),
     ),
+    "output": Kind(
+        "/heat/output", "HeatOutput", (Quantity("output", "mA", "output_mA"), Quantity("tripped", "1", "tripped"))
+    ),
 }
 KIND_OF_TOPIC = {kind.topic: kind for kind in KINDS.values()}

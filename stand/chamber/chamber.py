@@ -9,6 +9,7 @@ from pathlib import Path
 
 from drivers.devices.climate_chamber import ClimateChamber
 from drivers.devices.protocols import Controller, Switches
+from drivers.devices.software_regulator import SoftwareRegulator
 from foundation.clock import Clock, boot_of, seconds_ns
 from foundation.errors import ConfigError, DeviceFault, Occupied
 from foundation.hub import Hub
@@ -127,9 +128,9 @@ class Chamber:
         await self.permits.make_safe()
 
     async def test_dead_man(self, *, is_timed: bool = False) -> None:
-        """Test the relay board's timer on the heater's relay while the regulator is stopped; DeviceFault when the
-        regulator gives heat all the same, or the board cannot be relied upon. is_timed: as of Permits. Event
-        `no_dead_man` without a board."""
+        """Test the relay board's timer on the heater's relay while the regulator is stopped, and the watchdog of a
+        module that heats; DeviceFault when the regulator gives heat all the same, or one of them cannot be relied upon.
+        is_timed: as of Permits. Event `no_dead_man` without a board."""
         if not self._relays.has_timer:
             return self._tell_dead_man()
         output = {reading.channel: reading.value for reading in await self._regulator.read()}
@@ -137,6 +138,8 @@ class Chamber:
         if not output.get(f"{name}.mv_heat", 0.0) <= 0:
             raise DeviceFault(name, f"is stopped and yet gives {output[f'{name}.mv_heat']:g} % heat; look at the unit")
         await self.permits.test_dead_man(is_timed=is_timed)
+        if isinstance(self._regulator, SoftwareRegulator):
+            await self._regulator.test_dead_man()
 
     def _tell_dead_man(self) -> None:
         """No board drops the heat when this daemon dies: what ends it then is recorded with the session."""

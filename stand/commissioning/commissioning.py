@@ -83,6 +83,8 @@ async def _looks(assembly: Assembly, add: Callable[[Finding], None], *, has_move
     yield
     await look(links.relays, devices.relays, moves and moves.heat_timer)
     yield
+    await look(links.heat_module)
+    yield
     await look(links.inputs)
     yield
     for name in devices.probes:
@@ -122,7 +124,7 @@ def _identities(assembly: Assembly) -> dict[str, Identity]:
     """Of those that have answered."""
     devices = assembly.devices
     known: dict[str, Identity] = {}
-    units = (devices.regulator, devices.relays, devices.thermometers, devices.inputs, devices.flap)
+    units = (devices.regulator, devices.relays, devices.heat_module, devices.thermometers, devices.inputs, devices.flap)
     for device in (*units, *devices.axes.values(), *devices.cameras.values()):
         try:
             identity = None if device is None else device.identity

@@ -9,7 +9,8 @@ from drivers.devices.camera_gige import Camera
 from drivers.devices.camera_gige import Settings as GigeSettings
 from foundation.clock import WallClock
 from foundation.errors import DeviceError
-from stand.config.stand_config import SimulatedCamera, StandConfig, load_config, packaged
+from stand.config.simulation import SimulatedCamera
+from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.simulator import Simulator, laboratory_of
 
 _NAME = "camera"

@@ -55,7 +55,8 @@ class Links:
         unit, settings = assembly.config.regulator_unit, assembly.config.regulator
         if isinstance(settings, SoftwareRegulatorSettings):
             self.opened.add(regulator.name)
-            text = f"this program itself: it measures thermometers.{settings.thermometer} and heats by relays.{HEAT}"
+            by = f"relays.{HEAT}" if assembly.config.heat_module is None else "heat_module"
+            text = f"this program itself: it measures thermometers.{settings.thermometer} and heats by {by}"
             self._add(Finding(regulator.name, "link", "ok", text, data=settings.model_dump(mode="json")))
             return
         if unit is None:
@@ -93,6 +94,16 @@ class Links:
             if readings.get(f"{relays.name}.{channel}") == 1:
                 text = f"{channel} is on, though no program has this stand"
                 self._warn(relays.name, text, "switch it off at the board, or with `stand check --moves`")
+
+    async def heat_module(self) -> None:
+        """The analog output that a regulator of ours heats by, where there is one; which opens it as a run does."""
+        assembly = self._assembly
+        module, unit = assembly.devices.heat_module, assembly.config.heat_module
+        if module is None or unit is None:
+            return
+        await self._unit(module, unit)
+        used = [f"{each}_{unit.channel}" for each in ("output", "present", "safe", "power_on", "type_code")]
+        await self._points(module.name, module.name, unit, used)
 
     async def inputs(self) -> None:
         """The contacts, where there are any."""

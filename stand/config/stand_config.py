@@ -8,15 +8,15 @@ import difflib
 import importlib.resources
 import math
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal, Self, cast
 
-from pydantic import AfterValidator, AwareDatetime, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from drivers.devices.cameras import AnyCameraSettings
 from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
 from drivers.devices.flap import FlapSettings
+from drivers.devices.heat_module import HeatModuleSettings
 from drivers.devices.inputs import InputsSettings
 from drivers.devices.pid import split
 from drivers.devices.probes import ProbeSettings
@@ -28,7 +28,6 @@ from drivers.devices.thermometers import ThermometerModuleSettings, ThermometerS
 from drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
 from drivers.wires.bus import BusSettings
 from experiments.parameters import Chamber_degC
-from foundation.addresses import TcpAddress
 from foundation.documents import Document, load_document
 from foundation.errors import ConfigError
 from stand.config.alerts import AlertsConfig
@@ -38,18 +37,7 @@ from stand.config.interface import InterfaceConfig
 from stand.config.looks import ChamberConfig
 from stand.config.older_forms import CAMERA, renewed
 from stand.config.safe_ranges import check, outside
-
-
-def _printable(path: Path) -> Path:
-    if not str(path).isprintable():
-        raise ValueError("expected a path of printable characters")
-    return path
-
-
-def _of_this_century(start: datetime) -> datetime:
-    if not 2000 <= start.year < 2100:
-        raise ValueError("expected a time of the years 2000 to 2099")
-    return start
+from stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
 
 
 def _kind_of(regulator: object) -> str:
@@ -68,12 +56,13 @@ RegulatorSettings = Annotated[
     ),
 ]
 Folder = Literal["", "registers", "recipes", "targets"]
-MAPPED = ("regulator", "relays", "thermometer_module")  # the devices that have a register map
+MAPPED = ("regulator", "heat_module", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
 _GUARDED = {"air", "granite_inside"}  # thermometers without which nothing is heated
 _DEVICES = (
     "bus",
     "regulator",
+    "heat_module",
     "relays",
     "thermometers",
     "flap",
@@ -101,7 +90,7 @@ class CompressorConfig(Document):
     max_starts_per_h: int = Field(default=6, ge=1, le=60)
     start_above_cool_percent: float = Field(default=10.0, gt=0, le=100)
     stop_above_heat_percent: float = Field(default=60.0, gt=0, le=100)
-    state_file: Annotated[Path, AfterValidator(_printable)] | None = None
+    state_file: PrintablePath | None = None
 
 
 class RecordingConfig(Document):
@@ -113,8 +102,8 @@ class RecordingConfig(Document):
     copies finished sessions to, another disk.
     """
 
-    directory: Annotated[Path, AfterValidator(_printable)] = Path("sessions")
-    archive_directory: Annotated[Path, AfterValidator(_printable)] | None = None
+    directory: PrintablePath = Path("sessions")
+    archive_directory: PrintablePath | None = None
     frame_encoding: Literal["png", "raw", "roi"] = "png"
     whole_every_s: float = Field(default=60.0, gt=0, le=86400)
     telemetry_commit_s: float = Field(default=1.0, gt=0, le=1)
@@ -123,37 +112,10 @@ class RecordingConfig(Document):
     alert_below_percent: float = Field(default=10.0, ge=0, le=100)
 
 
-FaultText = Annotated[str, Field(pattern=r"^[A-Za-z_]+\.[A-Za-z_]+(=.+)?(@[\d.]+(s|min|h)?)?(:[\d.]+(s|min|h)?)?$")]
-
-
-class SimulatedCamera(Document):
-    """One camera of a simulated laboratory; optics: modified or as bought. genicam: a camera's own GenICam file, whose
-    features it then shows (`arv-tool-0.8 -a ADDRESS genicam > FILE` writes that of a real one)."""
-
-    optics: Literal["modified", "unmodified"] | None = None
-    genicam: Annotated[Path, AfterValidator(_printable)] | None = None
-
-
-class SimulationConfig(Document):
-    """The simulated laboratory behind these addresses; a real laboratory has no such section. camera: the optics of all
-    cameras; cameras: what one of the stand's cameras, by its name, has of its own. chamber_seed: another
-    chamber than the standard one, its conductances, lags and powers drawn within +-30 %. faults: what breaks, each
-    NAME[=VALUE][@TIME][:DURATION], times in s unless they end in s, min or h (`stand simulate --faults` lists the
-    names)."""
-
-    control: TcpAddress
-    start: Annotated[AwareDatetime, AfterValidator(_of_this_century)] = datetime(2026, 1, 1, 18, tzinfo=UTC)
-    seed: int = Field(default=1, ge=0)
-    camera: Literal["modified", "unmodified"] = "modified"
-    cameras: dict[DeviceName, SimulatedCamera] = Field(default_factory=dict)
-    laboratory_degC: float = Field(default=24.0, ge=-10, le=40)
-    chamber_seed: int | None = Field(default=None, ge=0)
-    faults: tuple[FaultText, ...] = Field(default=(), max_length=1000)
-
-
 class StandConfig(Document):
     """The whole file. What holds the chamber's temperature is a regulator, a unit on the bus or (kind: software) ours,
-    with a relay board that enables its heat, or a climate_chamber with a controller of its own, which needs none."""
+    with a relay board that enables its heat, or a climate_chamber with a controller of its own, which needs none. Ours
+    heats by a relay of that board, or by a heat_module, an analog output."""
 
     name: Line = Field(min_length=1)
     operator: Line = ""
@@ -162,6 +124,7 @@ class StandConfig(Document):
     regulator: RegulatorSettings | None = None
     climate_chamber: ClimateChamberSettings | None = None
     relays: RelaysSettings | None = None
+    heat_module: HeatModuleSettings | None = None
     thermometer_module: ThermometerModuleSettings
     thermometers: dict[DeviceName, ThermometerSettings]
     probes: dict[DeviceName, ProbeSettings] = Field(default_factory=dict)
@@ -208,18 +171,33 @@ class StandConfig(Document):
             yield "relays is missing: a board has to enable the regulator's heat; only a climate_chamber needs none"
         if isinstance(self.regulator, SoftwareRegulatorSettings):
             yield from self._unfit_software(self.regulator)
+            yield from self._unfit_output(self.regulator)
         elif self.relays is not None and HEAT in self.relays.channels:
             yield f"relays.channels has {HEAT}, which is the output of a regulator of kind: software, and this is none"
+        elif self.heat_module is not None:
+            yield "heat_module is the output of a regulator of kind: software, and this is none"
+
+    def _unfit_output(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
+        module, guard = self.heat_module, self.guard
+        has_relay = self.relays is not None and HEAT in self.relays.channels
+        if module is None:
+            if self.relays is not None and not has_relay:
+                yield f"relays.channels lacks {HEAT}, the relay by which a regulator of kind: software heats"
+            if regulator.pulses.cycle_s > guard.heater_hold_s:
+                yield "regulator.pulses.cycle_s is longer than guard.heater_hold_s, within which heat ends by itself"
+            return
+        if has_relay:
+            yield f"relays.channels has {HEAT}, and there is a heat_module: take one of them to heat with"
+        if module.watchdog_s > guard.heater_hold_s:
+            yield "heat_module.watchdog_s is longer than guard.heater_hold_s, within which heat ends by itself"
+        if module.watchdog_s < 2 * regulator.sample_s:
+            yield "heat_module.watchdog_s must be at least twice regulator.sample_s, or it trips between two steps"
 
     def _unfit_software(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
-        if self.relays is not None and HEAT not in self.relays.channels:
-            yield f"relays.channels lacks {HEAT}, the relay by which a regulator of kind: software heats"
         if regulator.thermometer not in self.thermometers:
             yield f"regulator.thermometer: there is no thermometer {regulator.thermometer}"
         if regulator.sample_s < self.thermometer_module.poll_s:
             yield "regulator.sample_s is shorter than thermometer_module.poll_s: between two readings nothing is new"
-        if regulator.pulses.cycle_s > self.guard.heater_hold_s:
-            yield "regulator.pulses.cycle_s is longer than guard.heater_hold_s, within which heat ends by itself"
         law, compressor = regulator.law, self.compressor
         _, coldest_percent = split(law.lowest_percent, law.dead_band_percent)
         if law.lowest_percent < 0 and coldest_percent <= compressor.start_above_cool_percent:
@@ -230,12 +208,12 @@ class StandConfig(Document):
 
     def _unfit_devices(self) -> Iterator[str]:
         regulator = self.regulator_unit
-        units = [each.unit for each in (regulator, self.relays) if each is not None]
+        units = [each.unit for each in (regulator, self.heat_module, self.relays) if each is not None]
         units += self.thermometer_module.units
         if len(set(units)) < len(units):
-            yield f"regulator, relays and thermometer_module need different units on one bus, not {units}"
-        others = [*self.thermometer_module.units, *((regulator.unit,) if regulator is not None else ())]
-        if self.inputs is not None and self.inputs.unit in others:
+            yield f"regulator, relays, heat_module and thermometer_module need different units on one bus, not {units}"
+        others = [each.unit for each in (regulator, self.heat_module) if each is not None]
+        if self.inputs is not None and self.inputs.unit in (*others, *self.thermometer_module.units):
             yield "inputs.unit is that of the regulator or the thermometers; take the relay board's, or another"
         addresses = [self.bus.address, *(each.address for each in (*self.axes.values(), *self.probes.values()))]
         addresses += [self.climate_chamber.address] if self.climate_chamber is not None else []

@@ -199,8 +199,14 @@ def _minutes(duration_s: float) -> str:
 
 
 def _messages_per_s(config: StandConfig) -> float:
-    polled = (config.regulator, config.climate_chamber, config.relays, config.thermometer_module, config.flap)
-    polled = (*polled, *config.cameras.values(), *config.axes.values(), *config.probes.values())
+    polled = (config.regulator, config.climate_chamber, config.relays, config.heat_module, config.flap)
+    polled = (
+        *polled,
+        config.thermometer_module,
+        *config.cameras.values(),
+        *config.axes.values(),
+        *config.probes.values(),
+    )
     return sum(1.0 / device.poll_s for device in polled if device is not None)
 
 

@@ -92,6 +92,8 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
     }
     if recorded.inputs is not None:
         maps["inputs"] = recorded.inputs.model_copy(update={"registers": "waveshare-inputs"})
+    if recorded.heat_module is not None:
+        maps["heat_module"] = recorded.heat_module.model_copy(update={"registers": "icpdas-m7024"})
     state_file = {"state_file": simulated.compressor.state_file}
     return recorded.model_copy(
         update={

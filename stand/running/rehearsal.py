@@ -33,6 +33,7 @@ def rehearsed(order: Order) -> Order:
         "bus": there.bus,
         "regulator": _at(config.regulator_unit, "omron-e5cc") if config.regulator_unit else config.regulator,
         "relays": config.relays and _at(config.relays, "waveshare-relay"),
+        "heat_module": config.heat_module and _at(config.heat_module, "icpdas-m7024"),
         "climate_chamber": config.climate_chamber and config.climate_chamber.model_copy(update={"address": _CHAMBER}),
         "thermometer_module": _at(config.thermometer_module, there.thermometer_module.registers),
         "inputs": config.inputs and _at(config.inputs, "waveshare-inputs"),

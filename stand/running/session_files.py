@@ -60,7 +60,7 @@ def tell_identities(assembly: Assembly) -> None:
     """Which devices have answered, as events, but for the cameras, which are told when they are on; and what the stand
     lacks."""
     devices, now_ns = assembly.devices, assembly.clock.now_ns()
-    units = (devices.regulator, devices.relays, devices.thermometers, devices.inputs, devices.flap)
+    units = (devices.regulator, devices.relays, devices.heat_module, devices.thermometers, devices.inputs, devices.flap)
     for device in (*units, *devices.axes.values(), *devices.probes.values()):
         if device is not None and device.identity is not None:
             assembly.hub.publish(identity_event(device.name, device.identity, now_ns))
@@ -124,6 +124,7 @@ def _kinds(config: StandConfig) -> dict[str, str]:
     """Device name -> what kind of device it is, for the recorder's topics."""
     kinds = {name: name for name in ("regulator", "relays", "thermometers")}
     kinds |= dict.fromkeys(config.cameras, "camera")
+    kinds |= {} if config.heat_module is None else {"heat_module": "output"}
     kinds |= {} if config.inputs is None else {"inputs": "relays"}  # contacts, as those of the relays
     kinds |= {} if config.imager is None else {"imager": "imager"}
     kinds |= {} if config.flap is None else {"flap": "flap"}

@@ -31,6 +31,7 @@ def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Labor
     config = load_config(packaged("", "simulated"))
     described = laboratory_of(config, virtual=True, seed=None, start_ns=START_NS, is_anywhere=True)
     described["chamber"] = request.param  # beside the regulator, or nothing of its own
+    described["heat_module_unit"] = 9
     described["imager"] = {"folder": None, "spots": {"lens": [80, 60]}}
     described["axes"]["linear"]["address"] = f"serial:{tmp_path / 'linear'}"  # type: ignore[index]
     described["cameras"]["camera"]["address"] = camera_address()  # type: ignore[index]

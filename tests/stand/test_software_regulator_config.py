@@ -12,6 +12,22 @@ from stand.config.stand_config import StandConfig, packaged
 
 Change = Callable[[dict[str, Any]], object]
 
+
+def module(**keys: object) -> Change:
+    """In the place of the heat's relay."""
+
+    def change(data: dict[str, Any]) -> None:
+        data["relays"]["channels"].pop("heat")
+        data["heat_module"] = {"registers": "icpdas-m7024", "unit": 4, "watchdog_s": 12, **keys}
+
+    return change
+
+
+def module_beside_the_relay(data: dict[str, Any]) -> None:
+    module()(data)
+    data["relays"]["channels"]["heat"] = 3
+
+
 REFUSED: list[tuple[str, Change, str]] = [
     (
         "software-regulator",
@@ -32,6 +48,16 @@ REFUSED: list[tuple[str, Change, str]] = [
     ("software-regulator", lambda d: d["regulator"].update(sample_s=1), "sample_s is shorter than thermometer_module"),
     ("software-regulator", lambda d: d["regulator"]["pulses"].update(cycle_s=60), "longer than guard.heater_hold_s"),
     ("software-regulator", lambda d: d["regulator"]["law"].update(lowest_percent=-8), "never starts the compressor"),
+    ("software-regulator", module_beside_the_relay, "take one of them to heat with"),
+    ("software-regulator", module(watchdog_s=6), r"heat_module\.watchdog_s must be at least twice regulator\.sample_s"),
+    ("software-regulator", module(watchdog_s=25), "longer than guard.heater_hold_s"),
+    ("software-regulator", module(unit=3), "need different units on one bus"),
+    ("software-regulator", module(safe_mA=6), "it would heat when this computer has died"),
+    (
+        "simulated",
+        lambda d: d.update(heat_module={"registers": "icpdas-m7024", "unit": 4}),
+        "heat_module is the output of a regulator of kind: software, and this is none",
+    ),
 ]
 
 

@@ -1,0 +1,259 @@
+"""Heat through an analog output: a current of 4..20 mA into a power controller, from a module with a host watchdog.
+
+The module itself ends the heat when this program does: not written to for watchdog_s, it gives its safe value. So while
+it heats nothing but the law writes to it or reads it: what goes on asking must not keep alive what has died.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from drivers.devices.relays import COIL_OFF, COIL_ON
+from drivers.settings import Identity, OnBus
+from drivers.wires.modbus_unit import ModbusUnit
+from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
+from foundation.readings import Reading
+
+_TOLERANCE_mA = 0.1  # of what reads back: the modules are good to 0.02 mA
+_TESTED = 1.5  # watchdog_s, for which it is left alone, and then written to
+_WATCHDOG, _TRIPPED, _TIME = "watchdog_on", "tripped", "watchdog_s"
+
+
+class HeatModuleSettings(OnBus):
+    """The module's output `channel`, 0 is the first: zero_mA no heat, full_mA all of it. safe_mA: what it must give
+    when its watchdog has tripped, and after power-up; by default zero_mA. watchdog_s: how long it may be left alone."""
+
+    channel: int = Field(default=0, ge=0, le=7)
+    zero_mA: float = Field(default=4.0, ge=0, le=20)
+    full_mA: float = Field(default=20.0, gt=0, le=20)
+    safe_mA: float | None = Field(default=None, ge=0, le=20)
+    watchdog_s: float = Field(default=5.0, ge=1, le=25.5)
+
+    @model_validator(mode="after")
+    def _safe(self) -> Self:
+        if self.zero_mA >= self.full_mA:
+            raise ValueError("zero_mA must be below full_mA: a power controller that heats at less current is not safe")
+        if self.safe_mA is not None and self.safe_mA > self.zero_mA:
+            raise ValueError("safe_mA is above zero_mA: it would heat when this computer has died")
+        return self
+
+    @property
+    def tripped_mA(self) -> float:
+        """What it must give when its watchdog has tripped."""
+        return self.zero_mA if self.safe_mA is None else self.safe_mA
+
+
+class HeatModule:
+    """Points output_<n>, safe_<n>, power_on_<n>, watchdog_s and coils watchdog_on, tripped of the map; present_<n>
+    (what it gives) and type_code_<n> where it has them. Not heated with before `arm`."""
+
+    def __init__(self, wire: ModbusUnit, settings: HeatModuleSettings, clock: Clock) -> None:
+        self.name = name = wire.name
+        self._unit = wire
+        self._settings = settings
+        self._clock = clock
+        points, place = wire.map.points, settings.channel
+        self._output, self._safe, self._power_on = (f"{each}_{place}" for each in ("output", "safe", "power_on"))
+        needed = (self._output, self._safe, self._power_on, _TIME, _WATCHDOG, _TRIPPED)
+        if missing := [point for point in needed if point not in points]:
+            raise ConfigError(
+                f"{name}: register map {wire.map.model} has no {', '.join(missing)}, without which nothing ends "
+                "the heat when this computer dies; take a module with a host watchdog, or a relay"
+            )
+        self._present = present if (present := f"present_{place}") in points else self._output
+        self._type_code = type_code if (type_code := f"type_code_{place}") in points else None
+        self._lock = asyncio.Lock()  # a write and what is read back stay together
+        self._is_safe = False  # whether its safe value has been read back
+        self._armed_ns: int | None = None  # when its watchdog was last refreshed; None: it is off
+        self._left_mA: float | None = None  # by the last write that was confirmed
+        self._trip = ""  # why it gives no heat until it is armed again
+        self._last: tuple[Reading, ...] = ()
+
+    @property
+    def identity(self) -> Identity | None:
+        """Which module has answered; None before `open`."""
+        return self._unit.identity
+
+    async def open(self) -> None:
+        """Check identity, range, and that what it gives without us is safe, which is set where it differs; DeviceFault
+        when it stays otherwise. The output is not changed."""
+        async with self._lock:
+            await self._prepare()
+
+    async def close(self) -> None:
+        """Nothing to let go of; a module that is left alone goes to its safe value."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """output (mA, what it gives), tripped; while it heats those of the law's last exchange. DeviceError, and the
+        output is at zero, when it gives heat though nothing does."""
+        async with self._lock:
+            if self._armed_ns is not None and self._last:
+                return self._last
+            given_mA = await self._given_mA()
+            if given_mA > self._settings.zero_mA + _TOLERANCE_mA:
+                await self._zero()
+                raise DeviceFault(self.name, f"gave {given_mA:.2f} mA unasked; it is at its zero again")
+            return self._last
+
+    async def arm(self) -> None:
+        """Before control begins: safe values as configured, output at zero, watchdog on and not tripped, all read back.
+        A trip is cleared: whoever starts control has seen it."""
+        async with self._lock:
+            self._armed_ns, self._left_mA = None, None
+            await self._prepare()
+            await self._unit.write(_TIME, self._settings.watchdog_s)
+            await self._switch(_WATCHDOG, True)
+            if await self._is(_TRIPPED):
+                await self._clear()
+            await self._zero()
+            if await self._is(_TRIPPED):
+                raise DeviceFault(self.name, "its host watchdog trips as soon as it is cleared")
+            self._armed_ns, self._trip = self._clock.now_ns(), ""
+
+    async def give(self, percent: float, *, at_once: bool = False) -> None:
+        """The heat from now on; at_once has no meaning here. Also refreshes the watchdog. DeviceFault when it does not
+        give what it was left at, which ends with zero, or has tripped, which lasts until it is armed again."""
+        async with self._lock:
+            if self._armed_ns is None:
+                raise DeviceFault(self.name, "gives no heat: it was not armed")
+            if self._trip:
+                raise DeviceFault(self.name, self._trip)
+            await self._compare()
+            settings = self._settings
+            wanted_mA = settings.zero_mA + (settings.full_mA - settings.zero_mA) * min(100.0, max(0.0, percent)) / 100
+            self._left_mA = None  # until the write is confirmed
+            self._left_mA = await self._unit.write(self._output, wanted_mA)
+            self._armed_ns = self._clock.now_ns()
+
+    async def off(self) -> None:
+        """No heat, confirmed; DeviceError. Its watchdog is off from then, unless it cannot be reached for that: then it
+        trips, which is as safe."""
+        async with self._lock:
+            await self._zero()
+            with suppress(DeviceError):
+                await self._switch(_WATCHDOG, False)
+            self._armed_ns = None
+
+    async def test_dead_man(self) -> None:
+        """At zero: does the watchdog trip when the module is left alone, and not while it is written to? DeviceFault
+        when not: then it would heat on without us, or never for long."""
+        await self.arm()
+        try:
+            await self._pause(_TESTED)
+            if not await self._is(_TRIPPED):
+                text = f"its host watchdog does not trip after {_TESTED * self._settings.watchdog_s:g} s without us"
+                raise DeviceFault(self.name, f"{text}; it would heat on when this computer has died")
+            await self.arm()
+            for _ in range(5):
+                await self._pause(_TESTED / 5)
+                await self.give(0.0)
+        except DeviceFault as error:
+            if not self._trip:
+                raise
+            text = "its host watchdog trips though it is written to; does it want the broadcast `~**` of DCON?"
+            raise DeviceFault(self.name, text) from error
+        finally:
+            await self.off()
+
+    async def _pause(self, share: float) -> None:
+        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(share * self._settings.watchdog_s))
+
+    async def _prepare(self) -> None:
+        self._is_safe = False
+        await self._unit.probe()
+        if self._type_code is not None:
+            sample = (await self._unit.snapshot([self._type_code])).samples[self._type_code]
+            if sample.reason:
+                text = f"{self._type_code} is {sample.raw:#x}, which is no range of mA; set its range at the module"
+                raise DeviceFault(self.name, text)
+        for point, when in ((self._safe, "when it is left alone"), (self._power_on, "after power-up")):
+            await self._make(point, when)
+        self._is_safe = True
+
+    async def _make(self, point: str, when: str) -> None:
+        """The value as configured, which is written only when it differs: it wears the module's memory."""
+        wanted_mA = self._settings.tripped_mA
+        if abs(await self._mA(point) - wanted_mA) <= _TOLERANCE_mA:
+            return
+        with suppress(Refused):
+            await self._unit.write(point, wanted_mA)
+        found_mA = await self._mA(point)
+        if abs(found_mA - wanted_mA) > _TOLERANCE_mA:
+            text = f"gives {found_mA:g} mA {when} ({point}), not {wanted_mA:g}, and does not take that"
+            raise DeviceFault(self.name, f"{text}; set it at the module: it is not heated with")
+
+    async def _compare(self) -> None:
+        """What it gives with what it was left at; the trip lasts."""
+        age_s = (self._clock.now_ns() - (self._armed_ns or 0)) / NS_PER_S
+        given_mA = await self._given_mA()
+        if self._last[-1].value == 1:
+            self._trip = (
+                f"its host watchdog has tripped ({age_s:.1f} s after it was last written to): it gives {given_mA:.2f} "
+                "mA until control is started again"
+            )
+            raise DeviceFault(self.name, self._trip)
+        left_mA = self._left_mA
+        if left_mA is not None and abs(given_mA - left_mA) > _TOLERANCE_mA:
+            await self._zero()
+            text = f"gave {given_mA:.2f} mA where it was left at {left_mA:.2f} mA; does something else write to it?"
+            raise DeviceFault(self.name, text)
+
+    async def _zero(self) -> None:
+        """Confirmed by what it gives; a module that has tripped takes nothing, and gives its safe value."""
+        zero_mA, error = self._settings.zero_mA, ""
+        try:
+            self._left_mA = await self._unit.write(self._output, zero_mA)
+        except Unreachable:
+            raise
+        except DeviceError as failure:
+            error = f" ({failure.text})"
+        given_mA = await self._given_mA()
+        is_tripped = self._last[-1].value == 1
+        is_low = given_mA <= zero_mA + _TOLERANCE_mA
+        if is_low if self._present != self._output or not is_tripped else self._is_safe:
+            return
+        raise DeviceFault(self.name, f"is not confirmed at {zero_mA:g} mA, it gives {given_mA:.2f} mA{error}")
+
+    async def _given_mA(self) -> float:
+        """What flows, mA, and whether it has tripped, which become the readings."""
+        snapshot = await self._unit.snapshot([self._present, _TRIPPED])
+        sample, now_ns = snapshot.samples[self._present], self._clock.now_ns()
+        if sample.reason:
+            raise DeviceFault(self.name, f"{self._present}: {sample.reason}")
+        self._last = (
+            Reading(f"{self.name}.output", sample.value, "mA", now_ns),
+            Reading(f"{self.name}.tripped", float(snapshot.bits[_TRIPPED]), "1", now_ns),
+        )
+        return sample.value
+
+    async def _mA(self, point: str) -> float:
+        sample = (await self._unit.snapshot([point])).samples[point]
+        if sample.reason:
+            raise DeviceFault(self.name, f"{point}: {sample.reason}")
+        return sample.value
+
+    async def _is(self, coil: str) -> bool:
+        return (await self._unit.snapshot([coil])).bits[coil]
+
+    async def _clear(self) -> None:
+        async def send() -> None:
+            await self._unit.write_coil(self._unit.map.points[_TRIPPED].address, COIL_ON)
+
+        async def holds() -> bool:
+            return not await self._is(_TRIPPED)
+
+        await self._unit.checked(send, holds, "clearing the trip")
+
+    async def _switch(self, coil: str, on: bool) -> None:
+        async def send() -> None:
+            await self._unit.write_coil(self._unit.map.points[coil].address, COIL_ON if on else COIL_OFF)
+
+        async def holds() -> bool:
+            return await self._is(coil) == on
+
+        await self._unit.checked(send, holds, f"{coil} {'on' if on else 'off'}")

@@ -1,0 +1,51 @@
+"""One thing that can be broken in a simulated laboratory, and the usual ways to break it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.sim.laboratory import Laboratory
+
+Setter = Callable[[Laboratory, object], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """How something is broken: by a value, `worst` when none is given; the one that mends it; what it means. `locks`:
+    set under the plant's lock; a wire that is unplugged waits for its thread, which may want that lock."""
+
+    apply: Setter
+    worst: object
+    mended: object
+    text: str
+    locks: bool = True
+
+
+def number(value: object) -> float:
+    """A value as given, 0 for none."""
+    return float(str(value or 0))
+
+
+def number_or_none(value: object) -> float | None:
+    """A value as given."""
+    return None if value is None else float(str(value))
+
+
+def to(find: Callable[[Laboratory], object], attribute: str, kind: Callable[[object], object] = bool) -> Setter:
+    """Sets one attribute of one fake."""
+
+    def apply(laboratory: Laboratory, value: object) -> None:
+        setattr(find(laboratory), attribute, kind(value))
+
+    return apply
+
+
+def once(act: Callable[[Laboratory], None]) -> Setter:
+    """Something that happens when the fault is set, and is not undone."""
+
+    def apply(laboratory: Laboratory, value: object) -> None:
+        if value:
+            act(laboratory)
+
+    return apply

@@ -1,0 +1,122 @@
+"""Our own regulator over an analog output: it holds, it needs the same permission as a relay, and ends without us."""
+
+import asyncio
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from foundation.errors import DeviceFault
+from stand.config.stand_config import load_config, packaged
+from stand.simulator import ControlSocket, Simulator, laboratory_of
+from tests.system.virtual_stand import VirtualStand, virtual_stand
+
+LIMIT_S = 60.0  # real
+MODULE = {"registers": "icpdas-m7024", "unit": 4, "channel": 2, "watchdog_s": 12.0}
+CHANNELS = {"heater_enable": 0, "compressor": 1, "camera_power": 2}
+
+
+def stand_file(folder: Path, **sections: dict[str, Any]) -> Path:
+    data = yaml.safe_load(packaged("", "software-regulator").read_text())
+    data |= {"axes": {}, "cameras": {}, "heat_module": dict(MODULE)}
+    data["relays"]["channels"] = dict(CHANNELS)
+    for name, entries in sections.items():
+        data[name].update(entries)
+    path = folder / "stand.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+async def current_mA(stand: VirtualStand) -> float:
+    await stand.wait(5.0)
+    return stand.series["heat_module.output"][-1][1]
+
+
+async def test_it_holds_a_set_point_and_gives_nothing_without_permission(tmp_path: Path):
+    async with virtual_stand(load_config(stand_file(tmp_path))) as stand:
+        permits = stand.assembly.stand.chamber.permits
+        assert await current_mA(stand) == 4.0
+        await stand.hold(40, 1800)
+        assert abs(stand.series["regulator.pv"][-1][1] - 40) < 0.5
+        assert await current_mA(stand) > 4.0
+        permits.revoke()
+        await stand.wait(10)
+        assert await current_mA(stand) == 4.0
+        assert await stand.true("heater_W") == 0
+        permits.grant()
+        await stand.wait(10)
+        assert await current_mA(stand) > 4.0
+        await stand.assembly.stand.chamber.stop()
+        assert await current_mA(stand) == 4.0
+        await stand.wait(60)
+        assert stand.series["heat_module.tripped"][-1][1] == 0
+        assert stand.trips() == []
+
+
+async def test_a_module_that_is_gone_for_longer_than_its_watchdog_holds_the_stand_and_its_trip_is_told(tmp_path: Path):
+    async with virtual_stand(load_config(stand_file(tmp_path, bus={"timeout_s": 0.1}))) as stand:
+        await stand.hold(40, 60)
+        await stand.break_("heat_module.silent", True)
+        await stand.wait(15)
+        assert await stand.true("heater_W") == 0
+        await stand.break_("heat_module.silent", False)
+        await stand.wait(stand.assembly.config.guard.keys_s + 15)
+        assert stand.trips() == ["device_fault"]
+        assert await stand.true("heater_enabled") == 0
+
+
+async def test_a_module_whose_watchdog_wants_another_protocol_is_refused_before_anything_is_heated(tmp_path: Path):
+    config = load_config(stand_file(tmp_path, simulation={"faults": ["heat_module.refreshed_by=nothing"]}))
+    with pytest.raises(DeviceFault, match=r"heat_module.*trips though it is written to"):
+        async with virtual_stand(config):
+            pass
+
+
+RECIPE = "name: soak\nexperiments:\n  - steps:\n      - start_chamber: 45\n      - soak: 100000\n"
+FAST: dict[str, dict[str, object]] = {
+    "regulator": {"poll_s": 0.25, "sample_s": 0.25},
+    "heat_module": {"watchdog_s": 1.5},
+    "thermometer_module": {"poll_s": 0.25},
+    "relays": {"poll_s": 0.5, "self_test_s": 0.6},
+    "flap": {"poll_s": 0.5},
+    "guard": {"period_s": 0.5, "heater_hold_s": 30.0, "heater_renew_s": 5.0},
+    "recording": {"telemetry_commit_s": 0.2},
+}
+
+
+async def test_a_process_that_is_killed_leaves_the_module_at_its_safe_value_after_its_watchdogs_time(tmp_path: Path):
+    """SIGKILL, in real time: the module ends the heat, long before the enable relay's hold of 30 s."""
+    path = stand_file(tmp_path, **FAST)
+    config = load_config(path)
+    simulator = await asyncio.to_thread(Simulator, laboratory_of(config, virtual=False, seed=None, is_anywhere=True))
+    control = ControlSocket(simulator.addresses["control"])
+    await control.open()
+
+    async def plant(quantity: str) -> float:
+        return float(str((await control.request({"do": "state"}))[quantity]))
+
+    data = yaml.safe_load(path.read_text())
+    data["bus"]["address"] = simulator.addresses["bus"]
+    data["flap"]["backend_address"] = simulator.addresses["flap"]
+    data["simulation"]["control"] = simulator.addresses["control"]
+    path.write_text(yaml.safe_dump(data))
+    (tmp_path / "recipe.yaml").write_text(RECIPE)
+    run = ["run", tmp_path / "recipe.yaml", "--config", path, "--out", tmp_path / "out"]
+    process = subprocess.Popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
+    try:
+        async with asyncio.timeout(LIMIT_S):
+            while await plant("heater_W") == 0:
+                await asyncio.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        await asyncio.sleep(1.5 + 1.0)  # the plant's steps are of 0.5 s
+        assert await plant("heater_W") == 0
+        assert await plant("heater_enabled") == 1  # it is the module that has ended it
+    finally:
+        process.kill()
+        process.wait(LIMIT_S)
+        await control.close()
+        await asyncio.to_thread(simulator.stop)
