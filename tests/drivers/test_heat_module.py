@@ -126,16 +126,15 @@ async def test_reading_it_does_not_keep_alive_what_its_law_has_left():
         assert bench.heater_W() == 0.0
 
 
-@pytest.mark.parametrize(
-    ("spoil", "text"),
-    [
-        (lambda fake: fake.safe_mA.__setitem__(1, 12.0), "gives 12 mA when it is left alone (safe_1), not 4, and does"),
-        (lambda fake: fake.type_codes.__setitem__(1, 0x32), "type_code_1 is 0x32, which is no range of mA"),
-        (lambda fake: fake.coils.update({268: False}), "data_format is 0 where the register map expects 1"),
-        (lambda fake: fake.coils.update({259: True}), "watchdog_mode is 1 where the register map expects 0"),
-    ],
-    ids=["safe value", "range", "format", "watchdog mode"],
-)
+UNSAFE: list[tuple[Callable[[FakeHeatModule], object], str]] = [
+    (lambda fake: fake.safe_mA.__setitem__(1, 12.0), "gives 12 mA when it is left alone (safe_1), not 4, and does"),
+    (lambda fake: fake.type_codes.__setitem__(1, 0x32), "type_code_1 is 0x32, which is no range of mA"),
+    (lambda fake: fake.coils.update({268: False}), "data_format is 0 where the register map expects 1"),
+    (lambda fake: fake.coils.update({259: True}), "watchdog_mode is 1 where the register map expects 0"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "text"), UNSAFE, ids=["safe value", "range", "format", "watchdog mode"])
 async def test_one_that_would_not_be_safe_without_us_is_refused(spoil: Callable[[FakeHeatModule], object], text: str):
     bench = Bench()
     bench.fake.safe_fixed = True
