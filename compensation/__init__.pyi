@@ -1,9 +1,9 @@
 from compensation.arrays import observations_of as observations_of
 from compensation.calibration.calibrate import Calibration as Calibration
 from compensation.calibration.calibrate import calibrate as calibrate
-from compensation.calibration.positions import Positions as Positions
-from compensation.calibration.positions import observe_positions as observe_positions
-from compensation.calibration.stages import TableSigma as TableSigma
+from compensation.calibration.session_centres import Positions as Positions
+from compensation.calibration.session_centres import observe_positions as observe_positions
+from compensation.calibration.stage_geometry import TableSigma as TableSigma
 from compensation.drift.choosing import fit as fit
 from compensation.drift.drift_model import DriftModel as DriftModel
 from compensation.drift.evaluation import Evaluation as Evaluation

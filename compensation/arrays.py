@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.history.history import History, refined
+from compensation.history.thermal_history import History, refined
 from compensation.observations import Float, Observations, SessionFacts
 from experiments.steps import Role
 from foundation.clock import NS_PER_S

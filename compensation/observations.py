@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from compensation.finding.found import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
-from compensation.history.history import History, recorded_history
+from compensation.history.thermal_history import History, recorded_history
 from compensation.one_camera import others_ns, serial_of, take
 from compensation.one_equilibrium import check_sessions
 from experiments.steps import Role

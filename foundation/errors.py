@@ -11,7 +11,9 @@
     │   ├── Occupied           operated at the unit by hand; it takes no orders until that ends
     │   └── Superseded         a newer command, or making safe, has overtaken this one: not a fault
     ├── StandTripped           the guard has made the stand safe; an operator must clear it
-    └── SessionError           a recorded session cannot be read
+    ├── SessionError           a recorded session cannot be read
+    ├── DetectionError         no target in the image, or one that is not identified beyond doubt
+    └── CalibrationError       observations that do not determine a camera, or a pose
 
 Programming mistakes stay ValueError. Bad calls raise; bad measurements are values with a quality.
 """
@@ -78,3 +80,15 @@ class StandTripped(StandError):
 
 class SessionError(StandError):
     """A recorded session is missing, damaged or not of our making."""
+
+
+class DetectionError(StandError):
+    """The target was not found or not identified beyond doubt; `found` counts the markers that were."""
+
+    def __init__(self, text: str, found: int = 0) -> None:
+        super().__init__(text)
+        self.found = found
+
+
+class CalibrationError(StandError):
+    """Observations that do not determine a camera, or a pose; the sentence says why."""

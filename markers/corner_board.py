@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from foundation.documents import Document, load_document
+from foundation.errors import DetectionError
 from markers.april_grid import AprilGrid, find_tag_corners
-from markers.errors import DetectionError
 from markers.noise import Image, full_scale_DN
 
 SIGMA_px = 0.03

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from foundation.errors import DetectionError
 from markers.bootstrap import Candidates
-from markers.errors import DetectionError
 from markers.lattice import largest_lattice
 from markers.placement import LEAST_SEEN, Placement, placements, settled
 from markers.plane import area_scale, expected_px, fit_homography, pitch_px, project, roll_deg

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from markers.errors import DetectionError
+from foundation.errors import DetectionError
 from markers.lattice import Cell
 from markers.plane import area_scale, checked_homography, expected_px, fit_homography, pitch_px, project
 from markers.target import Target

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.errors import DetectionError
+from foundation.errors import DetectionError
 from markers.target import Target
 
 _LEAST_FOR_DEGREE = {5: 80, 3: 20}

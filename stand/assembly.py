@@ -9,14 +9,13 @@ from typing import Protocol, cast
 
 import usb.backend
 
-from drivers.devices.cameras import make_camera
+from drivers.devices.absent_devices import NoFlap, NoRelays
+from drivers.devices.cameras_by_protocol import make_camera
 from drivers.devices.climate_chamber import ClimateChamber
 from drivers.devices.flap import Flap, FlapSettings
 from drivers.devices.heat_module import HeatModule
 from drivers.devices.heat_pulses import HeatPulses
 from drivers.devices.inputs import Inputs
-from drivers.devices.no_flap import NoFlap
-from drivers.devices.no_relays import NoRelays
 from drivers.devices.probes import Probe
 from drivers.devices.protocols import Controller, Sensor, Shutter, Switches
 from drivers.devices.regulator import Regulator

@@ -10,7 +10,7 @@ _INTERRUPTED = 130  # exit_codes.INTERRUPTED, which cannot be imported before th
 def app() -> None:
     """Run the command line; ends the process."""
     try:
-        from stand.commands.commands import app as commands
+        from stand.commands.command_table import app as commands
     except KeyboardInterrupt:
         sys.stderr.write("interrupted; nothing was started\n")
         sys.exit(_INTERRUPTED)

@@ -19,7 +19,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from compensation import drift_runtime
-from compensation.apply.export import runtime_model
+from compensation.apply.runtime_export import runtime_model
 from compensation.drift.drift_model import DriftModel
 from foundation.errors import ConfigError
 from foundation.files import write_whole

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.resources
 from pathlib import Path
 
-from compensation.apply.export import export
+from compensation.apply.runtime_export import export
 from compensation.drift.drift_model import DriftModel
 from foundation.files import make_folder, write_whole
 

@@ -12,7 +12,7 @@ from compensation.budget.correction import granite_mm, indices, post_mm, refract
 from compensation.budget.geometry import Geometry, StandState
 from compensation.budget.refraction import Index, ciddor_1996, edlen_1966, tilted_shift_mm
 from compensation.budget.repeatability import Repeatability, home_residuals, v0_repeats
-from compensation.budget.states import capture_states, mean_state, states_at
+from compensation.budget.session_temperatures import capture_states, mean_state, states_at
 from foundation.errors import SessionError
 from markers.target import Target
 from recording.reading.session import Session

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.budget.states import CaptureState, capture_states
+from compensation.budget.session_temperatures import CaptureState, capture_states
 from compensation.one_camera import others_ns
 from foundation.items import Event
 from markers.detection import Detection, DetectionError, detect

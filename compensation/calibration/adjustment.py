@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from compensation.calibration.board import Board
 from compensation.calibration.bundle import Scene, problem_of
-from compensation.calibration.eccentricity import shifts_by_camera, shifts_by_homography
+from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from compensation.calibration.hand_eye import table_from_poses
 from compensation.calibration.least_squares import Float, Solution, minimise
 from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.positions import Positions
-from compensation.calibration.stages import ERRORS, TableSigma
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import ERRORS, TableSigma
 
 _ROUNDS = 10
 _OUTLIER = 8.0

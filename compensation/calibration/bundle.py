@@ -3,8 +3,8 @@
     minimise  sum |W (project(p) - centre)|^2 + sum ((X - X0)/s_X)^2 + sum (d/s_d)^2 + sum (w/s_w)^2
 
 W: inverse square root of a marker's covariance; X0, s_X: the measured or nominal board; d, w: the table's errors at a
-position (compensation/calibration/stages.py). Everything that is known enters with its uncertainty: taking board or
-table as exact would put their errors into the camera.
+position (compensation/calibration/stage_geometry.py). Everything that is known enters with its uncertainty: taking
+board or table as exact would put their errors into the camera.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from compensation.calibration.board import Board
 from compensation.calibration.least_squares import Float, whiteners
 from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.positions import Positions
-from compensation.calibration.stages import PARAMETERS, Table, TableSigma
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import PARAMETERS, Table, TableSigma
 
 _LENS_PRIOR = 0.05
 _LENS_ORDERS = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])

@@ -19,9 +19,9 @@ from compensation.calibration.model_scores import (
     rays_of,
     score_models,
 )
-from compensation.calibration.positions import Positions
 from compensation.calibration.rays import DEGREES, RayLens
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import TableSigma
 from compensation.calibration.uncertainty import Difference, UncertaintyMap, projection_uncertainty
 from markers.target import Target
 

@@ -18,7 +18,7 @@ from compensation.calibration.calibrate import Calibration
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES, Pinhole
 from compensation.calibration.rays import RayLens, exponents
-from compensation.calibration.stages import PARAMETERS
+from compensation.calibration.stage_geometry import PARAMETERS
 from foundation.documents import Document
 from foundation.errors import SessionError
 from foundation.files import write_whole
@@ -48,7 +48,7 @@ class Fit(Document):
 
 class TablePart(Document):
     """The axes and the target's mount in the camera's frame, and per position what was recorded and what was wrong
-    with it: errors d (mm) and w (rad) of compensation/calibration/stages.py, RMS residual per coordinate."""
+    with it: errors d (mm) and w (rad) of compensation/calibration/stage_geometry.py, RMS residual per coordinate."""
 
     base_mm: Triple
     linear: Triple

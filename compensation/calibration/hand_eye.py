@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
-from compensation.calibration.stages import Table
+from compensation.calibration.stage_geometry import Table
+from foundation.errors import CalibrationError
 
 _LEAST_TURN_DEG = 5.0
 _LEAST_TRAVEL_MM = 10.0

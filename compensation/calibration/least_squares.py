@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from compensation.calibration.errors import CalibrationError
+from foundation.errors import CalibrationError
 
 Float = NDArray[np.float64]
 State = TypeVar("State")

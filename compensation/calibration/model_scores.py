@@ -10,13 +10,13 @@ from scipy.spatial import ConvexHull
 
 from compensation.calibration.adjustment import Adjustment, adjust
 from compensation.calibration.board import Board
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pose import Lens, find_pose
-from compensation.calibration.positions import Positions
 from compensation.calibration.rays import DEGREES, RayLens, fit_rays
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import TableSigma
 from compensation.calibration.uncertainty import Difference, difference
+from foundation.errors import CalibrationError
 
 BROWN, RATIONAL = "pinhole, Brown", "pinhole, rational"
 _FOLDS = 5

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import Pinhole
+from foundation.errors import CalibrationError
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 

@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from compensation.calibration.board import Board
-from compensation.calibration.eccentricity import shifts_by_camera
-from compensation.calibration.errors import CalibrationError
+from compensation.calibration.centre_corrections import shifts_by_camera
 from compensation.calibration.least_squares import Float, minimise, whiteners
 from compensation.calibration.rotation import crosses
+from foundation.errors import CalibrationError
 
 _LEAST_MARKERS = 4
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.least_squares import Float
-from compensation.calibration.stages import ERRORS, PARAMETERS
+from compensation.calibration.stage_geometry import ERRORS, PARAMETERS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from compensation.calibration.board import Board
 from compensation.calibration.bundle import lens_sigma
-from compensation.calibration.eccentricity import shifts_by_camera, shifts_by_homography
-from compensation.calibration.errors import CalibrationError
+from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from compensation.calibration.least_squares import Float, Solution, minimise, whiteners
 from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.pose import find_pose
 from compensation.calibration.rotation import crosses
+from foundation.errors import CalibrationError
 
 POSE = 6
 """Parameters of a view: a turn (rad) and a shift (mm), in the camera's frame."""

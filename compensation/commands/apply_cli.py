@@ -13,16 +13,25 @@ import numpy as np
 import typer
 
 from compensation.apply.c_header import export_c
-from compensation.apply.export import export
-from compensation.apply.images import Form, corrected_image, middle_flags, write_image
-from compensation.apply.points import CAMERA, X, Y, numbers, outside_text, read_points, times, write_corrected
+from compensation.apply.compensate_images import Form, corrected_image, middle_flags, write_image
+from compensation.apply.compensate_points import (
+    CAMERA,
+    X,
+    Y,
+    numbers,
+    outside_text,
+    read_points,
+    times,
+    write_corrected,
+)
 from compensation.apply.ros2_package import export_ros2
+from compensation.apply.runtime_export import export
 from compensation.commands.options import CameraName, Incomplete, open_session
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel
-from compensation.history.history import recorded_history, states_at
 from compensation.history.states import States
+from compensation.history.thermal_history import recorded_history, states_at
 from compensation.one_camera import name_of, own_frames, take
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError

@@ -12,8 +12,8 @@ from compensation.calibration.calibrate import Calibration, Model, calibrate
 from compensation.calibration.camera_file import CameraFile, camera_file
 from compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
 from compensation.calibration.pinhole import NAMES
-from compensation.calibration.positions import observe_positions
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.session_centres import observe_positions
+from compensation.calibration.stage_geometry import TableSigma
 from compensation.commands.options import CameraName, Incomplete, TargetOption, named_target, open_session
 from compensation.observations import session_target
 from compensation.one_camera import serial_of

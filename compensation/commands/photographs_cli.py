@@ -9,7 +9,6 @@ import numpy as np
 import typer
 
 from compensation.calibration.board import board_of, board_of_corners
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.exports import EXPORTS, write_exports
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES
@@ -17,6 +16,7 @@ from compensation.calibration.view_uncertainty import in_words
 from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
 from compensation.commands.options import installed_target
 from foundation.command_app import App
+from foundation.errors import CalibrationError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to

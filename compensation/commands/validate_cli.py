@@ -16,10 +16,10 @@ from compensation.observations import Float
 from compensation.one_camera import name_of
 from compensation.reporting.validation_report import validation_page
 from compensation.validation3d.document import as_json
-from compensation.validation3d.positions import validation_frames
 from compensation.validation3d.stand_part import StandPart, stand_part
-from compensation.validation3d.summary import summary
-from compensation.validation3d.validation import LensModel, camera_of, check_same, validate
+from compensation.validation3d.validate import LensModel, camera_of, check_same, validate
+from compensation.validation3d.validation_frames import validation_frames
+from compensation.validation3d.validation_text import summary
 from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors

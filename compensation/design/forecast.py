@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.history import states_at
 from compensation.history.states import Float, Memory, States
+from compensation.history.thermal_history import states_at
 from compensation.observations import Observations
 from experiments.steps import Role
 from foundation.errors import SessionError

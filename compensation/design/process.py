@@ -19,8 +19,8 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     Plain values: the daemon that reads them has nothing of this package."""
     import cv2
 
-    from compensation.design.deciding import Wanted, decide
-    from compensation.design.night import recorded_so_far
+    from compensation.design.next_visit import Wanted, decide
+    from compensation.design.unfinished_night import recorded_so_far
 
     cv2.setNumThreads(1)
     wanted = Wanted(

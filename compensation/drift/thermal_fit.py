@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from compensation.drift.instants import Index, Instants
+from compensation.drift.condensed import Index, Instants
 from compensation.drift.terms import MOTIONS, Kind, Term
 from compensation.history.states import Float
 

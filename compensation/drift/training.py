@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compensation.drift.condensed import Instants, condense_instants
 from compensation.drift.displacements import Displacements, anchors, displacements
-from compensation.drift.instants import Instants, condense_instants
 from compensation.drift.terms import Kind, Origin, Term, features
-from compensation.history.history import states_at
 from compensation.history.states import Float, Memory, States
+from compensation.history.thermal_history import states_at
 from compensation.observations import Mask, Observations
 from experiments.steps import Role
 from foundation.errors import SessionError

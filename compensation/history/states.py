@@ -1,7 +1,7 @@
 """What a camera remembers of its thermal past, at many instants.
 
 The recursion that follows it is that of the runtime (drift_runtime.py): fed sample by sample, from a recording
-(history.py) or live, it gives the same state.
+(thermal_history.py) or live, it gives the same state.
 """
 
 from __future__ import annotations

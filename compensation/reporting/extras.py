@@ -9,7 +9,7 @@ from compensation.budget.budget import Budget
 from compensation.datasheet.details import Details
 from compensation.reporting.equipment import Line
 from compensation.reporting.table_positions import TablePositions
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
 
 
 @dataclass(frozen=True, slots=True)

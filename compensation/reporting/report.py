@@ -27,7 +27,7 @@ from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
 from compensation.reporting.result_section import result_section
 from compensation.reporting.table_positions import TablePositions, positions_figure, table_positions
 from compensation.reporting.validation_report import validation_parts
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
 from experiments.steps import Role
 from foundation.errors import SessionError
 from foundation.files import check_writable, write_whole

@@ -9,7 +9,7 @@ from compensation.drift.unrepeated import Cause
 from compensation.reporting.numbers import Numbers, Pair, ScoreNumbers, percent
 from compensation.reporting.page import Heading, Paragraph, Part, Table
 from compensation.reporting.validation_report import gains_table
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
 
 PAPER = (
     "Paper: Adamczyk et al., Temperature Compensation Method for Digital Cameras in 2D and 3D Measurement "

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from compensation.reporting.figures import I_COLOUR, J_COLOUR, new_figure, style
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
 
 AXES = ("X", "Y", "Z")
 _BEFORE, _AFTER = I_COLOUR, J_COLOUR

@@ -15,8 +15,8 @@ from compensation.reporting.figures import as_svg
 from compensation.reporting.numbers import percent
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from compensation.validation3d.summary import flagged, reason_names
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
+from compensation.validation3d.validation_text import flagged, reason_names
 
 _HEADS = ("Temp.", "Pos.", *(f"{axis} {when}" for when in ("before", "after") for axis in figures.AXES))
 

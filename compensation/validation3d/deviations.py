@@ -8,11 +8,11 @@ import numpy as np
 
 from compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
 from compensation.calibration.board import Board
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.pose import Lens
 from compensation.observations import Float, Observations
 from compensation.validation3d.poses import Doubts, Found, find, middle_mm, rotation_mrad
-from compensation.validation3d.positions import FrameIndices, ValidationFrames
+from compensation.validation3d.validation_frames import FrameIndices, ValidationFrames
+from foundation.errors import CalibrationError
 
 _LEAST_MARKERS = 12
 

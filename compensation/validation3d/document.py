@@ -11,8 +11,8 @@ import numpy as np
 from compensation.drift.drift_model import Outside
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from compensation.validation3d.summary import reason_names
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
+from compensation.validation3d.validation_text import reason_names
 
 FORMAT = "thermostand validation"
 SCHEMA_VERSION = 1

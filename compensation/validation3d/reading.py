@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 from compensation.drift.drift_model import Outside
 from compensation.observations import Float
 from compensation.validation3d.deviations import Deviations
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
 from foundation.documents import Document
 from foundation.errors import SessionError
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from compensation.budget.correction import displacement_px, varied
 from compensation.budget.geometry import Geometry, Quantity, StandState
-from compensation.budget.states import mean_state, states_at
+from compensation.budget.session_temperatures import mean_state, states_at
 from compensation.observations import Float, Observations
-from compensation.validation3d.positions import ValidationFrames
+from compensation.validation3d.validation_frames import ValidationFrames
 from foundation.errors import SessionError
 from recording.reading.session import Session
 

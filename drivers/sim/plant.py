@@ -17,8 +17,8 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from drivers.sim.bouc_wen import BoucWen
 from drivers.sim.chamber_spec import ChamberSpec, drawn
-from drivers.sim.hysteresis import BoucWen
 from drivers.sim.optics import CameraKind, Nodes, Optics, Placement, optics_at
 
 NS_PER_S = 1_000_000_000

@@ -23,15 +23,15 @@ from foundation.items import Item
 from foundation.lane import Lane
 from foundation.readings import Frame
 from recording.exporting.topics import recorded_devices
+from recording.format.decoded_items import Description
 from recording.format.holes import holes_text
 from recording.format.images import IMAGE_CLASS, ImageEncoding
-from recording.format.items import Description
 from recording.format.layout import FORMAT
 from recording.format.records import frame_places
 from recording.reading.journal_lines import JOURNAL_NAME
 from recording.reading.session import Session
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
-from recording.writing.settings import VIRTUAL_COMMIT_S
+from recording.writing.recorder_settings import VIRTUAL_COMMIT_S
 
 # Items read at once, at most one frame among them: few enough to keep memory flat, enough to make the hand-over to the
 # reading thread cheap.

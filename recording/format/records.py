@@ -22,9 +22,7 @@ from foundation.errors import SessionError
 from recording.format.damage import FileDamaged, reading
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
 from recording.format.layout import SALVAGE_METADATA, SEGMENT_METADATA, SESSION_METADATA, contradicts
-from recording.format.messages import CLASSES
-from recording.format.summary import ChunkPlace, Summary, read_summary
-from recording.format.wire import (
+from recording.format.mcap_bytes import (
     CHUNK_LIMIT_BYTES,
     RECORD,
     ChunkHead,
@@ -34,6 +32,8 @@ from recording.format.wire import (
     chunk_head,
     stream,
 )
+from recording.format.messages import CLASSES
+from recording.format.summary import ChunkPlace, Summary, read_summary
 
 _FRAME_HEAD_BYTES = 1 << 14  # schema, channel and what precedes the image; 3 KiB in the first chunk, 90 bytes in others
 SCHEMAS = {

@@ -17,22 +17,22 @@ from foundation.items import Event, StepMark
 from recording.format import messages
 from recording.format.chain import Link, misplaced, missing_segments
 from recording.format.damage import DAMAGE, reading
+from recording.format.decoded_items import event_of, step_of
 from recording.format.holes import holes_in, segments_text
 from recording.format.inventory import SegmentFile, State, inventory
-from recording.format.items import event_of, step_of
 from recording.format.layout import FINISHED, FRAMES, TELEMETRY, later_format
+from recording.format.mcap_bytes import Source
 from recording.format.records import Head, read_head, telemetry_messages
 from recording.format.summary import Summary, read_summary
 from recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
-from recording.format.wire import Source
-from recording.reading.camera_temperature import NO_TEMPERATURE, has_recorded_temperature
 from recording.reading.coverage import Coverage, coverage_of
 from recording.reading.ends import is_of_a_run, lost_end
 from recording.reading.extent import extent_of
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
-from recording.reading.kept import is_recovered
+from recording.reading.kept_originals import is_recovered
 from recording.reading.run_word import Files, Run, run_word
 from recording.reading.session import Session
+from recording.reading.temperature_present import NO_TEMPERATURE, has_recorded_temperature
 from recording.reading.walk import survey
 
 _NEAR = (messages.EVENT, messages.STEP)

@@ -26,9 +26,7 @@ from foundation.readings import Frame
 from recording.format import messages
 from recording.format.chain import Link, misplaced
 from recording.format.damage import FileDamaged, naming
-from recording.format.holes import Hole, holes_in
-from recording.format.inventory import State, inventory
-from recording.format.items import (
+from recording.format.decoded_items import (
     Description,
     ImagesToCome,
     RecordedImage,
@@ -40,6 +38,8 @@ from recording.format.items import (
     stands_for_item,
     step_of,
 )
+from recording.format.holes import Hole, holes_in
+from recording.format.inventory import State, inventory
 from recording.format.layout import DAMAGED, DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED, later_format
 from recording.format.records import (
     FramePlace,

@@ -23,9 +23,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from recording.format.damage import DAMAGE
 from recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
+from recording.format.mcap_bytes import MESSAGE, RECORD, Source, chunk_content, chunk_head, records, stream
 from recording.format.proof import Contents, claim_of, proven
 from recording.format.summary import read_summary
-from recording.format.wire import MESSAGE, RECORD, Source, chunk_content, chunk_head, records, stream
 from recording.reading.doubt import Doubt
 from recording.reading.torn import Blocks
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, Schema
 
 from recording.format.layout import FINISHED, FRAMES, TELEMETRY
-from recording.format.wire import Source
+from recording.format.mcap_bytes import Source
 from recording.reading.walk import Survey, survey
 
 SIBLINGS_PER_SERIES = 4  # enough for a vote, few enough for a night of hundreds

@@ -37,7 +37,7 @@ from recording.format.layout import (
     UNFINISHED,
     segment_metadata,
 )
-from recording.format.wire import Source
+from recording.format.mcap_bytes import Source
 from recording.reading.walk import StoredMessage, Survey, stored_messages, survey
 from recording.repair.opening import Opening, opening_of, segments_of
 from recording.repair.segment_check import check_segment

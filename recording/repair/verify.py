@@ -29,7 +29,6 @@ from recording.format.layout import (
 )
 from recording.format.records import Message
 from recording.format.utc_offsets import UtcOffsets, offsets_of
-from recording.reading.camera_temperature import NO_TEMPERATURE, has_temperature
 from recording.reading.contents import Contents, FrameKey
 from recording.reading.coverage import Coverage, coverage_of
 from recording.reading.ends import is_of_a_run, lost_end
@@ -37,10 +36,11 @@ from recording.reading.extent import Extent, extent_of
 from recording.reading.frame_account import frame_account
 from recording.reading.gaps import FRAMES_DROPPED, silences, told_blocks
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
-from recording.reading.kept import is_recovered
+from recording.reading.kept_originals import is_recovered
 from recording.reading.run_word import Files, Run, run_word
+from recording.reading.temperature_present import NO_TEMPERATURE, has_temperature
 from recording.repair.segment_check import Damage, SegmentCheck, check_segment
-from recording.writing.settings import SessionInfo
+from recording.writing.recorder_settings import SessionInfo
 
 
 class Severity(StrEnum):

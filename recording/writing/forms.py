@@ -11,8 +11,8 @@ from foundation.clock import seconds_ns
 from recording.format import messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
 from recording.format.layout import FRAMES, TELEMETRY
+from recording.writing.recorder_settings import RecordingSettings
 from recording.writing.segment import SeriesForm, Topic
-from recording.writing.settings import RecordingSettings
 
 TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it continues when frames or others fill the disk
 

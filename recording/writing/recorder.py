@@ -26,15 +26,15 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.lane import Lane
 from foundation.readings import Frame
+from recording.format.decoded_items import Description
 from recording.format.images import encode_image
-from recording.format.items import Description
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.restarts import restarted_step
 from recording.writing.disk import Disk
 from recording.writing.forms import SessionForm
 from recording.writing.homes import Beside, Homes, Kept
 from recording.writing.notices import DroppedReadings, Losses, Notice, telemetry_notice
-from recording.writing.settings import USUAL, RecordingSettings, SessionInfo
+from recording.writing.recorder_settings import USUAL, RecordingSettings, SessionInfo
 from recording.writing.waiting import Waiting
 from recording.writing.writers import DiskSeries, Fate, ImageWriter, TelemetryEncoder, TelemetryWriter, open_series
 

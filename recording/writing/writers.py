@@ -14,8 +14,8 @@ from typing import Any
 from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality
 from recording.format import messages
+from recording.format.decoded_items import Description, UndescribedFrame
 from recording.format.images import CAMERA_IMAGE
-from recording.format.items import Description, UndescribedFrame
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
 from recording.writing.forms import SessionForm

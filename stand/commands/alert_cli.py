@@ -32,7 +32,7 @@ def try_them(
 
     Example: stand alert test --config my-stand.yaml
     """
-    from stand.config.alerts import load_secrets
+    from stand.config.alerts_section import load_secrets
     from stand.config.stand_config import load_config, packaged
     from stand.serving.alerts import check_alerts
     from stand.serving.alerts_process import deliver, ping

@@ -20,7 +20,7 @@ from foundation.usage import one_line
 from stand.commands.reached import ConfigOption
 from stand.commissioning.commissioning import commission
 from stand.commissioning.finding import Finding, worst
-from stand.commissioning.genicam import rehearse
+from stand.commissioning.genicam_rehearsal import rehearse
 from stand.commissioning.record import Record
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import register_texts

@@ -19,7 +19,7 @@ from foundation.exit_codes import one_line_errors
 from foundation.output import say, show
 from foundation.usage import one_line
 from stand.config.new_stand import Axis, Connected, new_stand
-from stand.estimating.night import price_night
+from stand.estimating.run_estimate import price_night
 from stand.running.order import load_order
 
 app = App()

@@ -22,7 +22,7 @@ from stand.estimating.absent import absences
 from stand.estimating.camera_lines import camera_lines
 from stand.estimating.estimate import PricedStep
 from stand.estimating.learned import load_learned
-from stand.estimating.night import price_night
+from stand.estimating.run_estimate import price_night
 from stand.running.order import load_order
 from stand.simulator import Simulator, laboratory_of, list_faults
 

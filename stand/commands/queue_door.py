@@ -17,7 +17,7 @@ from foundation.output import say
 from stand.commands.reached import ConfigOption, TokenOption, UrlOption
 from stand.commands.submitted import submit_recipe
 from stand.config.stand_config import load_config, packaged
-from stand.estimating.night import existing, price_night, small_disk
+from stand.estimating.run_estimate import existing, price_night, small_disk
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry
 from stand.running.order import load_order

@@ -25,7 +25,7 @@ from stand.commands.submitted import daemon_of, follow, submit
 from stand.config.checked import load_checked
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.learned import learn
-from stand.estimating.night import existing, price_night, small_disk
+from stand.estimating.run_estimate import existing, price_night, small_disk
 from stand.running.order import Order, load_order
 from stand.running.resume import interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual

@@ -22,12 +22,12 @@ from foundation.output import Output, output, say
 from foundation.usage import one_line
 from stand.commands.checked_cli import warn_unchecked
 from stand.config.checked import ATTACHMENT, load_checked
-from stand.config.interface import load_tokens
+from stand.config.interface_section import load_tokens
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.daemon.desk import DaemonDesk
+from stand.daemon.daemon_desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
 from stand.serving.api.bridge import Bridge
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve as serve_clients
 from stand.serving.secop.door import door_at
 from stand.serving.viewing import Viewing

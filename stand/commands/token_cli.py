@@ -31,7 +31,7 @@ def add(name: NameArgument, config: ConfigOption = "simulated") -> None:
 
     Example: stand token add rose --config my-stand.yaml
     """
-    from stand.config.interface import TokenFile, load_tokens, write_tokens
+    from stand.config.interface_section import TokenFile, load_tokens, write_tokens
 
     with one_line_errors():
         path = _file(config)
@@ -53,7 +53,7 @@ def list_names(config: ConfigOption = "simulated") -> None:
 
     Example: stand token list --config my-stand.yaml
     """
-    from stand.config.interface import load_tokens
+    from stand.config.interface_section import load_tokens
 
     with one_line_errors():
         names = sorted(load_tokens(_file(config)))
@@ -66,7 +66,7 @@ def remove(name: NameArgument, config: ConfigOption = "simulated") -> None:
 
     Example: stand token remove rose --config my-stand.yaml
     """
-    from stand.config.interface import load_tokens, write_tokens
+    from stand.config.interface_section import load_tokens, write_tokens
 
     with one_line_errors():
         path = _file(config)

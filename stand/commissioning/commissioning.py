@@ -18,7 +18,7 @@ from foundation.errors import Unreachable
 from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
 from stand.commissioning import host
-from stand.commissioning.camera_lines import shared_lines
+from stand.commissioning.camera_line_check import shared_lines
 from stand.commissioning.finding import Finding
 from stand.commissioning.links import Links
 from stand.commissioning.moves import Moves

@@ -10,7 +10,7 @@ import time
 
 from stand.commissioning.finding import Finding
 from stand.config.stand_config import StandConfig
-from stand.estimating.night import existing
+from stand.estimating.run_estimate import existing
 
 _PIECES, _PIECE_BYTES = 8, 4_000_000
 _SLOWEST_FLUSH_S = 1.0

@@ -19,11 +19,11 @@ from foundation.readings import Quality, Reading
 from stand.assembly import Assembly, register_map
 from stand.chamber.permits import WATCHED
 from stand.commissioning import advice
-from stand.commissioning.camera_lines import packet_finding
+from stand.commissioning.camera_line_check import packet_finding
 from stand.commissioning.finding import Add, Finding
 from stand.commissioning.imager import imager_finding
-from stand.commissioning.points import unverified_points
-from stand.commissioning.thermometers import each_other
+from stand.commissioning.thermometer_comparison import each_other
+from stand.commissioning.unverified_points import unverified_points
 
 _SHOWN = 6  # readings of one device in a line
 

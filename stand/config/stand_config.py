@@ -13,7 +13,7 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
-from drivers.devices.cameras import AnyCameraSettings
+from drivers.devices.cameras_by_protocol import AnyCameraSettings
 from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
 from drivers.devices.flap import FlapSettings
 from drivers.devices.heat_module import HeatModuleSettings
@@ -30,11 +30,11 @@ from drivers.wires.bus import BusSettings
 from experiments.parameters import Chamber_degC
 from foundation.documents import Document, load_document
 from foundation.errors import ConfigError
-from stand.config.alerts import AlertsConfig
+from stand.config.alerts_section import AlertsConfig
+from stand.config.chamber_section import ChamberConfig
 from stand.config.dew import DewConfig, EndingConfig
-from stand.config.guard import GuardConfig
-from stand.config.interface import InterfaceConfig
-from stand.config.looks import ChamberConfig
+from stand.config.guard_section import GuardConfig
+from stand.config.interface_section import InterfaceConfig
 from stand.config.older_forms import CAMERA, renewed
 from stand.config.safe_ranges import check, outside
 from stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig

@@ -25,8 +25,8 @@ from recording.writing.recorder import FINISH_WITHIN_S
 from stand.daemon import systemd
 from stand.daemon.by_hand import ByHand
 from stand.daemon.counters import Counters
+from stand.daemon.daemon_file import Kept, KeptFile, Latch
 from stand.daemon.house_record import HouseRecord
-from stand.daemon.kept import Kept, KeptFile, Latch
 from stand.daemon.orders import Orders
 from stand.fault import Fault
 from stand.queueing.queue_file import Entry, working

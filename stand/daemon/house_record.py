@@ -27,7 +27,7 @@ from recording.reading.run_word import Run
 from recording.reading.session import Session
 from recording.writing.disk import Disk
 from recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
-from recording.writing.settings import SessionInfo
+from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly
 from stand.running.session_files import recorder_in, tell_identities
 

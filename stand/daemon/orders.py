@@ -23,7 +23,7 @@ from foundation.readings import Quality
 from recording.reading.session import Session
 from recording.writing.disk import Disk
 from stand.config.checked import ATTACHMENT
-from stand.estimating.night import Night, existing, price_night, small_disk
+from stand.estimating.run_estimate import Night, existing, price_night, small_disk
 from stand.queueing import queue
 from stand.queueing.queue import Asked, order_of
 from stand.queueing.queue_disk import QueueDisk

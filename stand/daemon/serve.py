@@ -18,9 +18,9 @@ from stand.config.checked import ATTACHMENT
 from stand.config.safe_ranges import accepted_text
 from stand.config.stand_config import StandConfig
 from stand.daemon.daemon import Daemon
-from stand.daemon.desk import DaemonDesk
+from stand.daemon.daemon_desk import DaemonDesk
+from stand.daemon.daemon_file import KeptFile, kept_in
 from stand.daemon.house_record import HouseRecord
-from stand.daemon.kept import KeptFile, kept_in
 from stand.daemon.orders import Orders
 from stand.daemon.reports import Reports
 from stand.running.claim import claimed

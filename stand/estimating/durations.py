@@ -30,7 +30,7 @@ from experiments.steps import (
 )
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
-from stand.estimating.thermal_model import ChamberModel
+from stand.estimating.chamber_model import ChamberModel
 
 # Until recorded nights have shown better, s: a flap's travel with its confirmation, homing from near the switch.
 _FLAP_TRAVEL_S = 3.0

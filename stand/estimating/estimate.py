@@ -27,9 +27,9 @@ from experiments.steps import (
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
 from stand.estimating.camera_lines import overloaded
+from stand.estimating.chamber_model import ChamberModel
 from stand.estimating.durations import COOL_DOWN_AS_FOUND, LABORATORY_degC, Situation, axis_of, expect
 from stand.estimating.learned import Learned
-from stand.estimating.thermal_model import ChamberModel
 
 # Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
 # with its share of the index, committed every second.

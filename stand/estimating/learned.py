@@ -20,8 +20,8 @@ from foundation.files import replace_file
 from foundation.items import StepMark, StepState
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig
+from stand.estimating.chamber_model import ChamberModel, Ramp, fit, ramps_of
 from stand.estimating.durations import Situation, expect
-from stand.estimating.thermal_model import ChamberModel, Ramp, fit, ramps_of
 
 LEARNED_FILE = "learned.json"
 _NIGHTS = 5  # as far back as a stand is likely to be as it is now

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from foundation.clock import NS_PER_S, seconds_ns
-from stand.config.looks import CameraFeelsConfig, GraniteFeelsConfig
+from stand.config.chamber_section import CameraFeelsConfig, GraniteFeelsConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering

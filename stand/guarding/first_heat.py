@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from foundation.clock import seconds_ns
-from stand.config.looks import FirstHeatConfig
+from stand.config.chamber_section import FirstHeatConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
 from stand.guarding.interlocks import Rule

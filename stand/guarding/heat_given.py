@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from foundation.clock import NS_PER_S, seconds_ns
-from stand.config.looks import ChamberConfig, HeatFeltConfig
+from stand.config.chamber_section import ChamberConfig, HeatFeltConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering

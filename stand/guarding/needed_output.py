@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from foundation.clock import seconds_ns
-from stand.config.looks import NeededOutputConfig
+from stand.config.chamber_section import NeededOutputConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
 from stand.guarding.interlocks import Rule

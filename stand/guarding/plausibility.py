@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from foundation.clock import NS_PER_S, seconds_ns
-from stand.config.guard import CoolingConfig, HeaterOffConfig, HeatingConfig
+from stand.config.guard_section import CoolingConfig, HeaterOffConfig, HeatingConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from experiments.steps import SoakUntilSettled
 from foundation.clock import NS_PER_S
-from stand.estimating.thermal_model import BAND_K
+from stand.estimating.chamber_model import BAND_K
 
 if TYPE_CHECKING:
     from markers.detection import Detection

@@ -11,7 +11,7 @@ from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from stand.config.stand_config import StandConfig
 from stand.estimating.learned import learn
-from stand.estimating.night import price_night
+from stand.estimating.run_estimate import price_night
 from stand.queueing.queue import order_of
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Halt, Notes

@@ -23,7 +23,7 @@ from recording.reading.contents import RUN_END
 from recording.reading.run_word import Run
 from recording.writing.recorder import Recorder
 from stand.assembly import Assembly
-from stand.estimating.night import price_night
+from stand.estimating.run_estimate import price_night
 from stand.fault import Fault
 from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from stand.running.camera_gap import OffsetGap, OffsetWatch, doubt
@@ -41,7 +41,7 @@ from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.status import StatusBoard
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.running.to_ambient import to_ambient
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.api.server import preload, serve
 from stand.serving.eta_slip import EtaSlip
 

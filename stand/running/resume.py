@@ -24,7 +24,7 @@ from recording.reading.glance import glance
 from recording.reading.run_word import Run, last_run_event
 from recording.reading.session import Session
 from recording.repair.salvage import Salvaged, salvage_unfinished
-from recording.writing.settings import SessionInfo
+from recording.writing.recorder_settings import SessionInfo
 from stand.config.stand_config import StandConfig
 from stand.running.actions import cold_start
 from stand.running.camera_gap import CameraBefore, camera_before

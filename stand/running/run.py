@@ -17,10 +17,9 @@ from foundation.tasks import cancelled, cause_of, failure_text
 from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
 from recording.writing.disk import Disk
 from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
-from recording.writing.settings import SessionInfo
+from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly, assemble
 from stand.config.safe_ranges import accepted_text
-from stand.running.camera_temperature import check_temperature
 from stand.running.claim import claimed
 from stand.running.clock_watch import ClockWatch
 from stand.running.guest import Guest, Job
@@ -31,6 +30,7 @@ from stand.running.rehearsal import rehearsed
 from stand.running.resume import Interruption, is_of_virtual_time
 from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory, tell_identities
 from stand.running.stop import Interrupted, Stop
+from stand.running.temperature_check import check_temperature
 from stand.serving.alerts import alerting
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 

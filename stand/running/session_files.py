@@ -20,7 +20,7 @@ from markers.target import Target
 from recording.format.roi import RoiEncoder
 from recording.writing.disk import Disk
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
-from recording.writing.settings import VIRTUAL_COMMIT_S
+from recording.writing.recorder_settings import VIRTUAL_COMMIT_S
 from stand.assembly import Assembly
 from stand.config.stand_config import RecordingConfig, StandConfig
 from stand.estimating.absent import absences

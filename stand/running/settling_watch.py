@@ -16,7 +16,7 @@ from foundation.items import Batch, Event, Item
 from foundation.lane import Lane
 from foundation.readings import Frame, Reading
 from markers.target import Target
-from stand.estimating.thermal_model import BAND_K
+from stand.estimating.chamber_model import BAND_K
 from stand.imaging.settling import Float, Seen, digit_K, judge, movement, seconds
 from stand.stand import Stand
 

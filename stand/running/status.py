@@ -11,7 +11,7 @@ from foundation.items import Batch, Event, Item, StepMark
 from foundation.readings import Quality
 from recording.writing.recorder import Recorder
 from stand.estimating.eta import Eta
-from stand.estimating.night import Night
+from stand.estimating.run_estimate import Night
 from stand.fault import Fault
 from stand.gate import Gate, Phase
 from stand.running.state import RunState

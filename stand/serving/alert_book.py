@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 from foundation.clock import seconds_ns
 from foundation.items import Event
-from stand.config.alerts import Cause
+from stand.config.alerts_section import Cause
 
 # raised: told at once. lasting: told when it is not over within the grace time. over: the end of one.
 Phase = Literal["raised", "lasting", "over"]

@@ -22,7 +22,7 @@ from foundation.helper import Helper
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.tasks import cancelled, cause_of, failure_text
-from stand.config.alerts import AlertsConfig, load_secrets
+from stand.config.alerts_section import AlertsConfig, load_secrets
 from stand.serving.alert_book import RUN_FAILED, AlertBook, Message, sign_of
 from stand.serving.alerts_process import MISSING, MODULE, deliver, ping
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Thread
 
 from foundation.errors import ConfigError
-from stand.config.alerts import load_secrets
+from stand.config.alerts_section import load_secrets
 
 MODULE = "stand.serving.alerts_process"
 LEFT_NAME = "stand-alert-left"  # of a process whose daemon has gone

@@ -22,7 +22,7 @@ from stand.serving.api.bridge import Bridge, NoAnswer
 from stand.serving.api.recorded import Disk, SessionName, session_in
 from stand.serving.api.stream import json_of
 from stand.serving.desk import Missing
-from stand.serving.history import MOST_POINTS
+from stand.serving.live_history import MOST_POINTS
 from stand.serving.preview_process import session_columns, session_drift
 from stand.serving.viewing import Viewing
 

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from foundation.errors import DetectionError
 from markers.detection import Detection, detect, grey_image
 from markers.edge_model import SIGMA
-from markers.errors import DetectionError
 from markers.plane import project, roll_deg
 from markers.target import Target
 from stand.serving.shot import DRIFT_ROLES, Image, Shot

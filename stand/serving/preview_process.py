@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from foundation.helper import go_behind_all_others
 
 if TYPE_CHECKING:
-    from stand.serving.history import Columns, History
+    from stand.serving.live_history import Columns, History
     from stand.serving.preview import Previewer
     from stand.serving.recorded_drift import Recalled, SessionDrift
 

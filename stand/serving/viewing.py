@@ -20,7 +20,7 @@ from foundation.helper import Helper, Line
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame
-from stand.serving.history import History
+from stand.serving.live_history import History
 from stand.serving.preview_process import MODULE, previewer, recorded_week, run_references
 from stand.serving.shot import Shot, is_reference
 

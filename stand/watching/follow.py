@@ -14,7 +14,7 @@ from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality
 from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
 from stand.estimating.eta import Eta
-from stand.estimating.night import Night
+from stand.estimating.run_estimate import Night
 from stand.watching.moment import AIR, CAMERA, SET_POINT, Moment, held_by
 from stand.watching.remedies import next_command
 

@@ -19,7 +19,7 @@ from foundation.clock import NS_PER_S, Now, WallClock
 from foundation.hub import Hub
 from foundation.output import output
 from foundation.usage import one_line
-from stand.estimating.night import Night
+from stand.estimating.run_estimate import Night
 from stand.running.order import Order
 from stand.running.resume import Interruption
 from stand.watching.aside import aside

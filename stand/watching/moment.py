@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from stand.estimating.night import existing
+from stand.estimating.run_estimate import existing
 from stand.gate import IN_WORDS
 from stand.serving.desk import StandState
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from compensation.calibration.adjustment import Adjustment, adjust
 from compensation.calibration.board import Board
-from compensation.calibration.eccentricity import shifts_by_homography
+from compensation.calibration.centre_corrections import shifts_by_homography
 from compensation.calibration.hand_eye import table_from_poses
 from compensation.calibration.model_scores import halves, rays_of
 from compensation.calibration.opencv import OpencvCalibration, calibrate_opencv
-from compensation.calibration.positions import Positions
-from compensation.calibration.stages import Table, TableSigma
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import Table, TableSigma
 from tests.bench.figures import Figure, at_most, in_turns, milliseconds, progress, side_by_side, skipped
 from tests.compensation.calibration_cases import CENTRE_mm, board, positions, translation_errors_um
 from tests.compensation.calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from compensation.design.deciding import Wanted, decide
+from compensation.design.next_visit import Wanted, decide
 from compensation.drift.choosing import fit
 from experiments.known import Enough, Frames, Visit, after_decision, first_decision, fixed_visits
 from experiments.parameters import Known

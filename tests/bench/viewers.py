@@ -25,7 +25,7 @@ from stand.running.fold import fold
 from stand.running.journal import Logbook
 from stand.running.run_desk import RunDesk
 from stand.running.stop import Interrupted, Stop
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve
 from stand.serving.client import Server, server_of
 from stand.serving.desk import Done, StandState, Who

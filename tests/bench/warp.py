@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.apply.images import warp
+from compensation.apply.compensate_images import warp
 from compensation.drift_runtime import source_offset
 from markers.detection import detect
 from markers.target import load_target

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from compensation.calibration.board import Board, board_of
 from compensation.calibration.pose import Lens, find_pose
-from compensation.calibration.positions import Positions
-from compensation.calibration.stages import Table
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import Table
 from markers.target import Target
 
 from .calibration_truth import SIZE, Laboratory, true_table_frame

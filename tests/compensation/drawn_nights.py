@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.history import History, refined
+from compensation.history.thermal_history import History, refined
 from compensation.observations import Observations
 
 from .drawn_cameras import (

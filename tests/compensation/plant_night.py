@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.history import History, refined
+from compensation.history.thermal_history import History, refined
 from compensation.observations import Observations, SessionFacts
 from drivers.sim.optics import CameraKind, true_centres_px
 from drivers.sim.plant import Plant, PlantSpec

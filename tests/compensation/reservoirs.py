@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.history import History
+from compensation.history.thermal_history import History
 from compensation.observations import Observations
 
 from .synthetic import SIZE, TARGET, facts

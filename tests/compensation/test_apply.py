@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.apply.export import export, runtime_model
+from compensation.apply.runtime_export import export, runtime_model
 from compensation.cli import app
 from compensation.drift.drift_model import DriftModel, Outside
 from compensation.drift.facts import ModelFacts
@@ -24,8 +24,8 @@ from compensation.drift.polynomial import exponents
 from compensation.drift.terms import Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
 from compensation.drift_runtime import Drift
-from compensation.history.history import recorded_history, states_at
 from compensation.history.states import States, row_of, state_of
+from compensation.history.thermal_history import recorded_history, states_at
 from compensation.observations import session_target
 from foundation.errors import SessionError
 from markers.detection import detect

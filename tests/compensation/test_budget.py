@@ -18,7 +18,7 @@ from compensation.budget.budget import Budget, budget
 from compensation.budget.correction import displacement_px, granite_mm, post_mm, stand_correction
 from compensation.budget.geometry import Geometry, StandState, load_geometry
 from compensation.budget.repeatability import home_residuals
-from compensation.budget.states import mean_state
+from compensation.budget.session_temperatures import mean_state
 from drivers.sim import optics
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.errors import ConfigError

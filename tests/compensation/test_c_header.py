@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from compensation.apply.c_header import export_c, header_text
-from compensation.apply.export import runtime_model
-from compensation.apply.images import warp
+from compensation.apply.compensate_images import warp
+from compensation.apply.runtime_export import runtime_model
 from compensation.drift.choosing import fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift_runtime import AMBIENT, CAMERA, HISTORY, STATE, SWITCHED_ON, Drift

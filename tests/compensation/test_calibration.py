@@ -9,12 +9,12 @@ import pytest
 
 from compensation.calibration.adjustment import Adjustment, adjust
 from compensation.calibration.calibrate import calibrate
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.model_scores import BROWN, best, halves, rays_of
 from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pose import find_pose
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.stage_geometry import TableSigma
 from compensation.calibration.uncertainty import difference, projection_uncertainty
+from foundation.errors import CalibrationError
 
 from .calibration_cases import CENTRE_mm, board, covariances, positions, target_of, translation_errors_um
 from .calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw

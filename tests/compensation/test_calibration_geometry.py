@@ -9,15 +9,15 @@ import pytest
 from compensation.calibration.adjustment import Scene
 from compensation.calibration.board import Board
 from compensation.calibration.bundle import problem_of
-from compensation.calibration.eccentricity import shifts_by_camera, shifts_by_homography
-from compensation.calibration.errors import CalibrationError
+from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from compensation.calibration.hand_eye import table_from_poses
 from compensation.calibration.least_squares import minimise
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.pose import find_pose
 from compensation.calibration.rays import fit_rays
 from compensation.calibration.rotation import across
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.stage_geometry import TableSigma
+from foundation.errors import CalibrationError
 
 from .calibration_cases import board, positions
 from .calibration_truth import SIZE, TrueCamera, Truth, draw, ellipse_centres

@@ -15,12 +15,11 @@ from typer.testing import CliRunner, Result
 
 from compensation import cli
 from compensation.calibration.camera_file import CameraFile
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.pose import find_pose
-from compensation.calibration.positions import observe_positions
+from compensation.calibration.session_centres import observe_positions
 from compensation.observations import session_target
 from foundation.clock import NS_PER_S, VirtualClock
-from foundation.errors import SessionError
+from foundation.errors import CalibrationError, SessionError
 from foundation.hub import Hub
 from foundation.items import Batch, StepMark, StepState
 from foundation.readings import Frame, Quality, Reading

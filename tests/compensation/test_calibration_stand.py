@@ -9,8 +9,8 @@ from compensation.calibration.adjustment import adjust
 from compensation.calibration.board import board_of
 from compensation.calibration.model_scores import rays_of
 from compensation.calibration.pose import find_pose
-from compensation.calibration.positions import Positions
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import TableSigma
 from drivers.sim.optics import Nodes, Optics, Placement, optics_at, true_centres_px
 from markers.target import load_target
 from stand.config.stand_config import packaged

@@ -11,10 +11,10 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation.calibration.board import Board
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.view_uncertainty import in_words, projection_sigma_um
 from compensation.calibration.views import ViewCalibration, Views, calibrate_views, cross_validated_px
 from compensation.cli import app
+from foundation.errors import CalibrationError
 
 from .calibration_cases import board
 from .calibration_truth import SIZE, Laboratory, Truth, draw

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from compensation.design.courses import Known, best_course
-from compensation.design.deciding import Wanted, decide
 from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
+from compensation.design.next_visit import Wanted, decide
 from compensation.drift.training import frame_states
 from compensation.history.states import Float, Memory
 from compensation.observations import Observations

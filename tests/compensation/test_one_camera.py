@@ -15,7 +15,7 @@ from compensation.drift.facts import ModelFacts
 from compensation.drift.model_file import save_model
 from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import exponents
-from compensation.history.history import recorded_history
+from compensation.history.thermal_history import recorded_history
 from compensation.observations import observe
 from compensation.one_camera import name_of, own_frames, take
 from foundation.clock import NS_PER_S, VirtualClock

@@ -18,7 +18,7 @@ from compensation.reporting.table_positions import TablePositions, table_positio
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.document import as_json
 from compensation.validation3d.reading import load_validation
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
 from foundation.errors import SessionError
 from foundation.items import StepMark, StepState
 

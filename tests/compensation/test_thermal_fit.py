@@ -19,8 +19,8 @@ from compensation.drift.terms import Kind
 from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
-from compensation.history.history import states_at
 from compensation.history.states import States, row_of, state_of
+from compensation.history.thermal_history import states_at
 from compensation.observations import Observations, concatenate
 from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.history.history import History
+from compensation.history.thermal_history import History
 from compensation.observations import Observations, concatenate
 from compensation.reporting import drift_figures
 from compensation.reporting.figures import as_svg

@@ -14,8 +14,7 @@ from compensation.calibration.adjustment import adjust
 from compensation.calibration.averages import mean_centres
 from compensation.calibration.calibrate import Model, calibrate
 from compensation.calibration.camera_file import CameraFile, camera_file
-from compensation.calibration.errors import CalibrationError
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.stage_geometry import TableSigma
 from compensation.drift.drift_model import Outside
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
@@ -25,9 +24,9 @@ from compensation.validation3d.deviations import Camera, Deviations, deviations
 from compensation.validation3d.document import as_json
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
 from compensation.validation3d.poses import Doubts, find
-from compensation.validation3d.summary import summary
-from compensation.validation3d.validation import LensModel, Validation, camera_of, check_same, validate
-from foundation.errors import SessionError
+from compensation.validation3d.validate import LensModel, Validation, camera_of, check_same, validate
+from compensation.validation3d.validation_text import summary
+from foundation.errors import CalibrationError, SessionError
 
 from .calibration_cases import board, positions, target_of
 from .calibration_truth import SIZE, Laboratory, Truth, draw

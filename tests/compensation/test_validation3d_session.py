@@ -19,12 +19,12 @@ from compensation import cli
 from compensation.budget.geometry import load_geometry
 from compensation.calibration.calibrate import Model, calibrate
 from compensation.calibration.camera_file import camera_file
-from compensation.calibration.positions import Positions
-from compensation.calibration.stages import TableSigma
+from compensation.calibration.session_centres import Positions
+from compensation.calibration.stage_geometry import TableSigma
 from compensation.drift.model_file import save_model
 from compensation.drift.paper_fit import fit_paper
 from compensation.observations import Float, Observations, observe_session, session_target
-from compensation.validation3d.positions import validation_frames
+from compensation.validation3d.validation_frames import validation_frames
 from experiments.steps import Role
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.documents import parse_document

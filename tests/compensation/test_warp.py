@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from compensation.apply.images import warp
+from compensation.apply.compensate_images import warp
 from compensation.drift_runtime import LATTICE_PX, source_offset
 from markers.detection import detect
 from markers.target import load_target

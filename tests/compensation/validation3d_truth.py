@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.observations import Observations
-from compensation.validation3d.positions import ValidationFrames
+from compensation.validation3d.validation_frames import ValidationFrames
 
 from .calibration_truth import SIZE, VALIDATION, Laboratory, Truth, ellipse_centres
 from .synthetic import CAMERA_ABOVE_CHAMBER_K, REFERENCE_DEGC, TARGET, facts

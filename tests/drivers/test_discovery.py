@@ -14,7 +14,7 @@ from drivers.sim.genicam import features
 from drivers.sim.gvcp import Command, Request
 from drivers.sim.gvcp_device import ControlChannel
 from drivers.wires.discovery import GVCP_PORT, FoundCamera, cameras_at, decode_answer, usb_devices
-from stand.commands.commands import app
+from stand.commands.command_table import app
 
 HERE, SILENT = "127.0.0.91", "127.0.0.92"
 

@@ -10,8 +10,8 @@ import pytest
 import zstandard
 
 from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.mcap_bytes import CHUNK, LENGTH, RECORD, Source
 from recording.format.range_crc import RangeCrcs
-from recording.format.wire import CHUNK, LENGTH, RECORD, Source
 from recording.repair.salvage import salvage_session
 from tests.recording.damage import read_segment, write_segment
 

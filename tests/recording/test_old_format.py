@@ -17,7 +17,7 @@ from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 from recording.repair.verify import verify
-from stand.commands.commands import app as stand
+from stand.commands.command_table import app as stand
 
 SESSION = Path(__file__).parent / "data" / "20260101T180000Z-format-1"
 CYCLE = SESSION.with_name("20260101T180000Z-format-1-cycle")

@@ -9,7 +9,7 @@ from dataclasses import asdict
 
 import pytest
 
-from drivers.sim.hysteresis import BoucWen
+from drivers.sim.bouc_wen import BoucWen
 from drivers.sim.plant import NS_PER_S, Plant, PlantSpec, STEP_ns
 
 START_ns = 1_700_000_000 * NS_PER_S

@@ -14,7 +14,7 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from stand.gate import INTERLOCK, OPERATOR, Gate
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve
 from stand.serving.desk import (
     Conflict,

@@ -34,7 +34,7 @@ class Answer:
 def run_here(words: list[str]) -> None:
     """In the forked process; does not return."""
     from compensation.cli import app as compensate
-    from stand.commands.commands import app as stand
+    from stand.commands.command_table import app as stand
 
     status = CRASHED
     try:

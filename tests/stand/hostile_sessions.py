@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 from recording.format import messages
 from recording.format.images import CAMERA_IMAGE
 from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.wire import CHUNK, LENGTH, RECORD
+from recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
 
 SOUND, INCOMPLETE, DAMAGED, UNKNOWN, NONE = "sound", "incomplete", "damaged", "unknown", ""
 GB = 1 << 30

@@ -17,7 +17,7 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading
 from stand.gate import INTERLOCK, OPERATOR
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.desk import (
     Argument,
     DeviceState,

@@ -10,7 +10,7 @@ from pydantic import JsonValue
 from foundation.errors import DeviceFault, Refused, Unreachable
 from foundation.items import Batch
 from foundation.readings import Reading, bad_reading
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.desk import (
     Argument,
     Conflict,

@@ -13,8 +13,8 @@ from foundation.clock import VirtualClock, WallClock
 from foundation.errors import ConfigError, DeviceError
 from foundation.hub import Hub
 from foundation.items import Event
-from stand.commands.commands import app
-from stand.config.alerts import AlertsConfig, load_secrets
+from stand.commands.command_table import app
+from stand.config.alerts_section import AlertsConfig, load_secrets
 from stand.config.stand_config import packaged
 from stand.running.order import load_order
 from stand.running.run import run_real

@@ -13,7 +13,7 @@ from foundation.documents import parse_document
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from stand.assembly import assemble
-from stand.commissioning.camera_lines import shared_lines
+from stand.commissioning.camera_line_check import shared_lines
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, packaged
 from stand.estimating.camera_lines import camera_lines

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.devices.thermal_imager import ThermalImagerSettings
 from drivers.sim.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
-from stand.commissioning.camera_lines import packet_finding
+from stand.commissioning.camera_line_check import packet_finding
 from stand.commissioning.imager import imager_finding
 
 WARM = np.full((HEIGHT, WIDTH), 31.0)

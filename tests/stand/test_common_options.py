@@ -20,7 +20,7 @@ from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.output import output, say, show
 from foundation.version import installed_version
-from stand.commands.commands import app as stand
+from stand.commands.command_table import app as stand
 
 NOTHING_TO_SAY = {"stand serve", "stand queue start"}  # to a program, that is
 PROGRAMS = {"stand": stand, "compensate": compensate}

@@ -15,7 +15,7 @@ from foundation.clock import NS_PER_S
 from foundation.items import Event
 from stand.commands.control_cli import app, status_lines
 from stand.config.stand_config import packaged
-from stand.estimating.night import Night
+from stand.estimating.run_estimate import Night
 from stand.gate import Gate
 from stand.running.state import RunState
 from stand.running.status import StatusBoard

@@ -13,7 +13,7 @@ from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from stand.daemon import systemd
 from stand.daemon.counters import Counters
-from stand.daemon.kept import Kept, KeptFile, Latch, kept_in
+from stand.daemon.daemon_file import Kept, KeptFile, Latch, kept_in
 from stand.daemon.reports import Reports
 
 

@@ -33,11 +33,11 @@ from foundation.errors import ConfigError
 from foundation.items import Event, StepMark, StepState
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.estimating.chamber_model import ChamberModel, Response
 from stand.estimating.durations import Situation, expect, move_s
 from stand.estimating.estimate import PricedStep, price, way_back_s
 from stand.estimating.eta import Eta
 from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
-from stand.estimating.thermal_model import ChamberModel, Response
 from stand.running.entries import Change, Edited, Extended, Skipped, data_of
 from tests.recording.recorded import record
 

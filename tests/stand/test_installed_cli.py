@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation.cli import app as compensate
-from stand.commands.commands import app as stand
+from stand.commands.command_table import app as stand
 from stand.config.stand_config import packaged
 
 

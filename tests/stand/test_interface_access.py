@@ -14,7 +14,7 @@ from websockets.asyncio.client import connect
 from foundation.errors import ConfigError
 from stand.serving.api import access
 from stand.serving.api.access import BODY_LIMIT_BYTES, COOKIE, CSP, STOP_PATH, Access, is_open
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.client import server_at
 from tests.stand.a_desk import ADesk, served
 

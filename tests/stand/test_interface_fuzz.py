@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import free_port
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from compensation.cli import app as compensate
 from foundation.usage import Lazy, lazy_app
-from stand.commands.commands import app as stand
+from stand.commands.command_table import app as stand
 
 APPS = {"stand": stand, "compensate": compensate}
 EACH = [(name, command) for name, app in APPS.items() for command in get_command(app).commands]

@@ -7,7 +7,7 @@ from foundation.clock import seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch
 from foundation.readings import Reading, bad_reading
-from stand.config.looks import (
+from stand.config.chamber_section import (
     CameraFeelsConfig,
     ChamberConfig,
     FirstHeatConfig,

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from foundation.documents import parse_document
 from foundation.errors import ConfigError
-from stand.commands.commands import app
+from stand.commands.command_table import app
 from stand.config.migration import migrated
 from stand.config.older_forms import renewed
 from stand.config.stand_config import StandConfig, packaged

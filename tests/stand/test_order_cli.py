@@ -7,7 +7,7 @@ from pathlib import Path
 from typer.testing import CliRunner, Result
 
 from stand.commands.order_cli import app
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import free_port
 

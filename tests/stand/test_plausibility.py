@@ -9,7 +9,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch
 from foundation.readings import Reading, bad_reading
-from stand.config.guard import HeaterOffConfig, HeatingConfig
+from stand.config.guard_section import HeaterOffConfig, HeatingConfig
 from stand.config.stand_config import load_config, packaged
 from stand.fault import Fault
 from stand.guarding.plausibility import (

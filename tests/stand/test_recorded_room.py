@@ -9,7 +9,7 @@ import pytest
 
 from stand.serving.api import recorded
 from stand.serving.api.bridge import NoAnswer
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.api.recorded import REPORT, REPORT_CSP, Disk
 from tests.recording.recorded import record
 from tests.stand.a_desk import ADesk, served

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import ConfigError
-from stand.commissioning.genicam import rehearse
+from stand.commissioning.genicam_rehearsal import rehearse
 from tests.dialects import DIALECTS
 from tests.system.conftest import require_aravis
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from compensation.cli import app as compensate
 from compensation.commands.schema_cli import DOCUMENTS as OFFLINE
 from foundation.schemas import schema_text
-from stand.commands.commands import app as stand
+from stand.commands.command_table import app as stand
 from stand.commands.config_cli import DOCUMENTS
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -14,7 +14,7 @@ import pytest
 from stand.gate import INTERLOCK
 from stand.serving.desk import FaultState
 from stand.serving.secop import door
-from stand.serving.secop.messages import LINE_LIMIT_BYTES, Request, message, parsed
+from stand.serving.secop.secop_lines import LINE_LIMIT_BYTES, Request, message, parsed
 from tests.stand.secop_desk import JAM, NO, WIRE, SecopDesk, node
 from tests.stand.test_interface_access import EVIL, PROXIED, TOKEN
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from typer.testing import CliRunner, Result
 
-from stand.commands.commands import app
+from stand.commands.command_table import app
 from stand.config.stand_config import packaged
 
 CONFIG = packaged("", "simulated")

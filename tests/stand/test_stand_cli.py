@@ -9,10 +9,10 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from stand.commands.commands import app
+from stand.commands.command_table import app
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
-from stand.estimating.night import small_disk
+from stand.estimating.run_estimate import small_disk
 from stand.running.order import load_order
 
 runner = CliRunner()

@@ -13,7 +13,7 @@ from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from foundation.items import StepMark, StepState
 from stand.serving.api import stream as streams
 from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.api.stream import MOST_VIEWERS, Stream
 from stand.serving.client import ask, server_of
 from stand.serving.desk import StandState

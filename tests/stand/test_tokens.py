@@ -9,7 +9,7 @@ from typer.testing import CliRunner, Result
 
 from foundation.errors import ConfigError
 from stand.commands.token_cli import app
-from stand.config.interface import load_tokens, write_tokens
+from stand.config.interface_section import load_tokens, write_tokens
 from stand.config.stand_config import load_config, packaged
 
 TOKEN = "correct-horse-battery-staple"

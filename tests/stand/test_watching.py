@@ -17,7 +17,7 @@ from foundation.readings import Reading, bad_reading
 from recording.format.utc_offsets import UtcOffsets
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price
-from stand.estimating.night import Night
+from stand.estimating.run_estimate import Night
 from stand.serving.desk import ReadingState, StandState
 from stand.watching.follow import Follow
 from stand.watching.live import Foot, Lines

@@ -8,7 +8,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from recording.reading.session import Session
-from stand.commands.commands import app
+from stand.commands.command_table import app
 from tests.system.conftest import require_aravis
 
 RECIPE = """

@@ -15,7 +15,7 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.readings import Reading, bad_reading
 from recording.reading.session import Session
-from stand.commands.commands import app
+from stand.commands.command_table import app
 from stand.config.stand_config import load_config, packaged
 from stand.guarding.rules import camera_measured
 from stand.running.entries import Again, Step

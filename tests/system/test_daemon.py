@@ -23,7 +23,7 @@ from recording.reading.session import Session
 from stand.assembly import assemble
 from stand.config.stand_config import load_config, packaged
 from stand.daemon.daemon import Daemon
-from stand.daemon.desk import DaemonDesk
+from stand.daemon.daemon_desk import DaemonDesk
 from stand.daemon.house_record import HouseRecord
 from stand.daemon.serve import serve as serve_stand
 from stand.running.guest import Guest

@@ -16,9 +16,9 @@ from foundation.hub import Hub
 from foundation.items import Event
 from stand.config.stand_config import load_config, packaged
 from stand.daemon.daemon import Daemon
-from stand.daemon.desk import DaemonDesk
+from stand.daemon.daemon_desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve as serve_clients
 from stand.serving.client import server_of
 from tests.stand.alert_receiver import Receiver

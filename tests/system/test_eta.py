@@ -15,7 +15,7 @@ from recording.reading.session import Session
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.estimating.learned import learn, load_learned
-from stand.estimating.night import Night
+from stand.estimating.run_estimate import Night
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual

@@ -19,7 +19,7 @@ from foundation.items import Event
 from recording.reading.session import Session
 from stand.config.stand_config import packaged
 from stand.daemon.daemon import Daemon
-from stand.daemon.desk import DaemonDesk
+from stand.daemon.daemon_desk import DaemonDesk
 from stand.daemon.serve import serve
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from compensation.cli import app as compensate
-from stand.commands.commands import app as stand
+from stand.commands.command_table import app as stand
 from tests.compensation.rendered import Scene, photograph, render
 from tests.system.conftest import require_aravis
 from tests.system.test_validation_nightly import VALIDATION

@@ -14,7 +14,7 @@ from compensation.drift.model_file import load_model
 from foundation.exit_codes import NOT_REPORTED
 from recording.reading.session import Session
 from recording.repair.verify import verify
-from stand.commands.commands import app
+from stand.commands.command_table import app
 from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.running.order import load_order

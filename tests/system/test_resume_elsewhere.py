@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from drivers.wires.camera_settings import TemperatureFeature
 from foundation.errors import ConfigError, StandTripped
 from recording.reading.session import Session
-from stand.commands.commands import app
+from stand.commands.command_table import app
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.queueing.queue_file import QUEUE_NAME
 from stand.running.order import Order

@@ -13,8 +13,8 @@ from starlette.exceptions import HTTPException
 from foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
 from stand.serving.api.access import Access, App, Gatekeeper
 from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.api.commands import commands
-from stand.serving.api.interface import Interface
+from stand.serving.api.doors import Interface
+from stand.serving.api.order_routes import commands
 from stand.serving.api.pace import Pace
 from stand.serving.api.reads import reads
 from stand.serving.api.recorded import recorded

@@ -18,7 +18,7 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.tasks import failure_text
 from stand.serving.api.bridge import Bridge
-from stand.serving.api.interface import Interface, OtherDoor
+from stand.serving.api.doors import Interface, OtherDoor
 from stand.serving.api.pace import Pace
 from stand.serving.desk import Desk
 from stand.serving.presence import Entry, Presence

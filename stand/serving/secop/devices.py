@@ -8,7 +8,6 @@ from pydantic import JsonValue
 
 from stand.serving.desk import DeviceState, ReadingState, RunRequest, RunStatus, StandState
 from stand.serving.secop import datainfo
-from stand.serving.secop.messages import Refusal
 from stand.serving.secop.modules import (
     BUSY,
     DRIVE_CODES,
@@ -28,6 +27,7 @@ from stand.serving.secop.modules import (
     measured,
     status,
 )
+from stand.serving.secop.secop_lines import Refusal
 
 BAND_K = 0.5  # so close to its set-point the chamber has arrived
 CHAMBER, RUN = "chamber", "run"

@@ -14,9 +14,10 @@ from collections import deque
 from collections.abc import Callable
 
 from stand.serving.api.bridge import Bridge
-from stand.serving.api.interface import OtherDoor
+from stand.serving.api.doors import OtherDoor
 from stand.serving.api.pace import Pace
-from stand.serving.secop.messages import (
+from stand.serving.secop.node import Node, Place
+from stand.serving.secop.secop_lines import (
     ANSWERS,
     IDENTIFY,
     LINE_LIMIT_BYTES,
@@ -26,7 +27,6 @@ from stand.serving.secop.messages import (
     parsed,
     refused,
 )
-from stand.serving.secop.node import Node, Place
 
 HOST = "127.0.0.1"  # the protocol knows neither user nor password: others come through a tunnel of theirs
 MOST_CLIENTS = 16

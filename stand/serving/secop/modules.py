@@ -11,7 +11,7 @@ from pydantic import JsonValue
 from stand.serving.desk import Desk, Done, QueuedRun, ReadingState, StandState, Who
 from stand.serving.secop import datainfo
 from stand.serving.secop.datainfo import DataInfo
-from stand.serving.secop.messages import Refusal
+from stand.serving.secop.secop_lines import Refusal
 
 # Codes of a status (specification, "status"); BUSY is 300 to 399.
 IDLE, WARN, BUSY, RAMPING, ERROR = 100, 200, 300, 370, 400

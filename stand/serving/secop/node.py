@@ -26,7 +26,8 @@ from stand.serving.api.bridge import Bridge, NoAnswer, Snapshot
 from stand.serving.desk import Conflict, Desk, DeviceState, Done, QueuedRun, StandState, Who
 from stand.serving.secop.datainfo import taken
 from stand.serving.secop.devices import modules
-from stand.serving.secop.messages import (
+from stand.serving.secop.modules import Command, Drive, Known, Module, Order, Report, Seen
+from stand.serving.secop.secop_lines import (
     ANSWERS,
     IDENTIFICATION,
     IDENTIFY,
@@ -36,7 +37,6 @@ from stand.serving.secop.messages import (
     message,
     report,
 )
-from stand.serving.secop.modules import Command, Drive, Known, Module, Order, Report, Seen
 
 WHO = Who(name="", how="secop")
 _OLD_S = 10.0  # a snapshot is made twice a second: the control loop hangs

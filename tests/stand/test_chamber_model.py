@@ -10,7 +10,7 @@ from foundation.clock import NS_PER_S
 from foundation.items import Batch, StepMark, StepState
 from foundation.readings import Reading, bad_reading
 from recording.reading.session import Session
-from stand.estimating.thermal_model import BAND_K, ChamberModel, Ramp, Response, fit, ramps_of
+from stand.estimating.chamber_model import BAND_K, ChamberModel, Ramp, Response, fit, ramps_of
 from tests.recording.recorded import record
 
 HEATING = Response(dead_s=20.0, rate_K_per_s=0.04, time_constant_s=90.0)

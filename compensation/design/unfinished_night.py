@@ -10,7 +10,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from compensation.history.history import recorded_history
+from compensation.history.thermal_history import recorded_history
 from compensation.observations import Observations, observe
 from foundation.errors import SessionError
 from recording.format.layout import FINISHED, FRAMES, TELEMETRY, UNFINISHED

@@ -9,7 +9,7 @@ import pytest
 from foundation.clock import NS_PER_S
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Reading, bad_reading
-from stand.serving.history import MOST_CHANNELS, MOST_MARKS, History
+from stand.serving.live_history import MOST_CHANNELS, MOST_MARKS, History
 from stand.serving.recorded_history import recorded_week, session_columns
 from tests.recording.recorded import START_NS, half_second, record
 

@@ -1,4 +1,4 @@
-"""A stand without a relay board: its climate chamber enables heat and cold by itself, the cameras always have power."""
+"""Stand-ins for devices that a stand does not have, so that plans, holds and making safe have one path."""
 
 from __future__ import annotations
 
@@ -10,9 +10,47 @@ from foundation.readings import Reading
 _PERMIT, _COMPRESSOR = "heater_enable", "compressor"
 
 
+class NoFlap:
+    """In place of a flap: cameras see the target all the time, and opening and closing are done at once. What was
+    commanded last is remembered, nothing is read."""
+
+    identity = None
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.is_shut = True
+
+    async def open(self) -> None:
+        """Nothing to connect to."""
+
+    async def close(self) -> None:
+        """Nothing to let go of."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """Nothing is read."""
+        return ()
+
+    async def move_open(self) -> None:
+        """Nothing moves."""
+        self.is_shut = False
+
+    async def move_closed(self) -> None:
+        """Nothing moves."""
+        self.is_shut = True
+
+    async def make_safe(self) -> None:
+        """As closed."""
+        self.is_shut = True
+
+    def allow(self) -> None:
+        """Nothing was barred."""
+
+
 class NoRelays:
-    """The calls of a relay board, over nothing: a permission to heat is remembered for as long as it was given, so that
-    the guard's rules compare the chamber with it; no wire follows it. camera_power always reads on."""
+    """In place of a relay board: the climate chamber enables heat and cold by itself, the cameras always have power.
+
+    A permission to heat is remembered for as long as it was given, so that the guard's rules compare the chamber with
+    it; no wire follows it. camera_power always reads on."""
 
     has_timer = False
     identity = None

@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
-from compensation.calibration.errors import CalibrationError
 from compensation.calibration.least_squares import Float
 from compensation.calibration.visits import AXES, place, visits_for
 from compensation.one_camera import others_ns
-from foundation.errors import SessionError
+from foundation.errors import CalibrationError, SessionError
 from foundation.progress import Report
 from markers.detection import Detection, DetectionError, detect
 from markers.target import Target
-from recording.format.items import frame_of
+from recording.format.decoded_items import frame_of
 from recording.reading.session import Session
 
 ROLE = "calibration"

@@ -7,7 +7,7 @@ import numpy as np
 from compensation.drift.drift_model import Outside
 from compensation.observations import Float
 from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from compensation.validation3d.validation import Validation
+from compensation.validation3d.validate import Validation
 
 
 def summary(validation: Validation) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from foundation.documents import Document
-from stand.config.looks import (
+from stand.config.chamber_section import (
     CameraFeelsConfig,
     FirstHeatConfig,
     FrozenConfig,

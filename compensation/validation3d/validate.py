@@ -19,8 +19,8 @@ from compensation.drift.drift_model import DriftModel
 from compensation.drift.training import frame_states
 from compensation.observations import Float, Observations
 from compensation.validation3d.deviations import Camera, Deviations, deviations
-from compensation.validation3d.positions import ValidationFrames
 from compensation.validation3d.stand_part import StandPart
+from compensation.validation3d.validation_frames import ValidationFrames
 from foundation.errors import SessionError
 
 StandAt = Callable[[Float], StandPart | None]

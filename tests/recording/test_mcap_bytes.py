@@ -8,8 +8,8 @@ import zstandard
 
 from foundation.errors import SessionError
 from recording.format.layout import TELEMETRY
+from recording.format.mcap_bytes import INFLATED_LIMIT_BYTES, Source, chunk_content, records
 from recording.format.records import telemetry_messages
-from recording.format.wire import INFLATED_LIMIT_BYTES, Source, chunk_content, records
 from recording.reading.walk import stored_messages, survey
 from recording.repair.salvage import salvage_session
 from recording.repair.verify import verify
