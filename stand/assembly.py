@@ -40,7 +40,7 @@ from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording, Watch, intrusion
 from stand.guarding.notify import Notifier
-from stand.guarding.rules import VITAL, Announcements, camera_measured, camera_stale, recorded, watches
+from stand.guarding.rules import Announcements, camera_measured, camera_stale, recorded, vital, watches
 from stand.imaging.camera_supply import SupplyLimits
 from stand.poller import Poller
 from stand.stand import Devices, Stand
@@ -128,7 +128,7 @@ class Assembly:
             release,
             stand.cut_camera,
             self.notifier,
-            VITAL,
+            vital(self.config),
         )
         stand.chamber.permits.allowed = guard.may_permit
         return guard
@@ -196,7 +196,7 @@ def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers |
     for number, unit in enumerate(settings.units):
         here = {
             name: each.model_copy(update={"channel": each.channel - number * count})
-            for name, each in config.thermometers.items()
+            for name, each in config.sensors.items()
             if each.channel // count == number or (each.channel // count > number and unit == settings.units[-1])
         }
         if not here:

@@ -77,7 +77,7 @@ def _bus_of(config: StandConfig) -> dict[str, object]:
         **_inputs_of(config),
         "thermometers_units": list(config.thermometer_module.units),
         "thermometers_model": _model_of(config.thermometer_module),
-        "thermometer_channels": {name: entry.channel for name, entry in config.thermometers.items()},
+        "thermometer_channels": {name: entry.channel for name, entry in config.sensors.items()},
     }
 
 

@@ -68,7 +68,8 @@ def _sensor(name: object, sensor: Any) -> str:
     known = sensor if isinstance(sensor, dict) else {}
     certificate = " of ".join(str(known[key]) for key in ("certificate", "calibrated") if known.get(key))
     uncertainty = f"U = {known['uncertainty_K']:g} K" if isinstance(known.get("uncertainty_K"), int | float) else ""
-    facts = ", ".join(text for text in (certificate, uncertainty) if text)
+    role = str(known.get("role") or "")
+    facts = ", ".join(text for text in (role, certificate, uncertainty) if text)
     return f"{name} ({facts})" if facts else str(name)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
@@ -18,6 +18,9 @@ from foundation.errors import ConfigError, DeviceError, Unreachable
 from foundation.readings import Quality, Reading, bad_reading
 
 PLAUSIBLE_DEGC = (-40.0, 100.0)
+
+Role = Literal["air", "granite_inside", "granite_outside", "artifact", "laboratory", "safety"]
+PLACES: tuple[Role, ...] = get_args(Role)[:-1]
 
 
 class Calibration(Document):
@@ -51,9 +54,25 @@ class Calibration(Document):
 
 
 class ThermometerSettings(Calibration):
-    """One sensor; channel: its place, 0 is the first of the first module, and counted on through further ones."""
+    """One sensor; channel: its terminal, 0 is the first of the first module, and counted on through further ones.
+
+    role: where it is, which rules, reports and recordings ask for: a place is read and recorded as that, whatever the
+    sensor's own name; by default the place it is named after, if any. safety: any number of them, each under its own
+    name, that guard the heat beside the air's.
+    """
 
     channel: int = Field(ge=0, le=63)
+    role: Role | None = None
+
+    @property
+    def is_safety(self) -> bool:
+        """Whether it guards the heat."""
+        return self.role == "safety"
+
+
+def by_channel(thermometers: Mapping[str, ThermometerSettings]) -> dict[str, ThermometerSettings]:
+    """The sensors by what they are read as: their place, or their own names."""
+    return {name if each.role is None or each.is_safety else each.role: each for name, each in thermometers.items()}
 
 
 class ThermometerModuleSettings(OnBus):

@@ -24,7 +24,7 @@ from drivers.devices.relays import HEAT, RelaysSettings
 from drivers.devices.software_regulator import SoftwareRegulatorSettings
 from drivers.devices.stage import AxisSettings
 from drivers.devices.thermal_imager import ThermalImagerSettings
-from drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings
+from drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings, by_channel
 from drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
 from drivers.wires.bus import BusSettings
 from experiments.parameters import Chamber_degC
@@ -36,6 +36,7 @@ from stand.config.dew import DewConfig, EndingConfig
 from stand.config.guard_section import GuardConfig
 from stand.config.interface_section import InterfaceConfig
 from stand.config.older_forms import CAMERA, renewed
+from stand.config.roles import unfit_roles
 from stand.config.safe_ranges import check, outside
 from stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
 
@@ -58,7 +59,6 @@ RegulatorSettings = Annotated[
 Folder = Literal["", "registers", "recipes", "targets"]
 MAPPED = ("regulator", "heat_module", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
-_GUARDED = {"air", "granite_inside"}  # thermometers without which nothing is heated
 _DEVICES = (
     "bus",
     "regulator",
@@ -159,6 +159,7 @@ class StandConfig(Document):
 
     def _faults(self) -> Iterator[str]:
         """What of one section does not fit another."""
+        yield from unfit_roles(self.thermometers)
         yield from self._unfit_control()
         yield from self._unfit_devices()
         yield from self._unfit_limits()
@@ -194,8 +195,9 @@ class StandConfig(Document):
             yield "heat_module.watchdog_s must be at least twice regulator.sample_s, or it trips between two steps"
 
     def _unfit_software(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
-        if regulator.thermometer not in self.thermometers:
-            yield f"regulator.thermometer: there is no thermometer {regulator.thermometer}"
+        if regulator.thermometer not in self.sensors:
+            known = ", ".join(self.sensors)
+            yield f"regulator.thermometer: there is no thermometer {regulator.thermometer}, by its role {known}"
         if regulator.sample_s < self.thermometer_module.poll_s:
             yield "regulator.sample_s is shorter than thermometer_module.poll_s: between two readings nothing is new"
         law, compressor = regulator.law, self.compressor
@@ -225,8 +227,6 @@ class StandConfig(Document):
         names = [*self.axes, *self.cameras, *self.probes, *_DEVICES]
         if twice := [name for name in names if names.count(name) > 1]:
             yield f"the name {twice[0]} is that of two devices; axes, cameras and probes need names of their own"
-        if missing := _GUARDED - self.thermometers.keys():
-            yield f"thermometers lacks {', '.join(sorted(missing))}, without which nothing is heated"
         if len({entry.channel for entry in self.thermometers.values()}) < len(self.thermometers):
             yield "thermometers: two thermometers share one channel"
         if self.cameras and LEADING not in self.cameras:
@@ -246,8 +246,8 @@ class StandConfig(Document):
         low_degC, high_degC = self.set_points_degC
         if low_degC >= high_degC:
             yield "limits.chamber_degC and the ambient_degC of the cameras have no temperature in common"
-        if self.dew is not None and self.dew.humidity_percent is not None and "laboratory" not in self.thermometers:
-            yield "dew.humidity_percent needs a thermometer named laboratory; give dew.dew_point_degC instead"
+        if self.dew is not None and self.dew.humidity_percent is not None and "laboratory" not in self.sensors:
+            yield "dew.humidity_percent needs a thermometer with role: laboratory; give dew.dew_point_degC instead"
         if self.dew is not None and self.dew.hygrometer is not None:
             hygrometer = self.probes.get(self.dew.hygrometer)
             if hygrometer is None or hygrometer.protocol != "vaisala":
@@ -268,6 +268,11 @@ class StandConfig(Document):
         slowest_s = max(self.controller.poll_s, self.relays.poll_s if self.relays is not None else 0.0)
         if slowest_s * 2 > guard.keys_s:
             yield f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)"
+
+    @property
+    def sensors(self) -> dict[str, ThermometerSettings]:
+        """The thermometers by what they are read as: their roles, or their own names."""
+        return by_channel(self.thermometers)
 
     @property
     def set_points_degC(self) -> tuple[float, float]:

@@ -25,5 +25,5 @@ def _absences(config: StandConfig) -> Iterator[str]:
         yield "no compressor: it cools by losing heat only, so not below the laboratory's temperature"
     if config.cameras and all(not camera.has_temperature for camera in config.cameras.values()):
         yield "no camera measures its own temperature: drift is fitted to the air and its history"
-    if "laboratory" not in config.thermometers:
+    if "laboratory" not in config.sensors:
         yield "no thermometer in the laboratory: a night ends at ending.ambient_degC"

@@ -58,7 +58,6 @@ RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "rela
 FLAP = "flap.position"
 _CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
 _DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
-VITAL = (PV, AIR, GRANITE)  # without a fresh reading of each of these there is no heat
 
 
 class Announcements:
@@ -87,6 +86,16 @@ class Announcements:
             self.is_paused = item.kind == "held"
 
 
+def safety_thermometers(config: StandConfig) -> tuple[str, ...]:
+    """Those with `role: safety`."""
+    return tuple(f"thermometers.{name}" for name, each in config.sensors.items() if each.is_safety)
+
+
+def vital(config: StandConfig) -> tuple[str, ...]:
+    """Without a fresh reading of each of these there is no heat."""
+    return (PV, AIR, GRANITE, *safety_thermometers(config))
+
+
 def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
     """Every rule with the configured limits. Abort where the stand's temperature is not known or not controlled: that
     ends a night. Hold where an operator can put it right and the night is worth continuing."""
@@ -107,13 +116,16 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
     limits = config.guard
     return (
         Watch(over_temperature(PV, limits.max_air_degC)),
-        Watch(over_temperature(AIR, limits.max_air_degC)),
+        *(Watch(over_temperature(channel, limits.max_air_degC)) for channel in (AIR, *safety_thermometers(config))),
         Watch(over_temperature(GRANITE, limits.max_granite_degC)),
         *(
             Watch(over_temperature(f"{name}.temperature", limits.max_camera_degC, cuts_camera=True))
             for name in config.cameras
         ),
-        *(Watch(trustworthy(channel, limits.stale_after_s), after_gap_s=limits.stale_after_s) for channel in VITAL),
+        *(
+            Watch(trustworthy(channel, limits.stale_after_s), after_gap_s=limits.stale_after_s)
+            for channel in vital(config)
+        ),
     )
 
 
@@ -137,10 +149,10 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
         Watch(disagreement(PV, AIR, limits.warn_K), limits.warn_after_s, "warn"),
         Watch(disagreement(PV, AIR, limits.trip_K), limits.trip_after_s),
         Watch(stuck_while_other_moves(PV, AIR, limits.air_moves_K, limits.pv_stuck_after_s), action="hold"),
-        *(Watch(stuck(f"thermometers.{name}", limits.stuck_after_s), action="warn") for name in config.thermometers),
+        *(Watch(stuck(f"thermometers.{name}", limits.stuck_after_s), action="warn") for name in config.sensors),
         *(
             Watch(jumped(f"thermometers.{name}", limits.jump_K, limits.jump_within_s), action="warn")
-            for name in config.thermometers
+            for name in config.sensors
         ),
     )
 
@@ -151,7 +163,7 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
     found before anything is warm. The camera's own temperature is not required: one that is stale is a warning."""
     limits, chamber = config.guard, config.chamber
     granite, frost = limits.granite_feels, limits.frozen
-    module = tuple(f"thermometers.{name}" for name in config.thermometers)
+    module = tuple(f"thermometers.{name}" for name in config.sensors)
     return (
         Watch(too_much_heat(limits.heat_max_Wh_per_h, chamber.heater_W, "regulator", PERMIT)),
         *(Watch(heat_not_felt(limits.heat_felt, chamber, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
@@ -173,7 +185,7 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
 
 def _surroundings(config: StandConfig) -> tuple[str, ...]:
     """What could warm the air, as far as it is measured."""
-    return (LABORATORY, GRANITE) if "laboratory" in config.thermometers else (GRANITE,)
+    return (LABORATORY, GRANITE) if "laboratory" in config.sensors else (GRANITE,)
 
 
 def camera_stale(config: StandConfig, name: str) -> Rule:
@@ -212,7 +224,7 @@ def _flap_watches(config: StandConfig, announced: Announcements) -> tuple[Watch,
 def cold_parts(config: StandConfig) -> tuple[str, ...]:
     """What water would settle on first: the target, the granite it stands on without a thermometer of its own, and the
     cameras."""
-    target = "thermometers.artifact" if "artifact" in config.thermometers else GRANITE
+    target = "thermometers.artifact" if "artifact" in config.sensors else GRANITE
     return (target, *(f"{name}.temperature" for name in config.cameras))
 
 

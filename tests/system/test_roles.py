@@ -1,0 +1,97 @@
+"""Thermometers by their roles: whatever a sensor is called, rules, regulator and recording find it by its place."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from foundation.documents import parse_document
+from foundation.errors import ConfigError
+from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.guarding.rules import vital
+from tests.system.virtual_stand import virtual_stand
+
+THERMOMETERS: dict[str, dict[str, Any]] = {
+    "base_plate": {"channel": 0, "role": "granite_inside", "certificate": "T-17"},
+    "pt100_7": {"channel": 3, "role": "air"},
+    "beside_the_window": {"channel": 4, "role": "laboratory"},
+    "ceiling": {"channel": 1, "role": "safety"},
+    "cable": {"channel": 2},
+}
+
+
+def described(thermometers: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    data = yaml.safe_load(packaged("", "software-regulator").read_text())
+    return data | {"axes": {}, "cameras": {}, "thermometers": thermometers}
+
+
+def config_of(**changes: dict[str, Any] | None) -> StandConfig:
+    thermometers = {name: each for name, each in {**THERMOMETERS, **changes}.items() if each is not None}
+    return parse_document(yaml.safe_dump(described(thermometers)), StandConfig, "s.yaml")
+
+
+async def test_a_sensor_of_any_name_is_read_and_guarded_by_its_role(tmp_path: Path):
+    (tmp_path / "stand.yaml").write_text(yaml.safe_dump(described(THERMOMETERS)))
+    async with virtual_stand(load_config(tmp_path / "stand.yaml")) as stand:
+        await stand.hold(40, 600)
+        read = {channel for channel in stand.series if channel.startswith("thermometers.")}
+        assert {channel for channel in read if not channel.endswith("_raw")} == {
+            f"thermometers.{name}" for name in ("air", "granite_inside", "laboratory", "ceiling", "cable")
+        }
+        assert stand.series["thermometers.air"][-1][1] > 30
+        assert stand.trips() == []
+        await stand.break_("thermometer.offset_K", {"ceiling": 50})
+        await stand.wait(15)
+        assert "over_temperature" in stand.trips()
+        assert await stand.true("heater_enabled") == 0
+
+
+def test_without_a_safety_thermometer_that_is_read_there_is_no_heat():
+    assert vital(config_of()) == (
+        "regulator.pv",
+        "thermometers.air",
+        "thermometers.granite_inside",
+        "thermometers.ceiling",
+    )
+
+
+def test_a_file_without_roles_means_what_it_did():
+    config = load_config(packaged("", "software-regulator"))
+    assert list(config.sensors) == list(config.thermometers)
+    assert vital(config) == ("regulator.pv", "thermometers.air", "thermometers.granite_inside")
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {"pt100_7": {"channel": 3}},
+            r"lacks air, without which nothing is heated; name one so, or give one `role: air`",
+        ),
+        ({"cable": {"channel": 2, "role": "air"}}, "two of them have the role air"),
+        ({"air": {"channel": 2}}, "two of them have the role air"),
+        (
+            {"artifact": {"channel": 2, "role": "safety"}},
+            r"thermometers\.artifact has the role safety; give it another",
+        ),
+        ({"cable": {"channel": 2, "role": "ceiling"}}, r"thermometers\.cable\.role: "),
+    ],
+    ids=["nobody", "two", "one by its name", "belied", "no role"],
+)
+def test_roles_that_do_not_fit_are_refused(changes: dict[str, dict[str, Any]], text: str):
+    with pytest.raises(ConfigError, match=text):
+        config_of(**changes)
+
+
+def test_the_regulators_thermometer_and_the_dew_point_go_by_roles():
+    data = described(THERMOMETERS)
+    data["dew"] = {"humidity_percent": 60}
+    parse_document(yaml.safe_dump(data), StandConfig, "s.yaml")
+    data["regulator"]["thermometer"] = "pt100_7"
+    with pytest.raises(ConfigError, match=r"no thermometer pt100_7, by its role granite_inside, laboratory"):
+        parse_document(yaml.safe_dump(data), StandConfig, "s.yaml")
+    del data["thermometers"]["beside_the_window"]
+    data["regulator"]["thermometer"] = "air"
+    with pytest.raises(ConfigError, match="needs a thermometer with role: laboratory"):
+        parse_document(yaml.safe_dump(data), StandConfig, "s.yaml")
