@@ -10,6 +10,7 @@ by its methods' names later; else it goes back, as an exception does.
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import importlib
 import os
@@ -26,7 +27,10 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
 
+from foundation.patience import Patience
+
 _END_WITHIN_S = 0.5
+_LOOK_S = 0.01
 _LENGTH = struct.Struct("<Q")
 
 
@@ -189,15 +193,38 @@ class Helper:
     def close(self) -> bool:
         """End the process, which is waited for for half a second; False when it hangs in the kernel, or in a call, and
         is left. May be called twice."""
-        self._life.close()
-        for line in self._lines.values():
-            line.close()
+        self._let_go()
         try:
             self._process.wait(_END_WITHIN_S)
         except subprocess.TimeoutExpired:
-            self._process.returncode = 0  # it is not waited for any more, and Python need not warn of that
+            self._leave()
             return False
         return True
+
+    async def ended_within(self, patience: Patience) -> bool:
+        """As `close`, while the event loop goes on."""
+        self._let_go()
+        ending = asyncio.create_task(self._ending())
+        try:
+            if await patience.wait(ending, _END_WITHIN_S):
+                return True
+        finally:
+            ending.cancel()
+        self._leave()
+        return False
+
+    async def _ending(self) -> None:
+        while self._process.poll() is None:  # noqa: ASYNC110 - it tells nobody that it has ended
+            await asyncio.sleep(_LOOK_S)
+
+    def _let_go(self) -> None:
+        self._life.close()
+        for line in self._lines.values():
+            line.close()
+
+    def _leave(self) -> None:
+        if self._process.poll() is None:
+            self._process.returncode = 0  # it is not waited for any more, and Python need not warn of that
 
 
 def _how(status: int) -> str:

@@ -178,6 +178,12 @@ class Safety:
         while any(maker.tried < maker.demanded for maker in self._makers):
             await self._changed.wait()
 
+    async def settled(self) -> None:
+        """Return when everything is confirmed, or an operator has given up."""
+        await self.tried()
+        while not (self.is_confirmed or self._given_up):
+            await self._changed.wait()
+
     async def confirmed(self, limit_s: float) -> bool:
         """Whether everything is confirmed within that time, on the stand's clock, and before an operator gives up; an
         event each minute says what is not."""

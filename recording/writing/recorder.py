@@ -11,6 +11,7 @@ Heat is only justified by what is recorded: `waiting_since_ns` and `folder_lost`
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
@@ -25,6 +26,7 @@ from foundation.errors import SessionError
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.lane import Lane
+from foundation.patience import Patience
 from foundation.readings import Frame
 from recording.format.decoded_items import Description
 from recording.format.images import encode_image
@@ -191,32 +193,32 @@ class Recorder:
         while self._taking and (self._image_writer.done < frames or self._telemetry_writer.items_saved < items):
             await self._progress.wait()
 
-    async def finish(self, within_s: float | None = None) -> None:
+    async def finish(self, within_s: float = math.inf, patience: Patience | None = None) -> None:
         """Put what still waits on the disk and complete the segments; SessionError when telemetry was not saved or its
-        segment stays unfinished, or when the disk has not done all that within so many real seconds (None: no
-        limit): it is then left to itself. Items published later are not recorded. It runs to its end also when the
-        caller is cancelled. May be called twice."""
+        segment stays unfinished, or when the disk has not done all that within so many real seconds, or so long as
+        `patience` lasts: it is then left to itself. Items published later are not recorded. It runs to its end also
+        when the caller is cancelled. May be called twice."""
+        patience = patience or Patience()
         if self._finishing is None:
             if not self._taking:
                 return
             self._finishing = asyncio.ensure_future(self._finish())
         try:
-            await asyncio.wait([self._finishing], timeout=within_s)
+            await patience.wait(self._finishing, within_s)
         except asyncio.CancelledError:
-            await self._left(within_s)
+            await patience.wait(self._finishing, within_s)
+            await self._left()
             raise
         await self._left()
         self._hub.unsubscribe(self._receive)
         await self._finishing
 
-    async def _left(self, within_s: float | None = 0.0) -> None:
-        """Wait so long for the end of `_finish`, then for nothing any more."""
-        if self._finishing is not None:
-            await asyncio.wait([self._finishing], timeout=within_s)
-            if not self._finishing.done():
-                self._telemetry_lane.abandon()
-                self._frame_lane.abandon()
-                await asyncio.wait([self._finishing])
+    async def _left(self) -> None:
+        """Wait for nothing any more that `_finish` has not done."""
+        if self._finishing is not None and not self._finishing.done():
+            self._telemetry_lane.abandon()
+            self._frame_lane.abandon()
+            await asyncio.wait([self._finishing])
 
     async def _finish(self) -> None:
         try:

@@ -10,6 +10,7 @@ from foundation.clock import Clock, boot_of
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.lane import Lane
+from foundation.patience import Patience
 from stand.chamber.compressor import CompressorState, keep
 
 _CLOSE_LIMIT_S = 1.0  # real seconds for the last state; a disk that hangs does not keep a daemon alive
@@ -40,10 +41,10 @@ class CompressorFile:
         if self._writing is None or self._writing.done():
             self._writing = asyncio.create_task(self._write(self._path))
 
-    async def close(self) -> None:
+    async def close(self, patience: Patience | None = None) -> None:
         """Give the disk a moment for the last state; may be called twice."""
         if self._writing is not None:
-            await asyncio.wait([self._writing], timeout=_CLOSE_LIMIT_S)
+            await (patience or Patience()).wait(self._writing, _CLOSE_LIMIT_S)
             self._writing.cancel()
         if self._lane is not None:
             self._lane.close()

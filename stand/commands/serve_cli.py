@@ -74,7 +74,7 @@ def serve(
         async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
             viewing = Viewing(hub, clock, directory, texts["target.yaml"])
             served = replace(interface, rooms=(_page(viewing),))
-            async with serve_clients(desk, hub, clock, directory, stand.name, served):
+            async with serve_clients(desk, hub, clock, directory, stand.name, served, desk.patience):
                 where = f"; http://{host}:{port}/" if port is not None else ""
                 where += f"; SECoP at {secop_port}" if secop_port is not None else ""
                 say(f"{stand.name} is open; sessions go to {directory}{where}")

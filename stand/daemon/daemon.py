@@ -42,9 +42,9 @@ Answering = Callable[[Hub, WallClock], AbstractAsyncContextManager[object]]
 
 _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
 _ENDS = Fault(STOPPED.rule, "the daemon was ended")
+_STOPPED_LOOK_S = 0.1  # whether the run has ended that was stopped
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
 _KEEP_EVERY_S, _READ_EVERY_S = 60.0, 5.0
-_EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0  # systemd is asked for more time while the stand is made safe
 
 
 class Daemon:
@@ -59,6 +59,7 @@ class Daemon:
         self.counters = Counters(kept.counters, config.axes, config.chamber.heater_W, hub)
         self.by_hand = ByHand(assembly, self._check_heat)
         self.has_guest = False  # from the moment it is let in until it has gone
+        self._is_draining = False  # until the queue knows how its run has ended
         self._assembly = assembly
         self._hub = hub
         self._clock = assembly.clock
@@ -88,9 +89,11 @@ class Daemon:
     def leave(self) -> None:
         """As soon as the stand is confirmed safe; may be called again."""
         if not self._extending:
-            self._extending.append(asyncio.create_task(_extend()))
+            self._extending.append(asyncio.create_task(systemd.extending()))
         self.orders.leaving = True
         self.stop()
+        if not self._leaving.is_set():
+            self._beside(self.house.hurry())
         self._leaving.set()
 
     def stop(self) -> None:
@@ -154,10 +157,11 @@ class Daemon:
         """Until `leave`; then the stand is safe. Raises what makes that impossible."""
         async with AsyncExitStack() as stack:
             stack.push_async_callback(cancelled, self._extending)
-            stack.push_async_callback(self._keep.close)
-            stack.callback(self.note)
+            stack.push_async_callback(self._keep.close, self.house.patience)
             await self._record_house()
             stack.push_async_callback(self._end_record)
+            stack.callback(self.note)  # written while the record is ended
+            stack.callback(self.house.patience.begin)
             stack.push_async_callback(self.house.close)
             self.house.prepare()
             await self.house.read_once()
@@ -195,9 +199,10 @@ class Daemon:
         while self.orders.stop is not None and not worker.done():
             if self.orders.stop.fault is None:  # once: another stop says that nobody wants to wait any more
                 self.orders.stop(_ENDS)
-            await asyncio.wait([worker], timeout=_LOOK_S)
-        if self.has_guest:
-            await asyncio.wait([worker], timeout=FINISH_WITHIN_S)
+            await asyncio.wait([worker], timeout=_STOPPED_LOOK_S)
+        if self._is_draining:
+            await self.house.patience.wait(worker, FINISH_WITHIN_S)
+            await cancelled([worker])  # it says what the queue does not know
         if self._is_given_up:
             self._assembly.stand.safety.give_up()  # forgotten with the run
 
@@ -213,11 +218,14 @@ class Daemon:
                 continue
             if not any(entry.is_open for entry in queued.entries):
                 continue
+            self._is_draining = True
             try:
-                await drain(directory, self._run_one, self._clock, self._say, disk)
+                await drain(directory, self._run_one, self._clock, self._say, disk, self.house.patience)
                 self._tell("info", "queue_empty", "all that was queued is done")
             except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
                 self._say(f"the queue is halted: {failure_text(error)}")
+            finally:
+                self._is_draining = False
             with suppress(SessionError):
                 await self.orders.read()
 
@@ -380,13 +388,6 @@ class Daemon:
     def _tell_failure(self, what: str, ended: asyncio.Future[object]) -> None:
         if not ended.cancelled() and (error := ended.exception()) is not None:
             self._tell("warning", "by_hand_failed", f"{what}: {failure_text(error)}")
-
-
-async def _extend() -> None:
-    """systemd waits for as long as the stand is being made safe."""
-    while True:
-        systemd.tell(systemd.STOPPING, systemd.extended(_EXTENDED_S), "STATUS=making the stand safe")
-        await asyncio.sleep(_EXTEND_EVERY_S)
 
 
 def _catch_signals(leave: Callable[[], None]) -> None:

@@ -8,6 +8,7 @@ from typing import NoReturn, TypeVar
 from pydantic import JsonValue
 
 from foundation.errors import StandError
+from foundation.patience import Patience
 from stand.daemon.daemon import Daemon
 from stand.gate import INTERLOCK
 from stand.running.run_desk import RunDesk
@@ -149,6 +150,11 @@ class DaemonDesk:
         await keep(said, folder, self._assembly.hub, self._assembly.clock)
         self._tell(who, "note", {"tags": list(tags)})
         return self._done("note", "noted")
+
+    @property
+    def patience(self) -> Patience:
+        """Of a daemon that leaves."""
+        return self._daemon.house.patience
 
     @property
     def _run(self) -> RunDesk | None:

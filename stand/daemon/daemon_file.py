@@ -14,6 +14,7 @@ from foundation.files import replace_file
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.lane import Lane
+from foundation.patience import Patience
 
 NAME = "daemon.json"
 _CLOSE_LIMIT_S = 1.0
@@ -67,10 +68,10 @@ class KeptFile:
         if self._writing is None or self._writing.done():
             self._writing = asyncio.create_task(self._write())
 
-    async def close(self) -> None:
+    async def close(self, patience: Patience) -> None:
         """Give the disk a moment for the last state."""
         if self._writing is not None:
-            await asyncio.wait([self._writing], timeout=_CLOSE_LIMIT_S)
+            await patience.wait(self._writing, _CLOSE_LIMIT_S)
             self._writing.cancel()
         self._lane.abandon()
 

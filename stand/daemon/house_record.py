@@ -21,6 +21,7 @@ from foundation.errors import SessionError
 from foundation.hub import Hub, Subscriber
 from foundation.items import Event, Item
 from foundation.lane import Lane
+from foundation.patience import Patience
 from foundation.tasks import cancelled
 from recording.reading.contents import RUN_END
 from recording.reading.run_word import Run
@@ -43,24 +44,27 @@ class _Recording:
     disk: Disk
     task: asyncio.Task[None]
 
-    async def complete(self, within_s: float) -> None:
+    async def complete(self, within_s: float, patience: Patience) -> None:
         """SessionError when the disk does not take the rest in time."""
         try:
             await cancelled([self.task])
-            await self.recorder.finish(within_s)
+            await self.recorder.finish(within_s, patience)
         finally:
-            self.disk.close()
+            await self.disk.ended_within(patience)
 
 
 class HouseRecord:
     """Records what passes the hub from `begin` to `end`, as often as wanted; of one day all is in one session. texts:
-    attached, by their names there."""
+    attached, by their names there. patience: of a daemon that leaves, with its disk."""
 
-    def __init__(self, assembly: Assembly, texts: Mapping[str, str], out: Path, clock: WallClock) -> None:
+    def __init__(
+        self, assembly: Assembly, texts: Mapping[str, str], out: Path, clock: WallClock, patience: Patience
+    ) -> None:
         self._assembly = assembly
         self._texts = dict(texts)
         self._out = out
         self._clock = clock
+        self._patience = patience
         self._now: _Recording | None = None
         self._cut_off: list[_Recording] = []  # they take nothing any more, and are not complete yet
         self._day = ""
@@ -88,7 +92,7 @@ class HouseRecord:
             try:
                 await recorder.begin(tuple)
             except BaseException:
-                disk.close()
+                await disk.ended_within(self._patience)
                 raise
             self._cut()
             self._day = day
@@ -100,7 +104,7 @@ class HouseRecord:
         """Complete the segments of what was cut off; SessionError when the disk does not take them in time."""
         async with self._turn:
             while self._cut_off:
-                await self._cut_off.pop(0).complete(within_s)
+                await self._cut_off.pop(0).complete(within_s, self._patience)
 
     async def end(self, within_s: float = COMPLETE_WITHIN_S) -> None:
         """The same after cutting off what is recorded now. Nothing without `begin`."""

@@ -62,7 +62,7 @@ async def serve(
                 if house.disk is None:
                     raise ValueError("a daemon is on the host's clock, and has a process for its disk")
                 own = {name: text for name, text in texts.items() if name in ("config.yaml", ATTACHMENT)}
-                record = HouseRecord(assembly, own, out, clock)
+                record = HouseRecord(assembly, own, out, clock, stop.patience)
                 keep = KeptFile(out, house.disk.line(FILES_LINE).run, hub, clock)
                 reports = Reports(hub, clock)
                 stack.push_async_callback(reports.close)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 from contextlib import suppress
 
 STOPPING, READY, FED = "STOPPING=1", "READY=1", "WATCHDOG=1"
+_EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0
 
 
 def tell(*lines: str) -> None:
@@ -24,6 +26,13 @@ def watchdog_s() -> float | None:
         if int(os.environ.get("WATCHDOG_PID", os.getpid())) == os.getpid():
             return int(os.environ["WATCHDOG_USEC"]) / 1e6 if "WATCHDOG_USEC" in os.environ else None
     return None
+
+
+async def extending() -> None:
+    """Ask for more time while the stand is made safe, until cancelled."""
+    while True:
+        tell(STOPPING, extended(_EXTENDED_S), "STATUS=making the stand safe")
+        await asyncio.sleep(_EXTEND_EVERY_S)
 
 
 def extended(by_s: float) -> str:

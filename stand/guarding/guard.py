@@ -14,7 +14,7 @@ from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Event
 from stand.fault import Fault
-from stand.guarding.interlocks import Watch
+from stand.guarding.interlocks import NOT_DURABLE, Watch
 from stand.guarding.notify import Notifier
 from stand.safety import Safety
 
@@ -97,6 +97,18 @@ class Guard:
         if fault is not None:
             self._follow_hold(self._faults())
         return fault
+
+    def recording_ended(self) -> None:
+        """Nothing is recorded from now on. A hold for what was not on the disk in time ends with that, and its cause
+        may last."""
+        fault = self.held
+        if fault is None or fault.rule != NOT_DURABLE or not fault.ends_itself or self.release is None:
+            return
+        self.held = None
+        text = f"the recording ended while the disk held it up; nothing is heated before another begins: {fault.text}"
+        data: dict[str, object] = {"rule": fault.rule}
+        self.hub.publish(Event(self.clock.now_ns(), "warning", "hold_ended", text, data))
+        self.release()
 
     async def run(self) -> None:
         """Watch until cancelled or aborted."""

@@ -11,6 +11,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.readings import Quality
 from stand.fault import Action, Fault, Readings, value_of
 
+NOT_DURABLE = "not_recorded"  # the rule that ends its hold when the disk has caught up
 _CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to clear that
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
 
@@ -281,7 +282,7 @@ def not_recorded(recording: Recording, durable_within_s: float) -> Rule:
             return None
         age_s = (now_ns - since_ns) / NS_PER_S
         text = f"what was measured {age_s:.0f} s ago is not on the disk yet, limit {durable_within_s:g} s"
-        return Fault("not_recorded", text)
+        return Fault(NOT_DURABLE, text)
 
     return rule
 

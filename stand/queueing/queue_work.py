@@ -10,6 +10,7 @@ from pathlib import Path
 
 from foundation.clock import Now, WallClock
 from foundation.errors import DeviceError, InUse, SessionError, StandError, StandTripped
+from foundation.patience import Patience
 from recording.writing.disk import Disk
 from stand.queueing.queue import finish, note_session, note_step, queued, take
 from stand.queueing.queue_disk import QueueDisk
@@ -50,16 +51,18 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
     calls = QueueDisk(disk, WallClock())
     try:
         with working(directory):
-            await drain(directory, run_one, clock, tell, calls)
+            await drain(directory, run_one, clock, tell, calls, Patience())
     finally:
         calls.close()
         disk.close()
 
 
-async def drain(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: QueueDisk) -> None:
-    """As `work`, for whoever is `working` on the queue already."""
+async def drain(
+    directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: QueueDisk, patience: Patience
+) -> None:
+    """As `work`, for whoever is `working` on the queue already, and for `patience`, with the disk at a run's end."""
     while (entry := await disk.call(take, directory, clock.now_ns())) is not None:
-        run = _Run(directory, entry, clock, tell, disk)
+        run = _Run(directory, entry, clock, tell, disk, patience)
         if entry.fruitless_starts >= MOST_FRUITLESS_STARTS:
             await run.set_aside()
         else:
@@ -79,7 +82,15 @@ class Halt(StandError):
 
 
 class _Run:
-    def __init__(self, directory: Path, entry: Entry, clock: Now, tell: Callable[[str], None], disk: QueueDisk) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        entry: Entry,
+        clock: Now,
+        tell: Callable[[str], None],
+        disk: QueueDisk,
+        patience: Patience,
+    ) -> None:
         self._directory = directory
         self._entry = entry
         self._clock = clock
@@ -87,6 +98,7 @@ class _Run:
         self._name = f"run {entry.id} ({entry.recipe})"
         self._has_stepped = False
         self._disk = disk
+        self._patience = patience
         self._notes: list[asyncio.Task[None]] = []
 
     async def set_aside(self) -> None:
@@ -151,12 +163,17 @@ class _Run:
         """Noted when the disk takes that in time: one that hangs keeps nobody from leaving."""
         told = f"{self._name} {state}" + (f": {reason}" if reason else "")
         now_ns = self._clock.now_ns()
+        change = partial(finish, self._directory, self._entry.id, state, now_ns, reason, halt=halt)
+        noting = asyncio.create_task(self._noted_last(change))
         try:
-            async with asyncio.timeout(_NOTED_WITHIN_S):
-                await self._noted()
-                await self._disk.call(
-                    partial(finish, self._directory, self._entry.id, state, now_ns, reason, halt=halt)
-                )
-        except TimeoutError:
-            told += "; the disk has not answered, so the queue does not know it yet"
-        self._tell(told)
+            if await self._patience.wait(noting, _NOTED_WITHIN_S):
+                await noting
+        finally:
+            if not noting.done():
+                noting.cancel()
+                told += "; the disk has not answered, so the queue does not know it yet"
+            self._tell(told)
+
+    async def _noted_last(self, change: Callable[[], None]) -> None:
+        await self._noted()
+        await self._disk.call(change)

@@ -145,7 +145,7 @@ class Guest:
                     await house.rest(watchers)
                     settling.close()
                     stop.ended()
-                    await log.end(ended)
+                    await log.end(ended, stop.patience)
 
     async def _begun(self, settling: SettlingWatch, leaving: AsyncExitStack) -> Executor:
         """Everything read and judged once, and the journal begun or continued: nothing moves before that."""
@@ -223,7 +223,9 @@ class Guest:
         """Answer clients until cancelled; a run can do without any."""
         assembly, directory, name = self._assembly, self.recorder.directory, self.job.order.config.name
         try:
-            async with serve(desk, assembly.hub, assembly.clock, directory, name, Interface(directory.parent)):
+            async with serve(
+                desk, assembly.hub, assembly.clock, directory, name, Interface(directory.parent), self.stop.patience
+            ):
                 await asyncio.Event().wait()
         except StandError as error:
             self.log.tell("warning", "no_control", f"the run cannot be queried or paused: {error}")

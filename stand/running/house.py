@@ -13,6 +13,7 @@ from typing import Protocol, TypeVar
 
 from foundation.clock import VirtualClock
 from foundation.errors import StandError, Unreachable
+from foundation.patience import Patience
 from foundation.tasks import cancelled, watched
 from recording.writing.disk import FILES_LINE, Disk
 from stand.assembly import Assembly
@@ -61,12 +62,14 @@ class House:
     """The open stand. `recorder` is what heat depends on; set it before `prepare`.
 
     is_for_one: it is closed with its one guest; else a trip is kept until an operator clears it (`latched`), guest or
-    not. background: tasks that must not end, from the opening on.
+    not. background: tasks that must not end, from the opening on. patience: with the
+    disk, when the last guest has left and the stand is safe.
     """
 
-    def __init__(self, assembly: Assembly, disk: Disk | None, *, is_for_one: bool) -> None:
+    def __init__(self, assembly: Assembly, disk: Disk | None, patience: Patience, *, is_for_one: bool) -> None:
         self.assembly = assembly
         self.disk = disk
+        self.patience = patience
         self.is_for_one = is_for_one
         self.background: list[asyncio.Task[None]] = []
         self.recorder: Recorder | None = None
@@ -166,6 +169,11 @@ class House:
         for poller in self._pollers:
             await poller.poll()
 
+    async def hurry(self) -> None:
+        """Nobody waits long for a disk once the stand is safe."""
+        await self.assembly.stand.safety.settled()
+        self.patience.begin()
+
     async def close(self) -> None:
         """Safe for the last time; may be called when nothing was started."""
         self.is_for_one = True
@@ -173,8 +181,10 @@ class House:
             await self.rest()
 
     def unrecorded(self) -> None:
-        """The recording is complete, and nothing is heated before there is another one."""
+        """The recording has ended, and nothing is heated before there is another one."""
         self.recorder = None
+        if self._guard is not None:
+            self._guard.recording_ended()
 
     def left(self) -> None:
         """The guest has gone, and what it alone was held for counts no more. A fault stays until it is cleared."""
@@ -253,10 +263,10 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
     async with AsyncExitStack() as stack:
         disk = None if isinstance(assembly.clock, VirtualClock) else Disk()
         if disk is not None:
-            stack.callback(disk.close)
+            stack.push_async_callback(disk.ended_within, stop.patience)
             assembly.stand.chamber.compressor_file.through(disk.line(FILES_LINE).run)
-        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
-        house = House(assembly, disk, is_for_one=is_for_one)
+        stack.push_async_callback(assembly.stand.chamber.compressor_file.close, stop.patience)
+        house = House(assembly, disk, stop.patience, is_for_one=is_for_one)
         stack.push_async_callback(cancelled, house.background)
         if time is not None:
             house.background.append(asyncio.create_task(time()))

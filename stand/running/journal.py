@@ -8,7 +8,6 @@ lines after it count; of a file with damaged lines a copy is kept as `journal.js
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import os
 from asyncio import Task, create_task, gather
@@ -24,6 +23,7 @@ from foundation.helper import Line
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.lane import Lane
+from foundation.patience import Patience
 from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, lines_of
 from recording.writing.disk import JOURNAL_LINE, Disk
 from recording.writing.home import FolderLost
@@ -323,20 +323,25 @@ class Logbook:
         journal.start(self._clock, lambda text: self.tell("error", "journal_not_saved", text), disk)
         await self.write(*entries)
 
-    async def end(self, ended: Ended) -> None:
-        """The journal's last entry, at this instant; SessionError when the disk does not take it in time."""
+    async def end(self, ended: Ended, patience: Patience) -> None:
+        """The journal's last entry, at this instant; SessionError when the disk does not take it in time, or so long
+        as `patience` lasts."""
         journal = self._journal
         if journal is None:
             return
         within_s = _COMPLETE_WITHIN_S if ended.status == "complete" else _END_WITHIN_S
-        try:
-            async with asyncio.timeout(within_s):
-                await self.write(Ended(self._clock.now_ns(), ended.status, ended.text))
-                await journal.close()
-        except TimeoutError as error:
+        ending = create_task(self._end(journal, Ended(self._clock.now_ns(), ended.status, ended.text)))
+        if not await patience.wait(ending, within_s):
             journal.abandon()
-            text = f"the disk has not answered for {within_s:g} s; how the run ended is not in the journal"
-            raise SessionError(f"{journal.path}: {text}") from error
+            with suppress(TimeoutError):  # as all that waited for the journal
+                await ending
+            text = "the disk has not answered in time; how the run ended is not in the journal"
+            raise SessionError(f"{journal.path}: {text}")
+        await ending
+
+    async def _end(self, journal: Journal, ended: Ended) -> None:
+        await self.write(ended)
+        await journal.close()
 
     def enter(self, entry: Entry) -> None:
         """Into the state alone: what the recording proves, or the next gap makes void."""

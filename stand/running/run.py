@@ -98,7 +98,7 @@ async def run_in(house: House, job: Job, stop: Stop) -> Path:
         directory = _directory(job, house.assembly.clock)
         async with _telling_failure(house.assembly, directory, stop), AsyncExitStack() as stack:
             disk = Disk()
-            stack.callback(disk.close)
+            stack.push_async_callback(disk.ended_within, stop.patience)
             stack.callback(house.unrecorded)
             stack.push_async_callback(stop.settled)
             stop.watch(house.assembly.stand)
@@ -288,4 +288,4 @@ class _Early:
 
 async def _finish(recorder: Recorder, recording: asyncio.Task[None], stop: Stop) -> None:
     await cancelled([recording])
-    await recorder.finish(COMPLETE_WITHIN_S if stop.fault is None else FINISH_WITHIN_S)
+    await recorder.finish(COMPLETE_WITHIN_S if stop.fault is None else FINISH_WITHIN_S, stop.patience)

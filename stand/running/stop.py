@@ -6,6 +6,7 @@ import asyncio
 import signal
 
 from foundation.errors import SessionError, StandError, StandTripped
+from foundation.patience import Patience
 from stand.fault import Fault
 from stand.gate import Gate, Phase, Turn, next_phase
 from stand.stand import Stand
@@ -27,11 +28,15 @@ class Stop:
     what it then raises becomes Interrupted or StandTripped with the first reason. While an actuator does not confirm
     that it is safe, a signal a minute after the first ends the wait. Without `has_signals` the signals are somebody
     else's: those of a daemon, whose guest is stopped.
+
+    patience: how long a disk is waited for once the stand is safe; a run that has ended by itself, and is stopped while
+    it waits, has no more time than another.
     """
 
     def __init__(self, *, has_signals: bool = True) -> None:
         self.fault: Fault | None = None
         self.phase = Phase.IDLE
+        self.patience = Patience()
         self._stand: Stand | None = None
         self._aborting: asyncio.Task[None] | None = None
         self._signals = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT] if has_signals else []
@@ -57,6 +62,8 @@ class Stop:
         if self.phase in (Phase.ABORTING, Phase.ENDING, Phase.ENDED):
             if self._stand is not None and fault.rule == STOPPED_BY_OPERATOR:
                 self._stand.safety.give_up()
+            if self.phase is Phase.ENDED:
+                self.patience.begin()
             return
         self._turn(Turn.STOP)
         if self._stand is None:
@@ -76,8 +83,10 @@ class Stop:
             await asyncio.wait([self._aborting])
 
     def ended(self) -> None:
-        """The plan has ended, whichever way."""
+        """The plan has ended, whichever way, and the stand is safe."""
         self._turn(Turn.END)
+        if self.fault is not None:
+            self.patience.begin()
 
     async def _abort(self, stand: Stand) -> None:
         try:

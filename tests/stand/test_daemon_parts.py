@@ -10,6 +10,7 @@ import pytest
 from foundation.clock import NS_PER_S, WallClock
 from foundation.hub import Hub
 from foundation.items import Batch, Event
+from foundation.patience import Patience
 from foundation.readings import Reading, bad_reading
 from stand.daemon import systemd
 from stand.daemon.counters import Counters
@@ -58,7 +59,7 @@ async def test_counters_and_a_fault_are_there_for_the_next_daemon(tmp_path: Path
     last = Kept(counters={"flap_cycles": 3.0}, latch=Latch(rule="folder_lost", text="it is gone", since_ns=5))
     kept.note(Kept(counters={"flap_cycles": 1.0}))
     kept.note(last)
-    await kept.close()
+    await kept.close(Patience())
     assert kept_in(tmp_path) == last
     (tmp_path / "daemon.json").write_text("{")
     assert kept_in(tmp_path) == Kept()  # a damaged file is no reason not to open a stand
@@ -73,7 +74,7 @@ async def test_a_disk_that_refuses_is_an_event(tmp_path: Path):
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     kept = KeptFile(tmp_path, refused, hub, WallClock())
     kept.note(Kept())
-    await kept.close()
+    await kept.close(Patience())
     assert [event.kind for event in events] == ["daemon_not_kept"]
 
 

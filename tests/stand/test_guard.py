@@ -5,6 +5,7 @@ import os
 import select
 import stat
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -286,6 +287,20 @@ async def test_a_hold_that_ends_by_itself_ends_when_the_stand_is_safe_and_nothin
     assert bench.log.count("release") == 3
     bench.guard.clear()
     assert bench.guard.held is None
+
+
+async def test_a_hold_for_the_disk_ends_with_the_recording_and_is_not_told_to_be_over():
+    bench = Bench("hold")
+    bench.guard.recording_ended()  # nothing is held
+    bench.guard.held = Fault("not_recorded", "3 s are not on the disk", "hold")
+    bench.guard.recording_ended()
+    assert bench.guard.held is not None  # for an operator
+    bench.guard.held = replace(bench.guard.held, ends_itself=True)
+    bench.guard.recording_ended()
+    assert (bench.guard.held, bench.log) == (None, ["release"])
+    (ended,) = bench.events
+    assert ended.kind == "hold_ended"
+    assert ended.text.startswith("the recording ended while the disk held it up; nothing is heated before")
 
 
 async def test_a_fault_that_needs_an_operator_replaces_a_hold_that_would_end_by_itself():

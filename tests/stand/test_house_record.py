@@ -13,6 +13,7 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub
 from foundation.items import Batch
+from foundation.patience import Patience
 from foundation.readings import Reading
 from recording.reading.contents import RUN_END
 from recording.reading.session import Session
@@ -45,7 +46,7 @@ async def house(tmp_path: Path) -> AsyncGenerator[tuple[HouseRecord, Hub, Calend
     units = dict.fromkeys(("regulator", "relays", "thermometers", "inputs", "flap"))
     devices = SimpleNamespace(**units, axes={}, probes={})
     assembly = cast("Assembly", SimpleNamespace(hub=hub, clock=clock, devices=devices, config=load_config(CONFIG)))
-    record = HouseRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock)
+    record = HouseRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock, Patience())
     yield record, hub, clock
     await record.end(20.0)
 

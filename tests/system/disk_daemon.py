@@ -15,6 +15,7 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub
 from foundation.items import Event
+from foundation.patience import Patience
 from foundation.readings import Frame
 from recording.writing.disk import Disk
 from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
@@ -61,13 +62,15 @@ async def main(directory):
         say(recorder.saved.frames, recorder.saved.telemetry, age_s, recorder.folder_lost)
         await asyncio.sleep(0.02)
     publishing.cancel()
+    patience = Patience()
+    patience.begin()
     try:
         try:
-            await log.end(Ended(0, "interrupted", "stopped"))
+            await log.end(Ended(0, "interrupted", "stopped"), patience)
         finally:
             recording.cancel()
             await asyncio.wait([recording])
-            await recorder.finish(FINISH_WITHIN_S / 4)
+            await recorder.finish(FINISH_WITHIN_S / 4, patience)
     finally:
         disk.close()
 

@@ -16,6 +16,7 @@ from foundation.clock import Clock
 from foundation.errors import ConfigError, SessionError, StandError
 from foundation.hub import Hub
 from foundation.items import Event
+from foundation.patience import Patience
 from foundation.tasks import failure_text
 from stand.serving.api.bridge import Bridge
 from stand.serving.api.doors import Interface, OtherDoor
@@ -30,9 +31,16 @@ _READY_LIMIT_S = 30.0
 
 @asynccontextmanager
 async def serve(
-    desk: Desk, hub: Hub, clock: Clock, session: Path, stand: str, interface: Interface
+    desk: Desk,
+    hub: Hub,
+    clock: Clock,
+    session: Path,
+    stand: str,
+    interface: Interface,
+    patience: Patience | None = None,
 ) -> AsyncGenerator[Presence]:
-    """Answer for the daemon that runs `session` on the stand of this name while inside.
+    """Answer for the daemon that runs `session` on the stand of this name while inside; at the end for as long as
+    `patience` lasts.
 
     SessionError when the runtime folder cannot be used, ConfigError when it cannot listen at the port. A socket or
     entry that somebody removes is made again within some seconds.
@@ -60,7 +68,7 @@ async def serve(
     finally:
         bridge.close()
         with clock.hold():  # a client that does not read must not be where virtual time goes on
-            await asyncio.to_thread(thread.end)
+            await asyncio.to_thread(thread.end, (patience or Patience()).left_s(_CLOSE_LIMIT_S))
         presence.disappear()
 
 
@@ -119,14 +127,14 @@ class _Thread:
     def start(self) -> None:
         self._thread.start()
 
-    def end(self) -> None:
-        """Wait for it; it ends by itself when the process does, whatever keeps it."""
+    def end(self, within_s: float) -> None:
+        """Wait for it so long; it ends by itself when the process does, whatever keeps it."""
         self._is_over.set()
         loop, ended = self._loop, self._ended
         if loop is not None and ended is not None:
             with suppress(RuntimeError):
                 loop.call_soon_threadsafe(ended.set)
-        self._thread.join(_CLOSE_LIMIT_S)
+        self._thread.join(within_s)
 
     def _run(self) -> None:
         try:
