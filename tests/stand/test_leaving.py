@@ -19,7 +19,7 @@ from recording.writing.disk import FILES_LINE, Disk
 from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from stand.chamber.compressor import CompressorState
 from stand.chamber.compressor_file import CompressorFile
-from stand.daemon.kept import Kept, KeptFile
+from stand.daemon.daemon_file import Kept, KeptFile
 from stand.queueing.queue import append
 from stand.queueing.queue_disk import QueueDisk
 from stand.queueing.queue_file import Entry
