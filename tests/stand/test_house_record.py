@@ -43,7 +43,7 @@ class Calendar(WallClock):
 @pytest.fixture
 async def house(tmp_path: Path) -> AsyncGenerator[tuple[HouseRecord, Hub, Calendar]]:
     hub, clock = Hub(), Calendar()
-    units = dict.fromkeys(("regulator", "relays", "thermometers", "inputs", "flap"))
+    units = dict.fromkeys(("regulator", "heat_module", "relays", "thermometers", "inputs", "flap"))
     devices = SimpleNamespace(**units, axes={}, probes={})
     assembly = cast("Assembly", SimpleNamespace(hub=hub, clock=clock, devices=devices, config=load_config(CONFIG)))
     record = HouseRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock, Patience())
