@@ -20,7 +20,7 @@ from typing import Protocol
 NS_PER_S = 1_000_000_000
 PIECE_S = 1.0  # the longest that anybody sleeps on a timer that stands still while the host is suspended
 
-_AWAKE_NS = 2_000_000  # a thread that sleeps may be woken this late
+_AWAKE_NS = 5_000_000  # a thread that sleeps may be woken this late
 _BOOT_TIME = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # Linux; elsewhere only recordings are read
 _LOOK_NS, _LOOKS = 1_000_000, 5  # of two clocks at one instant
 

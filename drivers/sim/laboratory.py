@@ -27,7 +27,7 @@ from drivers.sim.probes import FakeProbe
 from drivers.sim.regulator import FakeRegulator
 from drivers.sim.relays import FakeRelays
 from drivers.sim.rtd_sensors import CHANNELS
-from drivers.sim.scene import Scene, SceneSpec
+from drivers.sim.scene import Scene, SceneSpec, still
 from drivers.sim.switch import Switch
 from drivers.sim.thermal_imager import FakeThermalImager
 from drivers.sim.thermometers import FakeThermometers
@@ -282,13 +282,14 @@ class Laboratory:
         """At its address, or at a free one: GVCP's port is fixed, but any of 127.0.0.0/8 will do."""
         genicam = read_genicam(settings.genicam) if settings.genicam is not None else None
         kind = settings.optics or self.spec.camera_kind
+        picture = still(scene.render) if settings.still else scene.render
 
         def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
             with self.plant.lock:
                 self.plant.advance(time_ns if self._followed is None else self._clock.now_ns())
                 optics = self.plant.optics(time_ns, kind)
                 flap_open = 1.0 if self._flap is None else self.plant.flap_open_at(time_ns)  # else a window
-            return scene.render(optics, time_ns, exposure_s, gain_dB, flap_open, rows)
+            return picture(optics, time_ns, exposure_s, gain_dB, flap_open, rows)
 
         def at(address: str) -> FakeCamera:
             return FakeCamera(

@@ -74,10 +74,12 @@ class EndpointSpec(Document):
 
 
 class CameraSpec(EndpointSpec):
-    """A camera; optics: none is as `camera_kind`. genicam: the file of another make, which it then shows."""
+    """A camera; optics: none is as `camera_kind`. genicam: the file of another make, which it then shows. still: it
+    renders a picture once and shows it from then on, for measurements of time on the machine that simulates."""
 
     optics: CameraKind | None = None
     genicam: Path | None = None
+    still: bool = False
 
 
 class ChamberUnitSpec(Document):

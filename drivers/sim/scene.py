@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,6 +100,25 @@ class Scene:
             _dim(image, left, top, 1.0 - darkening * coverage)
         image += np.float32(spec.black_DN)
         return image
+
+
+Picture = Callable[[Optics, int, float, float, float, int], NDArray[np.uint8]]
+
+
+def still(render: Picture) -> Picture:
+    """The same as `Scene.render`, rendered once and shown until another exposure, gain, flap or region is asked for."""
+    kept: dict[tuple[float, float, float, int], NDArray[np.uint8]] = {}
+
+    def shown(
+        optics: Optics, time_ns: int, exposure_s: float, gain_dB: float, flap_open: float, rows: int
+    ) -> NDArray[np.uint8]:
+        key = exposure_s, gain_dB, flap_open, rows
+        if key not in kept:
+            kept.clear()
+            kept[key] = render(optics, time_ns, *key)
+        return kept[key]
+
+    return shown
 
 
 def disc_coverages(optics: Optics, blur_px: float, rows: int = HEIGHT_px) -> list[tuple[int, int, NDArray[np.float32]]]:

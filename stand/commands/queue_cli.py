@@ -43,7 +43,8 @@ def add(
 ) -> None:
     """Check a recipe and queue it as it is now: later edits of the files do not change it. Prints its number.
 
-    The daemon of the stand, when there is one, checks its wires and who answers there, too.
+    Its limits and the room on the disk are checked, and that every device of the stand answers and is the right one;
+    nothing is written to any. While another program has the stand the devices are not asked, and that is said.
 
     Example: stand queue add thermal-cycle --config laboratory.yaml --out /data/sessions
     """

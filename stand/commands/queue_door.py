@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,12 +12,13 @@ import typer
 
 from foundation.clock import WallClock
 from foundation.command_app import with_parameters
-from foundation.errors import ConfigError, SessionError
+from foundation.errors import ConfigError, InUse, SessionError
 from foundation.exit_codes import one_line_errors
 from foundation.output import say
 from stand.commands.reached import ConfigOption, TokenOption, UrlOption
 from stand.commands.submitted import submit_recipe
-from stand.config.stand_config import load_config, packaged
+from stand.commissioning.answering import not_answering
+from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.run_estimate import existing, price_night, small_disk
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry
@@ -78,7 +80,8 @@ class DaemonDoor:
 
 
 class FileDoor:
-    """The queue of a folder that no daemon has; nobody has opened its stand, so limits and the disk are checked."""
+    """The queue of a folder that no daemon has: limits, the disk and, of a real stand, wires and identities are checked
+    here. A simulated one may be run in virtual time, on a laboratory of its own, and is not asked."""
 
     def __init__(self, directory: Path, config: str) -> None:
         self.name = str(directory)
@@ -90,10 +93,20 @@ class FileDoor:
         night = price_night(tuple(order.recipe.plan()), order.config, self._directory)
         if lack := small_disk(shutil.disk_usage(existing(self._directory)).free, night.steps, order.config):
             raise SessionError(f"{self._directory}: {lack}")
-        number = queue.add(self._directory, order, self._config, WallClock().now_ns()).id
         if order.config.simulation is None:
-            say("no `stand serve` has this stand: its wires are asked when the run begins")
-        return number
+            self._check_wires(order.config)
+        return queue.add(self._directory, order, self._config, WallClock().now_ns()).id
+
+    def _check_wires(self, config: StandConfig) -> None:
+        """SessionError for what keeps the run from beginning; that a stand is busy is told, and keeps it from nothing:
+        what is queued has its turn later."""
+        try:
+            lacks = asyncio.run(not_answering(config))
+        except InUse as error:
+            say(f"warning: queued without asking the devices: {error}")
+            return
+        if lacks:
+            raise SessionError(f"this stand cannot run it now, and nothing was queued: {'; '.join(lacks)}")
 
     def runs(self) -> tuple[str, list[Entry | QueuedRun]]:
         """As Door."""

@@ -1,19 +1,27 @@
 """How punctual frames are in real time: 2 frames/s for 50 s by the whole daemon, polled at 1 Hz, guarded and recording.
 
-A frame's instant is the trigger's on the stand's clock. The grid begins with the most punctual frame, none can be
-early. The simulator renders and sends 5 MP frames on the same machine meanwhile: one that is due while the simulated
-camera still sends the one before is that camera's delay, not the stand's, and is counted apart.
+A frame's instant is the trigger's on the stand's clock, held against the one at which it was due. The simulated camera
+shows a picture that was rendered before, 5 MP of it over the wire, so that the frames' way through the stand is
+measured and not the rendering; one that is due while the camera still sends the one before is counted apart. Beside it
+a process that does nothing but wait for instants as often: what the machine does to any.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
 import shutil
+import signal
 import statistics
-from collections.abc import Awaitable, Callable, Sequence
+import subprocess
+import sys
+from collections.abc import Awaitable, Callable, Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 from drivers.wires.aravis_library import library
+from drivers.wires.camera_connection import Connection, Shot
 from foundation.clock import WallClock, seconds_ns
 from foundation.errors import StandError
 from foundation.hub import Hub
@@ -28,6 +36,20 @@ from tests.system.simulated_orders import simulated_order
 FRAMES = 101  # so that the 99th percentile is not the longest
 INTERVAL_s = 0.5
 LIMIT_ms = 2.0
+WAIT = """
+import json, sys
+from foundation.clock import WallClock, block_until
+
+clock, late_ms = WallClock(), []
+due_ns, period_ns = clock.now_ns(), round(1e9 * float(sys.argv[1]))
+try:
+    while True:
+        due_ns += period_ns
+        block_until(clock, due_ns)
+        late_ms.append((clock.now_ns() - due_ns) / 1e6)
+except KeyboardInterrupt:
+    print(json.dumps(late_ms))
+"""
 RECIPE = f"""
 name: bench
 experiments:
@@ -49,32 +71,62 @@ def figures(directory: Path) -> list[Figure]:
         return [skipped(what, error)]
     progress(f"{FRAMES} frames in real time")
     order = simulated_order(directory, RECIPE, poll_s=1.0)
-    simulator = Simulator(laboratory_of(order.config, virtual=False, seed=None))
+    with laboratory(order):
+        late_ms, bare_ms = deviations_ms(order, directory / "jitter")
+    return [schedule(what, late_ms, bare_ms)]
+
+
+@contextmanager
+def laboratory(order: Order) -> Generator[None]:
+    """The simulated one of the order, in real time; its camera renders one picture and shows it from then on."""
+    described = laboratory_of(order.config, virtual=False, seed=None)
+    cameras = cast("dict[str, dict[str, object]]", described["cameras"])
+    for camera in cameras.values():
+        camera["still"] = True
+    simulator = Simulator(described)
     try:
-        late_ms = deviations_ms(order, directory / "jitter")
+        yield
     finally:
         simulator.stop()
-    return [schedule(what, late_ms)]
 
 
-def schedule(what: str, late_ms: Sequence[float], more: str = "") -> Figure:
+def schedule(what: str, late_ms: Sequence[float], bare_ms: Sequence[float], more: str = "") -> Figure:
     """99th percentile of these deviations, and of how many of all frames they are."""
     busy = FRAMES - len(late_ms)
     if busy > FRAMES // 2:
         return skipped(what, f"{busy} of {FRAMES} frames came due while the camera was sending")
-    p99_ms = statistics.quantiles(late_ms, n=100, method="inclusive")[98]
     seen = f"p99 of {len(late_ms)} frames; median {statistics.median(late_ms):.2f}, greatest {max(late_ms):.2f} ms"
     seen += f"; {busy} more came due while the camera was sending{more}"
-    return at_most(LIMIT_ms, Figure(what, "ms", p99_ms, seen))
+    seen += f"; a process that only waits: p99 {_p99(bare_ms):.2f}, greatest {max(bare_ms):.2f} ms"
+    return at_most(LIMIT_ms, Figure(what, "ms", _p99(late_ms), seen))
+
+
+def _p99(values: Sequence[float]) -> float:
+    return statistics.quantiles(values, n=100, method="inclusive")[98]
+
+
+@contextmanager
+def _waiting() -> Generator[list[float]]:
+    """How late a process beside that only waits goes on, ms; filled when the inside is left."""
+    late_ms: list[float] = []
+    command = [sys.executable, "-c", WAIT, str(INTERVAL_s)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield late_ms
+        finally:
+            process.send_signal(signal.SIGINT)
+            late_ms += json.loads(process.communicate()[0])
 
 
 async def _nobody(_: Path) -> None:
     pass
 
 
-def deviations_ms(order: Order, out: Path, begun: Callable[[Path], Awaitable[None]] | None = None) -> list[float]:
-    """How late each frame of the first capture was triggered whose camera was free in time. `begun` gets the
-    session."""
+def deviations_ms(
+    order: Order, out: Path, begun: Callable[[Path], Awaitable[None]] | None = None
+) -> tuple[list[float], list[float]]:
+    """How late each frame of the first capture was triggered whose camera was free in time, and how late a process is
+    that only waits. `begun` gets the session."""
     triggered_ns: list[int] = []
     arrived_ns: list[int] = []
     clock = WallClock()  # ms beside the stand's own at most, and it looks `lead_ns` ahead
@@ -87,14 +139,27 @@ def deviations_ms(order: Order, out: Path, begun: Callable[[Path], Awaitable[Non
     def watch(hub: Hub) -> None:
         hub.subscribe(follow)
 
-    asyncio.run(run_real(order, out, watch, begun or _nobody))
+    with _noted_dues() as dues_ns, _waiting() as bare_ms:
+        asyncio.run(run_real(order, out, watch, begun or _nobody))
     shutil.rmtree(out)
-    period_ns = seconds_ns(INTERVAL_s)
-    begin_ns = min(time_ns - number * period_ns for number, time_ns in enumerate(triggered_ns))
-    due_ns = [begin_ns + number * period_ns for number in range(len(triggered_ns))]
-    free_ns = [0, *arrived_ns]
-    return [
-        (time_ns - due) / 1e6
-        for time_ns, due, free in zip(triggered_ns, due_ns, free_ns, strict=False)
-        if free <= due - clock.lead_ns
-    ]
+    frames = zip(triggered_ns, dues_ns, [0, *arrived_ns], strict=False)
+    return [(time_ns - due) / 1e6 for time_ns, due, free in frames if free <= due - clock.lead_ns], bare_ms
+
+
+@contextmanager
+def _noted_dues() -> Generator[list[int]]:
+    """When each frame of the capture is due on the stand's clock, in the order in which they are triggered."""
+    dues_ns: list[int] = []
+    trigger = Connection.trigger
+
+    def noted(self: Connection, exposure_s: float, due_ns: int = 0) -> Shot | None:
+        shot = trigger(self, exposure_s, due_ns)
+        if due_ns and shot is not None:
+            dues_ns.append(due_ns)
+        return shot
+
+    Connection.trigger = noted
+    try:
+        yield dues_ns
+    finally:
+        Connection.trigger = trigger

@@ -31,7 +31,6 @@ from stand.serving.client import Server, server_of
 from stand.serving.desk import Done, StandState, Who
 from stand.serving.presence import living
 from stand.serving.seen import seen_state
-from stand.simulator import Simulator, laboratory_of
 from stand.stand import Stand
 from tests.bench import abort, jitter
 from tests.bench.figures import Figure, at_most, progress, skipped
@@ -139,7 +138,6 @@ def _frames(directory: Path) -> list[Figure]:
         return [skipped(what, error)]
     progress(f"{jitter.FRAMES} frames in real time with {VIEWERS} viewers")
     order = simulated_order(directory, jitter.RECIPE, poll_s=1.0)
-    simulator = Simulator(laboratory_of(order.config, virtual=False, seed=None))
     out, viewers = directory / "viewed", list[subprocess.Popen[bytes]]()
 
     async def begun(session: Path) -> None:
@@ -151,11 +149,11 @@ def _frames(directory: Path) -> list[Figure]:
 
     began_s, used_s = time.monotonic(), time.process_time()
     try:
-        late_ms = jitter.deviations_ms(order, out, begun)
+        with jitter.laboratory(order):
+            late_ms, bare_ms = jitter.deviations_ms(order, out, begun)
         share = (time.process_time() - used_s) / (time.monotonic() - began_s)
     finally:
-        simulator.stop()
         for viewer in viewers:
             viewer.kill()
             viewer.wait()
-    return [jitter.schedule(what, late_ms, f"; the daemon took {100 * share:.0f} % of a core")]
+    return [jitter.schedule(what, late_ms, bare_ms, f"; the daemon took {100 * share:.0f} % of a core")]

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.sim.optics import Nodes, Optics, Placement, optics_at
-from drivers.sim.scene import Scene, SceneSpec, disc_coverages, polygon_coverage, true_centres_px
+from drivers.sim.scene import Scene, SceneSpec, disc_coverages, polygon_coverage, still, true_centres_px
 
 TIME_ns = 1_700_000_000_000_000_000
 FLAT = SceneSpec(light_slope=(0.0, 0.0), vignetting=0.0)
@@ -155,3 +155,20 @@ def test_markers_cut_by_the_border_are_drawn_as_far_as_they_reach():
 def test_a_target_out_of_sight_leaves_the_paper_white():
     optics = optics_at("modified", COLD, Placement(target_offset_mm=(2000.0, 0.0)))
     assert Scene(FLAT, seed=1).noise_free(optics, 0.1, 0.0, 1.0).min() == pytest.approx(200.0, abs=1e-3)
+
+
+def test_a_still_scene_renders_once_until_another_exposure_is_asked_for():
+    asked: list[float] = []
+
+    def render(
+        optics: Optics, time_ns: int, exposure_s: float, gain_dB: float, flap_open: float, rows: int
+    ) -> NDArray[np.uint8]:
+        asked.append(exposure_s)
+        return np.full((rows, 1), len(asked), dtype=np.uint8)
+
+    shown, optics = still(render), at()
+    pictures = [
+        int(shown(optics, TIME_ns + n, exposure_s, 0.0, 1.0, 2)[0, 0])
+        for n, exposure_s in enumerate((0.1, 0.1, 0.2, 0.2, 0.1))
+    ]
+    assert (pictures, len(asked)) == ([1, 1, 2, 2, 3], 3)
