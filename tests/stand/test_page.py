@@ -45,6 +45,8 @@ INK = """() => { const c = document.querySelector(".curve canvas");
 if (!c || !c.width) return 0;
 const points = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
 return points.filter((value, n) => n % 4 === 3 && value).length }"""
+WHOLE_HEADER = """() => [...document.querySelectorAll("header .who, header .doing, header .eta")].every(
+    (part) => part.scrollWidth <= part.clientWidth && part.scrollHeight <= part.clientHeight + 1)"""
 STOP_IS_ON_TOP = """() => { const b = document.getElementById("stop").getBoundingClientRect();
 const [w, h] = [b.width, b.height];
 const inside = b.top >= 0 && b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight;
@@ -319,9 +321,11 @@ async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path
         first.tell("before the restart")
     await page.locator("#phase", has_text="No connection").wait_for()
     await page.get_by_text("What is shown is of").wait_for()
+    await page.get_by_role("link", name="Queue").click()  # whose recipes nobody gives now
     async with a_night(tmp_path / "sessions", port) as second:
         await page.locator("#phase", has_text="Running").wait_for()
         await page.get_by_text("No connection to the stand").wait_for(state="detached")
+        await page.locator("#recipe option").first.wait_for(state="attached")
         second.trip()
         await page.locator("#phase", has_text="Tripped").wait_for()
         await manager.__aexit__(None, None, None)
@@ -333,6 +337,10 @@ async def test_a_phone_is_wide_enough_for_every_view(night):
             await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
             await page.wait_for_timeout(500)
             assert await page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"), view
+            assert await page.evaluate(WHOLE_HEADER), view
+        await page.goto(f"http://127.0.0.1:{night.port}/#now")
+        boxes = [await page.get_by_role("heading", name=name).bounding_box() for name in ("Readings", "Temperatures")]
+        assert boxes[0]["y"] < boxes[1]["y"]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -37,7 +37,7 @@ const of = (channel) => (channel.startsWith("camera.") ? "" : `, ${channel.split
 export function temperatures(units) {
   const found = Object.keys(units).filter((channel) => units[channel] === "degC");
   const place = (channel) => (ORDER.indexOf(channel) < 0 ? ORDER.length : ORDER.indexOf(channel));
-  return found.sort((one, other) => place(one) - place(other) || one.localeCompare(other));
+  return found.sort((one, other) => place(one) - place(other) || one.localeCompare(other, undefined, { numeric: true }));
 }
 
 const HIDDEN = "thermostand.hidden";

@@ -4,6 +4,7 @@ import { css } from "./dom.js";
 import { look_of } from "./channels.js";
 
 const MARK = { error: ["--bad", "▲"], warning: ["--warn", "◆"] };
+const LABELS_px = 104; // to the right of the curves
 const font = "12px system-ui, sans-serif";
 
 // history -> uPlot's columns: x in s, then low and high of each channel.
@@ -77,7 +78,7 @@ export class Curves {
       height: options.height,
       pxAlign: 0,
       legend: { show: false },
-      padding: [16, options.labels ? 104 : 12, 0, 0],
+      padding: [16, options.labels ? LABELS_px : 12, 0, 0],
       cursor: { sync: { key: options.sync ?? "curves" }, drag: { x: true, y: false, setScale: false }, points: { size: 6 } },
       select: { show: true },
       scales: { x: { time: options.time !== false }, y: { range: options.range ?? padded } },
@@ -166,7 +167,7 @@ export class Curves {
     context.textBaseline = "middle";
     for (const { look, y } of ends) {
       context.fillStyle = css(look.colour);
-      context.fillText(look.name, right + 6 * scale, y);
+      context.fillText(fitting(context, look.name, (LABELS_px - 8) * scale), right + 6 * scale, y);
     }
     context.restore();
   }
@@ -190,6 +191,16 @@ export class Curves {
     context.textAlign = "left";
     context.fillText(name, left + 4 * scale, y - 3 * scale);
   }
+}
+
+// A name that is too long keeps its beginning and its end, in which names of one kind differ.
+function fitting(context, name, room) {
+  let text = name;
+  for (let kept = name.length - 1; kept > 1 && context.measureText(text).width > room; kept -= 1) {
+    const half = Math.ceil(kept / 2);
+    text = `${name.slice(0, half)}…${name.slice(name.length - kept + half)}`;
+  }
+  return text;
 }
 
 const short = (value) => (Number.isInteger(value) ? String(value) : String(Math.round(value * 1000) / 1000)).replace("-", "−");

@@ -58,8 +58,8 @@ export class Devices {
     }
     const is_bounded = minimum !== null && minimum !== undefined;
     const input = h("input", { type: "number", step: "any", min: minimum, max: maximum, required: true });
-    const range = is_bounded ? ` ${number(minimum, 0)} to ${number(maximum, 0)}` : "";
-    return { name, value: () => Number(input.value), label: h("label", {}, `${words(unit ? name.replace(/_[a-zA-Z]+$/, "") : name)} `, input, h("small", {}, ` ${unit_of(unit)}${range}`)) };
+    const range = is_bounded ? `${number(minimum, 0)} to ${number(maximum, 0)} ` : "";
+    return { name, value: () => Number(input.value), label: h("label", {}, `${words(unit ? name.replace(/_[a-zA-Z]+$/, "") : name)} `, input, h("small", {}, ` ${range}${unit_of(unit)}`)) };
   }
 
   refuse(part, device) {

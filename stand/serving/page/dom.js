@@ -60,7 +60,7 @@ export function bytes(count) {
   return `${count.toFixed(count < 10 && index ? 1 : 0)} ${units[index]}`;
 }
 
-export const words = (name) => name.replace(/_degC$/, " °C").replace(/_deg$/, ", °").replace(/_(mm|s|K|px|Wh)$/, ", $1").replaceAll("_", " ");
+export const words = (name) => name.replace("setpoint", "set-point").replace(/_degC$/, " °C").replace(/_deg$/, ", °").replace(/_(mm|s|K|px|Wh)$/, ", $1").replaceAll("_", " ");
 
 export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 

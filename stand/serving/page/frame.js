@@ -17,6 +17,7 @@ export class FramePanel {
     this.choice = h("select", { "aria-label": "Camera", hidden: true, onchange: () => { this.camera = this.choice.value; this.time_ns = null; this.soon(); } });
     place.append(h("section", { class: "panel" },
       h("div", { class: "head" }, h("h2", {}, "Last frame"), this.choice, this.caption),
+      this.none = h("p", { class: "quiet" }, "The next frame of a run is shown here, and one that is taken under Devices."),
       this.box = h("div", { class: "frame", hidden: true }, this.canvas), this.facts));
     this.timer = setTimeout(() => this.refresh(), 0);
   }
@@ -46,6 +47,7 @@ export class FramePanel {
     this.time_ns = frame.time_ns;
     this.frame = frame;
     this.box.hidden = false;
+    this.none.hidden = true;
     this.draw();
     this.show();
   }
@@ -122,23 +124,25 @@ function arrow(context, x, y, dx, dy, unit) {
 // The view for setting a camera up: light, focus and tilt, as of the last frame.
 export class CameraView {
   constructor(place, app) {
-    const left = h("div", { class: "stack" }), right = h("div", { class: "stack" });
-    fill(place, h("div", { class: "grid" }, left, right));
+    const left = h("div", { class: "stack" });
+    this.right = h("div", { class: "stack" });
+    fill(place, h("div", { class: "grid" }, left, this.right));
     this.histogram = h("canvas", { role: "img", "aria-label": "Histogram of the last frame", width: 640, height: 180, class: "line" });
     this.histogram.style.height = "110px";
     this.light = h("dl", { class: "facts" });
     this.focus = h("dl", { class: "facts" });
     this.tilt = h("dl", { class: "facts" });
-    right.append(
+    this.aids = [
       h("section", { class: "panel" }, h("h2", {}, "Light"), this.histogram, h("p", { class: "quiet" }, "number of pixels (logarithmic) from black to white"), this.light),
       h("section", { class: "panel" }, h("h2", {}, "Focus"), this.focus),
-      h("section", { class: "panel" }, h("h2", {}, "Target against camera"), this.tilt, h("p", { class: "quiet" }, "Both keystones are 0 when camera and target face each other. The tilt is told from some degrees on.")));
+      h("section", { class: "panel" }, h("h2", {}, "Target against camera"), this.tilt, h("p", { class: "quiet" }, "Both keystones are 0 when camera and target face each other. The tilt is told from some degrees on."))];
     this.frame = new FramePanel(left, app, true);
     this.sharpest = null;
     this.frame.on_frame = (frame) => this.show(frame);
   }
 
   show({ setup }) {
+    fill(this.right, this.aids);
     this.draw(setup.histogram);
     const part = (share) => (share === 0 ? "none" : share < 0.0001 ? "below 0.01 %" : `${number(share * 100, 2)} %`);
     facts(this.light, [

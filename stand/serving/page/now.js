@@ -40,24 +40,24 @@ export class Now {
       power: new Curves(power, { height: 112, unit: "%", range: [-26, 105], space: 36, labels: !narrow, lane: { channel: "relays.compressor", name: "compressor" }, on_zoom: zoom }),
       drift: new Curves(drift, { height: 130, unit: "px", labels: !narrow, marks: true, on_zoom: zoom }),
     };
-    this.hint = h("small", {}, "drag across the curves to zoom");
+    this.hint = h("small", { class: "hint" }, "drag across the curves to zoom");
     this.readings = h("tbody");
     this.flags = h("div", { class: "flags" });
     this.events = h("ul", {});
-    this.frame_place = h("div", { class: "stack" });
-    fill(place, h("div", { class: "grid" },
-      h("div", { class: "stack" },
-        h("section", { class: "panel" },
-          h("div", { class: "head" }, h("h2", {}, "Temperatures"), this.hint, this.ranges),
-          above, h("p", { class: "curve-name" }, "Heater power, and the compressor"), power, this.drift_box),
-        h("section", { class: "panel" }, h("h2", {}, "What happened"), h("div", { class: "events", tabindex: "0", role: "region", "aria-label": "Events" }, this.events))),
-      h("div", { class: "stack" },
+    this.frame_place = h("div", { class: "stack last" });
+    fill(place, h("div", { class: "grid now" },
+      h("div", { class: "stack aside" },
         h("section", { class: "panel" }, h("h2", {}, "Readings"),
           h("div", { class: "scroll" }, h("table", { class: "readings" },
             h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "press to hide a curve"), h("th", { scope: "col", class: "number" }, "now"), h("th", { scope: "col", class: "number" }, "per h"))),
             this.readings))),
         h("section", { class: "panel" }, h("h2", {}, "Stand"), this.flags),
-        this.frame_place)));
+        this.frame_place),
+      h("div", { class: "stack" },
+        h("section", { class: "panel" },
+          h("div", { class: "head" }, h("h2", {}, "Temperatures"), this.hint, this.ranges),
+          above, h("p", { class: "curve-name" }, "Heater power, and the compressor"), power, this.drift_box),
+        h("section", { class: "panel" }, h("h2", {}, "What happened"), h("div", { class: "events", tabindex: "0", role: "region", "aria-label": "Events" }, this.events)))));
     this.frame = new FramePanel(this.frame_place, this.app, false);
     this.show_choice();
   }
@@ -69,7 +69,7 @@ export class Now {
     this.soon();
   }
 
-  soon() { clearTimeout(this.timer); this.show_choice(); this.refresh(); }
+  soon() { clearTimeout(this.timer); this.show_choice(); this.refresh(); this.frame.soon(); }
 
   show_choice() {
     this.back.hidden = this.fixed === null;
@@ -233,7 +233,7 @@ function in_force(history) {
 
 function output(percent) {
   if (percent === null) return "–";
-  const size = `${number(Math.abs(percent), 0)} %`;
+  const size = `${number(Math.abs(percent), 0)}\u00a0%`;
   return percent > 0 ? `heats, ${size}` : percent < 0 ? `cools, ${size}` : size;
 }
 

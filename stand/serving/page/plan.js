@@ -123,7 +123,7 @@ export class Plan {
     if (!is_run) return say(this.summary, "No run is under way.");
     const run = state.run;
     const end = run.end_ns === null ? "" : `; ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(run)}`;
-    say(this.summary, `${run.recipe}, session ${run.run_id || "–"}: step ${run.step} of ${run.steps}${is_held ? `, held: ${state.reasons.map(this.app.reason).join(", ")}` : ""}${end}`);
+    say(this.summary, `${run.recipe}, session ${run.run_id || "–"}: step ${run.step} of ${run.steps}${is_held ? `, held: ${state.prompt ? "it waits for you" : state.reasons.map(this.app.reason).join(", ")}` : ""}${end}`);
   }
 
   draw() {

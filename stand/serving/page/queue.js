@@ -4,7 +4,6 @@ import { ask, day_clock, duration, fill, h, seconds, unit_of } from "./dom.js";
 import { RecipeForm } from "./recipe_form.js";
 
 const ENDED = ["done", "failed", "stopped"];
-const WORD = { waiting: "waiting", running: "running", done: "done", failed: "failed", stopped: "stopped", interrupted: "interrupted" };
 const MOST_ENDED = 10;
 
 export class Queue {
@@ -107,7 +106,7 @@ export class Queue {
     const acts = h("span", { class: "row" });
     const button = (name, label, act, disabled = false) => acts.append(h("button", { type: "button", class: "small", "aria-label": `${label}: run ${run.id}`, disabled, onclick: act }, name));
     const row = h("li", { draggable: at >= 0 ? "true" : undefined }, h("span", { class: "number quiet" }, String(run.id)),
-      h("span", {}, h("b", {}, run.recipe), ` ${WORD[run.state]}`, run.expected_s ? `, ${duration(run.expected_s)}` : "",
+      h("span", {}, h("b", {}, run.recipe), ` ${run.state}`, time_of(run),
         h("br"), h("small", {}, [run.reason, run.added_by && `by ${run.added_by}`, `added ${day_clock(seconds(run.added_ns, offset_ns))}`, run.session].filter(Boolean).join(" · "))), acts);
     if (at >= 0) {
       button("▲", "Earlier", () => this.move(run, at), at === 0);
@@ -134,6 +133,14 @@ export class Queue {
   }
 
   move(run, to) { command(this.answer, `move run ${run.id}`, "POST", `/queue/${run.id}/move`, { to }); }
+  // A list that the stand could not give when the view was opened.
+  soon() { if (!this.form) { tell(this.form_answer, ""); this.load(); } }
   event() {}
   close() { this.closed = true; }
+}
+
+// What it will take, or has taken.
+function time_of(run) {
+  if (run.began_ns && run.ended_ns) return ` after ${duration(seconds(run.ended_ns - run.began_ns))}`;
+  return run.expected_s && !ENDED.includes(run.state) ? `, takes ${duration(run.expected_s)}` : "";
 }

@@ -21,11 +21,12 @@ export class Sessions {
     fill(place, h("div", { class: "stack" },
       this.comparison,
       h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Sessions"), this.search, this.compare_button), this.answer,
-        h("div", { class: "scroll" }, h("table", { class: "sessions" }, h("thead", {}, h("tr", {}, head)), this.rows)))));
+        this.table = h("div", { class: "scroll", hidden: true }, h("table", { class: "sessions" }, h("thead", {}, h("tr", {}, head)), this.rows)))));
     this.load();
   }
 
   async load() {
+    if (!this.sessions) tell(this.answer, "reading the list of sessions …");
     try {
       this.sessions = (await get("/sessions")).sort((one, other) => (begun_ns(other) ?? 0) - (begun_ns(one) ?? 0));
       if (!this.closed) this.show();
@@ -37,7 +38,9 @@ export class Sessions {
     const matches = (each) => [each.name, each.recipe, each.operator, ...(each.tags ?? [])].join(" ").toLowerCase().includes(text);
     const found = (this.sessions ?? []).filter(matches);
     fill(this.rows, found.slice(0, MOST_ROWS).map((each) => this.row(each)));
-    tell(this.answer, found.length ? (found.length > MOST_ROWS ? `the latest ${MOST_ROWS} of ${found.length}` : "") : "no session is recorded here");
+    this.table.hidden = !found.length;
+    const none = this.sessions?.length ? "no session matches the search" : "No session is recorded here yet. Each run makes one, and so does each day.";
+    tell(this.answer, found.length ? (found.length > MOST_ROWS ? `the latest ${MOST_ROWS} of ${found.length}` : "") : none);
     this.choose();
   }
 
@@ -144,6 +147,7 @@ export class Sessions {
   }
 
   update() {}
+  soon() { this.load(); }
   event(event) { if (["run.end", "reported", "not_reported"].includes(event.kind)) this.load(); }
   close() { this.closed = true; this.clear(); }
 }
