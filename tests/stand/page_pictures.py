@@ -13,7 +13,7 @@ from tests.stand.browser import PHONE, a_page, browser
 from tests.stand.page_desk import a_night, free_port
 
 WIDE = (1280, 900)
-COLOURS = 96
+COLOURS = 256
 
 
 async def take(folder: Path) -> None:
