@@ -21,7 +21,7 @@ from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
 from stand.watching.follow import Follow
 from stand.watching.moment import Moment
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import CORNER, SHORT_RECIPE, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 
@@ -127,7 +127,7 @@ async def test_the_time_left_of_dwells_that_end_when_settled_is_true_once_a_run_
 
 @pytest.mark.nightly
 async def test_the_time_left_is_true_over_the_whole_demo_night(tmp_path: Path, order: Callable[..., Order]):
-    session, left = await followed(order(packaged("recipes", "demo").read_text()), tmp_path)
+    session, left = await followed(order(packaged("recipes", "demo").read_text(), camera=CORNER), tmp_path)
     assert len(left) > 10_000
     assert worst_share(left, session) < 0.05
 

@@ -27,7 +27,7 @@ from stand.guarding.rules import Announcements, watches
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from stand.simulator import ControlSocket, Simulator
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import CORNER, SHORT_RECIPE, require_aravis
 
 Start = Callable[[StandConfig, bool], Simulator]
 
@@ -371,7 +371,7 @@ async def test_a_good_night_trips_nothing_and_warns_of_nothing(
     tmp_path: Path, order: Callable[..., Order], recipe: str
 ):
     """As the guard of the run saw it, and the recording of it once more, asked every second."""
-    ordered = order(recipe)
+    ordered = order(recipe, camera=CORNER)
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, lambda hub: None))
     assert [event.text for event in session.events() if event.kind.startswith("guard.")] == []
     hub, announced = Hub(), Announcements()
