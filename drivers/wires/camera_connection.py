@@ -35,7 +35,7 @@ from drivers.wires.camera_errors import NO_CONTROL_HINT
 from drivers.wires.camera_pixels import Pixels, frame_bytes, unpacked
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from drivers.wires.camera_temperature import find_temperature, read_temperature, temperature_place
-from foundation.clock import NS_PER_S, Clock, block_until, seconds_ns
+from foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
 from foundation.errors import Refused
 from foundation.readings import Cause
 
@@ -58,6 +58,7 @@ STAMP_SLACK_NS = 20_000_000
 FUTURE_NS = NS_PER_S
 
 TRANSFER_TIMEOUT_S = 2.0  # real seconds beyond the exposure: read-out, 5 MB on the wire, resends, a busy host
+VIRTUAL_TIMEOUT_S = 20.0  # in virtual time a host that is busy must not make another session: a frame may stop half way
 CONTROL_RETRY_S = 1.0
 FRAME_ID_WRAP = 65535  # 16-bit frame ids count 1..65535 and skip 0
 
@@ -120,7 +121,8 @@ class Connection:
         self._failed = 0  # attempts since the last good frame
         self._give_one_away = False
         self._free_run = settings.trigger == "free_run"
-        self._timeout_s = max(TRANSFER_TIMEOUT_S, 2 * settings.period_s)
+        self._is_virtual = isinstance(clock, VirtualClock)
+        self._timeout_s = VIRTUAL_TIMEOUT_S if self._is_virtual else max(TRANSFER_TIMEOUT_S, 2 * settings.period_s)
         self._offset_ns: int | None = None  # stand clock minus camera clock; None: no useful time stamps
         self._latched_at_ns = 0
         self._stamped_ns = 0  # the last time stamp, on the camera's clock
@@ -175,14 +177,14 @@ class Connection:
         self._stream = stream
 
     def _configure(self, stream: GigeStream) -> None:
-        retention_us = round(FRAME_RETENTION_PERIODS / self.effective.frame_rate_hz * 1e6)
+        retention_s = self._timeout_s if self._is_virtual else FRAME_RETENTION_PERIODS / self.effective.frame_rate_hz
         stream.set_property("socket-buffer", SOCKET_BUFFER_FIXED, G_TYPE_INT)
         stream.set_property("socket-buffer-size", self.effective.receive_buffer_bytes, G_TYPE_INT)
         stream.set_property("packet-resend", int(self._settings.resend), G_TYPE_INT)
         stream.set_property("packet-request-ratio", PACKET_REQUEST_RATIO, G_TYPE_DOUBLE)
         stream.set_property("initial-packet-timeout", INITIAL_PACKET_TIMEOUT_US, G_TYPE_UINT)
         stream.set_property("packet-timeout", PACKET_TIMEOUT_US, G_TYPE_UINT)
-        stream.set_property("frame-retention", retention_us, G_TYPE_UINT)
+        stream.set_property("frame-retention", round(retention_s * 1e6), G_TYPE_UINT)
         for _ in range(self._settings.buffers):
             stream.add_buffer(self.effective.payload_bytes)
 

@@ -1,12 +1,15 @@
 """Packets, answers and time stamps that a camera should not send, through Aravis: never a wrong pixel, never a frame
 lost without need, never a wrong instant."""
 
+import threading
 from collections.abc import AsyncGenerator
 
 import pytest
 
 from drivers.devices.camera_gige import Camera
 from drivers.sim.camera import FakeCamera
+from drivers.sim.gvsp_sender import StreamSender
+from drivers.wires import camera_connection
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.errors import Unreachable
 from foundation.readings import Frame
@@ -36,6 +39,26 @@ async def grabbed(camera: Camera, clock: VirtualClock, count: int = FRAMES) -> l
         frames.append(await camera.grab())
         await clock.sleep_until(clock.now_ns() + NS_PER_S)
     return frames
+
+
+async def test_a_frame_that_a_busy_machine_holds_up_half_way_is_waited_for_in_virtual_time(
+    wired: tuple[VirtualClock, FakeCamera], monkeypatch: pytest.MonkeyPatch
+):
+    """Longer than a frame's period: a session must not tell how busy the machine was."""
+    clock, _ = wired
+    pace, holds_s = StreamSender._pace, [0.7]
+
+    def pace_and_hold(sender: StreamSender, size_bytes: int, packets: int) -> None:
+        pace(sender, size_bytes, packets)
+        if holds_s:
+            threading.Event().wait(holds_s.pop())
+
+    async with opened(clock, packet_size=1500) as camera:
+        monkeypatch.setattr(StreamSender, "_pace", pace_and_hold)
+        frames = await grabbed(camera, clock, 2)
+    assert holds_s == []
+    assert [(frame.block_id, frame.dropped) for frame in frames] == [(1, 0), (2, 0)]
+    assert all(map(is_right, frames))
 
 
 @pytest.mark.parametrize("fault", ["doubled", "reordered"])
@@ -101,8 +124,9 @@ async def test_answers_that_come_twice_or_are_announced_as_late_are_taken_once(
 
 @pytest.mark.parametrize("stamp", ["zero", "backwards"])
 async def test_a_time_stamp_that_cannot_be_is_counted_and_the_frame_has_the_triggers_instant(
-    wired: tuple[VirtualClock, FakeCamera], stamp: str
+    wired: tuple[VirtualClock, FakeCamera], stamp: str, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 1.0)  # after a jump back one frame seems stale
     clock, fake = wired
     async with opened(clock) as camera:
         await grabbed(camera, clock, 2)
