@@ -100,7 +100,8 @@ class Identity:
         return ", ".join([f"{named} (by its register map)" if self.by_map else named, *told])
 
     def is_another_than(self, before: Identity) -> bool:
-        """Whether something that both tell differs: one that tells nothing cannot be told from another of its kind."""
+        """Whether something that both state differs: one that states nothing cannot be distinguished from others of
+        its kind."""
         pairs = (
             (self.vendor, before.vendor),
             (self.model, before.model),

@@ -17,7 +17,7 @@ looks, with and without set-points seen before, showed 50 mpx, 13 that in 5 of 6
 @dataclass(frozen=True, slots=True)
 class Looks:
     """How often a plan looks at the target for its drift. bump_px: the smallest step of the image that nights with as
-    many looks have shown; None where none is told from drift."""
+    many looks have shown; None where none can be distinguished from drift."""
 
     count: int
     bump_px: float | None

@@ -1,10 +1,10 @@
 """What of a night's drift no thermal state explains and no single step either: fixings that slip again and again, or
-settle anew each time.
+settle differently each time.
 
-A joint that sticks and slips moves the image along one line; fixings that settle anew after each change move it in any
-direction. In nights of 24 drawn cameras each (numbers 2400 to 2423, by which the limits were chosen) what is left along
-its main axis is 1.6 to 29 times that across (3 below 3) with slips, 1.2 to 3.1 (1 above 2.4) with fixings that settle
-anew; in cameras that repeat it is 0.1 to 2.4 mpx.
+A joint that sticks and slips moves the image along one line; fixings that settle differently after each change move it
+in any direction. In nights of 24 drawn cameras each (numbers 2400 to 2423, by which the limits were chosen) what is
+left along its main axis is 1.6 to 29 times that across (3 below 3) with slips, 1.2 to 3.1 (1 above 2.4) with fixings
+that settle differently; in cameras that repeat it is 0.1 to 2.4 mpx.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import re
 from drivers.devices.chamber_language import ChamberState
 from drivers.devices.chamber_settings import Ascii2Settings
 from drivers.wires.line_client import LineClient
-from drivers.wires.link import SerialSettings, open_link
+from drivers.wires.link import SerialSettings
 from foundation.errors import Unreachable
 
 _FIELD = re.compile(r"-?\d{3,4}\.\d")
@@ -48,22 +48,7 @@ class Language:
         self._settings = settings
         self._shape: tuple[int, int] | None = None  # fields and digits of the last reply
         line = SerialSettings(settings.baud, 1)
-        self._client = LineClient(
-            name,
-            lambda: open_link(name, settings.address, line),
-            settings.timeout_s,
-            settings.gap_s,
-            is_kept=settings.address.startswith("serial:"),
-        )
-
-    @property
-    def connected(self) -> bool:
-        """The link of the last request still stands."""
-        return self._client.connected
-
-    def close(self) -> None:
-        """Let go of the link."""
-        self._client.close()
+        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
 
     def identity(self) -> str:
         """It says nothing of itself in this language; `$01?` describes its fields."""
@@ -101,7 +86,7 @@ class Language:
         """It has no dead-man."""
 
     def _read(self) -> tuple[list[float], str]:
-        return self._client.query(self._bytes("I"), self._answer)
+        return self.client.query(self._bytes("I"), self._answer)
 
     def _answer(self, heard: bytes) -> tuple[list[float], str] | None:
         """As parse; a unit always sends as many fields and digits: a reply that lost some bytes gives itself away."""
@@ -123,9 +108,9 @@ class Language:
         written = "".join(str(int(bits.get(index, digit == "1"))) for index, digit in enumerate(digits))
         request = self._bytes("E " + " ".join([*map(number, fields), written]))
         try:
-            self._client.send(request, lambda heard: heard if heard.endswith((b"\r", b"\n")) else None)
+            self.client.send(request, lambda heard: heard if heard.endswith((b"\r", b"\n")) else None)
         except Unreachable:  # some units do not answer a write
-            if not self._client.connected:
+            if not self.client.connected:
                 self._read()  # over a new link; Unreachable when it is gone
 
     def _bytes(self, command: str) -> bytes:

@@ -17,7 +17,7 @@ from typing import TypeVar
 from drivers.devices.chamber_language import ChamberState
 from drivers.devices.chamber_settings import CtsSettings
 from drivers.wires.line_client import LineClient
-from drivers.wires.link import SerialSettings, open_link
+from drivers.wires.link import SerialSettings
 from foundation.errors import Refused
 
 Found = TypeVar("Found")
@@ -59,22 +59,7 @@ class Language:
         self._door_reply = settings.door_reply
         self._is_serial = settings.address.startswith("serial:")
         line = SerialSettings(settings.baud, 1, settings.parity)
-        self._client = LineClient(
-            name,
-            lambda: open_link(name, settings.address, line),
-            settings.timeout_s,
-            settings.gap_s,
-            is_kept=self._is_serial,
-        )
-
-    @property
-    def connected(self) -> bool:
-        """The link of the last request still stands."""
-        return self._client.connected
-
-    def close(self) -> None:
-        """Let go of the link."""
-        self._client.close()
+        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
 
     def identity(self) -> str:
         """It says nothing of itself."""
@@ -86,17 +71,17 @@ class Language:
 
     def state(self) -> ChamberState:
         """Of A0, S, and F when there is an error."""
-        actual, nominal = self._client.query(*self._asked("A0", 14, self._temperatures))
-        flags, code = self._client.query(*self._asked("S", 10, self._flags))
+        actual, nominal = self.client.query(*self._asked("A0", 14, self._temperatures))
+        flags, code = self.client.query(*self._asked("S", 10, self._flags))
         alarms = (self._error_text(code),) if flags[1] == "1" or ord(code) & 0x7F not in _NO_ERROR else ()
-        is_open = self._door_reply is not None and self._client.query(*self._asked("O", self._door_reply, _door_open))
+        is_open = self._door_reply is not None and self.client.query(*self._asked("O", self._door_reply, _door_open))
         return ChamberState(
             actual, nominal, flags[0] == "1", alarms, humidity_on=flags[3] == "1", door_open=bool(is_open)
         )
 
     def set_temperature(self, degC: float) -> None:
         """a0 025.0."""
-        self._client.send(*self._asked(f"a0 {_number(degC)}", 1, _expecting("a")))
+        self.client.send(*self._asked(f"a0 {_number(degC)}", 1, _expecting("a")))
 
     def humidity_off(self) -> None:
         """Its channel differs from unit to unit."""
@@ -104,13 +89,13 @@ class Language:
 
     def run(self, on: bool) -> None:
         """s1 1 or s1 0."""
-        self._client.send(*self._asked(f"s1 {int(on)}", 2, _expecting("s1")))
+        self.client.send(*self._asked(f"s1 {int(on)}", 2, _expecting("s1")))
 
     def renew(self) -> None:
         """It has no dead-man."""
 
     def _error_text(self, code: str) -> str:
-        text = self._client.query(*self._asked("F", 33, lambda text: text[1:].strip() if text[:1] == "F" else None))
+        text = self.client.query(*self._asked("F", 33, lambda text: text[1:].strip() if text[:1] == "F" else None))
         return text or f"error {code!r}"
 
     def _temperatures(self, text: str) -> tuple[float, float] | None:

@@ -12,7 +12,7 @@ import re
 from drivers.devices.chamber_language import ChamberState
 from drivers.devices.chamber_settings import EspecSettings
 from drivers.wires.line_client import LineClient
-from drivers.wires.link import SerialSettings, open_link
+from drivers.wires.link import SerialSettings
 from foundation.errors import GarbledReply, Refused
 
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
@@ -52,22 +52,7 @@ class Language:
             else "nothing: it goes on at its set-point, within the limits of its own controller"
         )
         line = SerialSettings(settings.baud, 1)
-        self._client = LineClient(
-            name,
-            lambda: open_link(name, settings.address, line),
-            settings.timeout_s,
-            settings.gap_s,
-            is_kept=settings.address.startswith("serial:"),
-        )
-
-    @property
-    def connected(self) -> bool:
-        """The link of the last request still stands."""
-        return self._client.connected
-
-    def close(self) -> None:
-        """Let go of the link."""
-        self._client.close()
+        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
 
     def identity(self) -> str:
         """The reply to TYPE?, such as T,T,S2,160.0."""
@@ -116,7 +101,7 @@ class Language:
             self._tell("TIMER,ON,0")
 
     def _temperatures(self) -> list[float]:
-        return self._client.query(self._bytes("TEMP?"), lambda heard: self._parsed(heard, 4))
+        return self.client.query(self._bytes("TEMP?"), lambda heard: self._parsed(heard, 4))
 
     def _parsed(self, heard: bytes, count: int) -> list[float] | None:
         line = _line(heard)
@@ -136,7 +121,7 @@ class Language:
                 raise ValueError("expected temperature, humidity, mode, number of alarms")
             return float(fields[0]), fields[1], fields[2], int(fields[-1])
 
-        return self._client.query(self._bytes("MON?"), answer)
+        return self.client.query(self._bytes("MON?"), answer)
 
     def _humidity_on(self) -> bool:
         """`25,85,100,0`: the set value is no number when it is off."""
@@ -144,12 +129,12 @@ class Language:
         return len(fields) > 1 and bool(_NUMBER.fullmatch(fields[1].strip()))
 
     def _ask(self, command: str) -> str:
-        line = self._client.query(self._bytes(command), _line)
+        line = self.client.query(self._bytes(command), _line)
         self._refuse(line, command)
         return line
 
     def _tell(self, command: str) -> None:
-        line = self._client.send(self._bytes(command), _line)
+        line = self.client.send(self._bytes(command), _line)
         self._refuse(line, command)
         if not line.startswith("OK:"):
             raise GarbledReply(self._name, f"{command!r} was answered by {line!r}")

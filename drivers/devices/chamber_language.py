@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from drivers.wires.line_client import LineClient
+
 
 @dataclass(frozen=True, slots=True)
 class ChamberState:
-    """One look: temperatures in degC, whether it controls, its alarms in words; `humidity_on`: None when it cannot be
-    told; program: a program of its own runs; door_open: as far as it tells. ramp_degC: the set-point on its way, None
-    when it does not move."""
+    """One look: temperatures in degC, whether it controls, its alarms in words; `humidity_on`: None when that is
+    unknown; program: a program of its own runs; door_open: False where it does not say. ramp_degC: the set-point on
+    its way, None when it does not move."""
 
     actual_degC: float
     set_degC: float
@@ -25,20 +27,13 @@ class ChamberState:
 class ChamberLanguage(Protocol):
     """One conversation, blocking. All calls raise Unreachable, GarbledReply, Refused or DeviceFault.
 
-    resolution_K: of a set-point. dead_man: what ends the heat when this computer dies, in words.
+    client: of its requests. resolution_K: of a set-point. dead_man: what ends the heat when this computer dies, in
+    words.
     """
 
+    client: LineClient
     resolution_K: float
     dead_man: str
-
-    @property
-    def connected(self) -> bool:
-        """The link of the last request still stands: the unit is the one that was identified."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the link; may be called twice."""
-        ...
 
     def identity(self) -> str:
         """What it says of itself; "" when it says nothing."""
@@ -57,7 +52,8 @@ class ChamberLanguage(Protocol):
         ...
 
     def humidity_off(self) -> None:
-        """Switch humidity and condensation off; Refused, with what to do at the panel, when it cannot be told to."""
+        """Switch humidity and condensation off; Refused, with what to do at the panel, when it has no command for
+        that."""
         ...
 
     def run(self, on: bool) -> None:

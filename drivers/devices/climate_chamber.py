@@ -33,7 +33,8 @@ class ClimateChamber:
 
     allowed_degC: the set-points that the stand may ask for; a chamber whose own controller allows more is refused.
     Identity, limits and humidity are looked at before the first command and after every loss. A set-point is sent only
-    when it differs from what the unit has. What somebody changed at the panel is told, and never overwritten unasked.
+    when it differs from what the unit has. What somebody changed at the panel is reported, and never overwritten
+    unasked.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class ClimateChamber:
         """Let go of the wire; the chamber goes on."""
         lane, self._lane = self._lane, None
         if lane is not None:
-            await lane.call(self._language.close)
+            await lane.call(self._language.client.close)
             lane.close()
 
     async def read(self) -> tuple[Reading, ...]:
@@ -152,7 +153,7 @@ class ClimateChamber:
 
     def _ready(self) -> ChamberState:
         """Its state, after it was made sure who answers."""
-        if not (self._is_checked and self._language.connected):
+        if not (self._is_checked and self._language.client.connected):
             self._check()
         return self._language.state()
 

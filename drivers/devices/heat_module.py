@@ -102,7 +102,7 @@ class HeatModule:
 
     async def arm(self) -> None:
         """Before control begins: safe values as configured, output at zero, watchdog on and not tripped, all read back.
-        A trip is cleared: whoever starts control has seen it."""
+        A trip is cleared: the program that starts control has seen it."""
         async with self._lock:
             self._armed_ns, self._left_mA = None, None
             await self._prepare()

@@ -20,7 +20,7 @@ from foundation.readings import Reading
 class ContactSettings(Document):
     """One contact. channel: its input, 0 is the first. fault_when: open (a contact that is closed while all is well, as
     safety contacts are: a broken wire opens them) or closed. action: what then happens; trip ends the run, hold waits
-    for an operator, warn says so. after_s: how long it must last. means: what people are told."""
+    for an operator, warn says so. after_s: how long it must last. means: the sentence that people read."""
 
     channel: int = Field(ge=0, le=31)
     fault_when: Literal["open", "closed"] = "open"

@@ -20,7 +20,7 @@ from pydantic import Field
 from drivers.devices.thermometers import Calibration
 from drivers.settings import Identity, Polled, PollPeriod_s, same_device
 from drivers.wires.line_client import LineClient
-from drivers.wires.link import SerialSettings, open_link
+from drivers.wires.link import SerialSettings
 from foundation.addresses import ByteAddress
 from foundation.clock import Clock
 from foundation.errors import Refused, Unreachable
@@ -96,13 +96,7 @@ class Probe:
         line = SerialSettings(
             settings.baud or as_delivered.baud, as_delivered.stopbits, as_delivered.parity, as_delivered.databits
         )
-        self._client = LineClient(
-            name,
-            lambda: open_link(name, settings.address, line),
-            settings.timeout_s,
-            _GAP_S,
-            is_kept=settings.address.startswith("serial:"),
-        )
+        self._client = LineClient.at(name, settings.address, line, settings.timeout_s, _GAP_S)
 
     async def open(self) -> None:
         """Which unit answers; Refused when it is another one."""

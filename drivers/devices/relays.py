@@ -125,7 +125,7 @@ class Relays:
             return (await self._states())[channel] == on
 
         async with self._lock:
-            if on:  # off is never withheld, whoever answers
+            if on:  # off is never withheld, even from a unit of another identity
                 await self._known()
             await self._unit.checked(send, holds, f"{channel} {'on' if on else 'off'}")
 

@@ -41,7 +41,7 @@ from foundation.errors import ConfigError
 # How fast frames leave: as a camera's readout in real time; in virtual time nothing else moves meanwhile.
 _PACE_MBps = {False: 40.0, True: 120.0}
 
-_LINE_MBps = 125.0  # 1 Gbit/s, at which each of several cameras sends unless it is told to pause
+_LINE_MBps = 125.0  # 1 Gbit/s, at which each of several cameras sends unless it is set to pause
 _FREE_ADDRESS_TRIES = 100
 
 

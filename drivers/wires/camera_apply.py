@@ -139,7 +139,7 @@ def _trigger_off(device: GigeDevice) -> None:
 
 
 def _set_modes(device: GigeDevice) -> None:
-    """Frames until told to stop, nothing automatic, the exposure timed."""
+    """Frames until a stop command, nothing automatic, the exposure timed."""
     pairs = [("AcquisitionMode", "Continuous"), words.TIMED, *((feature, "Off") for feature in words.AUTOMATICS)]
     for feature, entry in pairs:
         if device.available(feature) and entry in _offered(device, feature) and device.get_string(feature) != entry:

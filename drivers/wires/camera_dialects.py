@@ -37,5 +37,5 @@ TEMPERATURES = (
 )
 TEMPERATURE_ENTRIES = ("Sensor", "Sensorboard", "SensorBoard", "Mainboard", "Coreboard")  # the nearest to the sensor
 
-# Without these nothing can be done with a camera; what else is missing is told where it is needed.
+# Without these nothing can be done with a camera; what else is missing is reported where it is needed.
 NECESSARY = ("Width", "Height", "PixelFormat", "PayloadSize", "AcquisitionStart", "AcquisitionStop")

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from drivers.wires.link import ByteLink
+from drivers.wires.link import ByteLink, SerialSettings, open_link
 from foundation.errors import GarbledReply, Unreachable
 
 Answer = TypeVar("Answer")
@@ -36,6 +36,12 @@ class LineClient:
         self._is_kept = is_kept
         self._link: ByteLink | None = None
         self._free_s = 0.0
+
+    @classmethod
+    def at(cls, device: str, address: str, line: SerialSettings, timeout_s: float, gap_s: float) -> LineClient:
+        """Of the device at `serial:PATH`, with these settings, or `tcp:HOST:PORT`."""
+        is_kept = address.startswith("serial:")
+        return cls(device, lambda: open_link(device, address, line), timeout_s, gap_s, is_kept=is_kept)
 
     @property
     def connected(self) -> bool:

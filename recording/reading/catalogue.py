@@ -2,7 +2,7 @@
 
 The index is made from the sessions and holds nothing else. An entry counts as long as the names, sizes and times of its
 session's files are those it was made of; all others are made again. An index that is lost, damaged, of another version
-or somebody else's is made anew; where none can be written, the list takes as long as it takes to look at each session.
+or somebody else's is made again; where none can be written, the list takes as long as it takes to look at each session.
 
 Nothing is imported here that takes time: a list of known sessions needs neither numpy nor protobuf.
 """
@@ -125,9 +125,9 @@ Memory = dict[Path, tuple[str, Entry]]  # a digest of the files, and what was ma
 
 
 def catalogue(folder: Path, report: Callable[[int], Report] | None = None, memory: Memory | None = None) -> list[Entry]:
-    """The sessions in `folder`, the oldest first. `report`: called with how many must be looked at, gives what is told
-    of the progress. memory: takes what is new in place of the index, for who must not wait for a disk that hangs.
-    Blocking; OSError when the folder cannot be read."""
+    """The sessions in `folder`, the oldest first. `report`: called with how many must be looked at, gives what is
+    called with the progress. memory: takes what is new in place of the index, for who must not wait for a disk that
+    hangs. Blocking; OSError when the folder cannot be read."""
     found = {path: files for path in _folders(folder) if (files := _files(path)) is not None}
     digests = {path: _digest(files) for path, files in found.items()}
     with closing(_Index(folder, memory)) as index:

@@ -1,4 +1,4 @@
-"""`stand alert`: whether those who are to be told are reached."""
+"""`stand alert`: whether alerts reach their receivers."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def _rehearse(file: Path, stand: StandConfig) -> None:
 
 
 def _nothing(_: tuple[Finding, ...]) -> None:
-    """Of what is told at the end."""
+    """The summary at the end."""
 
 
 def _tell(findings: tuple[Finding, ...]) -> None:

@@ -1,4 +1,4 @@
-"""What those who run a stand are told about its check: that there was none, or that it was of another file."""
+"""Warnings about a stand's last `stand check`: that there was none, or that it was of another file."""
 
 from __future__ import annotations
 

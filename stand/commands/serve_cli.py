@@ -51,7 +51,7 @@ def serve(
     ] = None,
     no_reports: Annotated[bool, typer.Option("--no-reports", help="Report no run when it is complete.")] = False,
 ) -> None:
-    """Own the stand until it is told to end: status, devices by hand, and a queue whose runs are its guests.
+    """Own the stand until it is stopped: status, devices by hand, and a queue whose runs are its guests.
 
     SIGTERM or Ctrl-C makes the stand safe and ends it; the run under way may be resumed.
 
@@ -85,7 +85,8 @@ def serve(
 
 
 def _attachments(path: Path, stand: StandConfig) -> dict[str, str]:
-    """What each session of this stand keeps, by the attachment's name; a stand that was not checked since is told."""
+    """What each session of this stand keeps, by the attachment's name; a stand that was not checked since is
+    reported."""
     texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
     record = load_checked(path)
     warn_unchecked(path, stand, record)

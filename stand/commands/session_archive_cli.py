@@ -98,7 +98,7 @@ def _line(text: str) -> None:
 
 
 def _copy(entries: Sequence[Entry], out: Path, found: _Done) -> None:
-    """Those that must wait are told."""
+    """Those that must wait are listed."""
     waiting = [(entry, reason) for entry in entries if not entry.archived and (reason := unfit(entry))]
     for entry, reason in waiting:
         found.waiting[entry.name] = reason

@@ -35,7 +35,7 @@ def packet_finding(name: str, address: str, packet_size: int) -> Finding:
             towards.connect((address, _GVCP))
             mtu = towards.getsockopt(socket.IPPROTO_IP, _IP_MTU)
         except OSError as error:
-            text = f"packets of {packet_size} bytes; what the line takes cannot be told ({error.strerror})"
+            text = f"packets of {packet_size} bytes; the line's own limit is not known ({error.strerror})"
             return Finding(name, "packets", "unverified", text, "look at the MTU of its network interface")
     data: dict[str, object] = {"packet_size": packet_size, "mtu": mtu}
     text = f"packets of {packet_size} bytes, the network interface takes up to {mtu}"

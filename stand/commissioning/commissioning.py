@@ -24,7 +24,7 @@ from stand.commissioning.links import Links
 from stand.commissioning.moves import Moves
 from stand.config.stand_config import StandConfig
 from stand.running.claim import claimed
-from stand.running.house import close_devices
+from stand.running.house import close_devices, made_safe
 from stand.running.stop import Stop
 
 COMMAND = "stand check"
@@ -36,7 +36,7 @@ Work = Callable[[], Awaitable[None]]
 async def commission(
     config: StandConfig, tell: Tell, *, has_moves: bool
 ) -> tuple[tuple[Finding, ...], dict[str, Identity]]:
-    """Everything that was found, told group by group as it is found, and which devices have answered.
+    """Everything that was found, reported group by group as it is found, and which devices have answered.
 
     InUse when the stand belongs to another program: then nothing was touched. Interrupted when it was stopped, and
     ConfigError.
@@ -107,14 +107,8 @@ async def _looks(assembly: Assembly, add: Callable[[Finding], None], *, has_move
 
 
 async def _made_safe(assembly: Assembly, stop: Stop, found: list[Finding], tell: Tell) -> None:
-    """Everything that may have moved, confirmed."""
-    stop.taking_down()
-    await stop.settled()
-    safety = assembly.stand.safety
-    safety.demand()
-    await safety.confirmed(assembly.config.guard.safe_limit_s)
-    await safety.close()
-    if unsafe := safety.unconfirmed:
+    """Everything that may have moved; a failure when it is not confirmed."""
+    if unsafe := await made_safe(assembly, stop):
         text = f"NOT SAFE: {'; '.join(unsafe)}"
         found.append(Finding("stand", "made safe", "failed", text, "look at the stand now"))
         tell((found[-1],))

@@ -1,4 +1,4 @@
-"""A camera that is only a GenICam file yet: what of it a stand would use, told by opening it in the simulator."""
+"""A camera that is only a GenICam file yet: what of it a stand would use, found by opening it in the simulator."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ class Links:
         await self._device(self._assembly.devices.axes[name], lambda error: advice.for_axis(error, name))
 
     async def camera(self, name: str, *, is_switched_on_later: bool) -> None:
-        """A camera; one without supply is left alone, and that is told unless it gets it later."""
+        """A camera; one without supply is left alone, and that is reported unless it gets it later."""
         assembly, camera = self._assembly, self._assembly.devices.cameras[name]
         if not await self._has_supply():
             if is_switched_on_later:

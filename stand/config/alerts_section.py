@@ -26,10 +26,11 @@ Cause = Literal[
 
 
 class AlertsConfig(Document):
-    """Who is told when nobody is at the stand. secrets: a YAML file (mode 0600) with `urls`, addresses of Apprise
-    (https://github.com/caronc/apprise), and `alive_url`; it is never recorded or shown. causes: what is told. grace_s:
-    what is over by itself within this is not told. most_per_h: messages, but for trips. alive_every_s: how often
-    alive_url is called while all is well; a service that misses the call raises the alarm when this computer cannot.
+    """Who gets a message when nobody is at the stand. secrets: a YAML file (mode 0600) with `urls`, addresses of
+    Apprise (https://github.com/caronc/apprise), and `alive_url`; it is never recorded or shown. causes: what is
+    reported. grace_s: what is over by itself within this is not reported. most_per_h: messages, but for trips.
+    alive_every_s: how often alive_url is called while all is well; a service that misses the call raises the alarm when
+    this computer cannot.
     """
 
     secrets: Path | None = None

@@ -1,6 +1,6 @@
 """The daemon: it owns a stand for days. One guard from its first look to its last; runs of the queue are its guests.
 
-locks -> open, harmless -> the house's record -> polled and guarded -> clients -> the queue, one run after another
+locks -> open, harmless -> the record between runs -> polled and guarded -> clients -> the queue, one run after another
 end: the run stopped, the stand safe and tried until it confirms, the record completed, everything closed
 """
 
@@ -48,7 +48,7 @@ _KEEP_EVERY_S, _READ_EVERY_S = 60.0, 5.0
 
 
 class Daemon:
-    """An open stand with its queue and record. `serve` until it is told to leave, or something fails."""
+    """An open stand with its queue and record. `serve` until it is asked to leave, or something fails."""
 
     def __init__(self, house: House, orders: Orders, record: HouseRecord, kept: Kept, keep: KeptFile) -> None:
         assembly = house.assembly
@@ -261,7 +261,7 @@ class Daemon:
             systemd.tell("STATUS=idle")
 
     async def _record_house(self) -> None:
-        """The house's record is what heat depends on, when no run records; a disk that refuses it is an event, and
+        """Heat depends on the record between runs while no run records; a disk that refuses it is an event, and
         there is no heat by hand."""
         self._recorded_ns = self._clock.now_ns()
         try:

@@ -66,7 +66,7 @@ class DaemonDesk:
         return () if run is None else run.plan()
 
     def devices(self) -> tuple[DeviceState, ...]:
-        """What may be told by hand."""
+        """The commands that devices take by hand."""
         return self._daemon.by_hand.devices(self._daemon.refused_by_hand())
 
     def pause(self, who: Who, when: When = "now") -> Done:

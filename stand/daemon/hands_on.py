@@ -1,6 +1,6 @@
 """One device by hand while no daemon has the stand: `stand device NAME VERB` at the bench.
 
-The stand's addresses are locked as for a run, the device and what it needs are opened, what it is told goes through the
+The stand's addresses are locked as for a run, the device and what it needs are opened, commands go through the
 verbs of the stand, so through its gate and limits, and at the end what was moved is made safe: the flap is shut, stages
 stand still, the cameras' supply is as it was. Nothing is heated: heat needs a recording and the guard.
 """
@@ -28,7 +28,7 @@ from stand.assembly import Assembly, assemble, register_map
 from stand.config.stand_config import StandConfig
 from stand.daemon.by_hand import ByHand
 from stand.running.claim import claimed
-from stand.running.house import close_devices
+from stand.running.house import close_devices, made_safe
 from stand.running.run_desk import device_kinds
 from stand.running.stop import Stop
 from stand.serving.desk import Conflict, DeviceState
@@ -166,13 +166,7 @@ async def _session(config: StandConfig) -> AsyncGenerator[_Hands]:
 
 
 async def _made_safe(assembly: Assembly, stop: Stop) -> None:
-    stop.taking_down()
-    await stop.settled()
-    safety = assembly.stand.safety
-    safety.demand()
-    await safety.confirmed(assembly.config.guard.safe_limit_s)
-    await safety.close()
-    if unsafe := safety.unconfirmed:
+    if unsafe := await made_safe(assembly, stop):
         raise StandTripped(f"NOT SAFE: {'; '.join(unsafe)}; look at the stand now")
 
 

@@ -1,7 +1,7 @@
 """The daemon's own record between runs: one session a day, `20261122-house`, begun at local midnight.
 
-What is done by hand is recorded as in a run, and heat depends on it in the same way. While a run records, the house
-does not: each instant is in one session.
+What is done by hand is recorded as in a run, and heat depends on it in the same way. While a run records, the
+daemon does not: each instant is in one session.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class HouseRecord:
         if self._now is None:
             return
         recording, self._now = self._now, None
-        ended = Event(self._clock.now_ns(), "info", RUN_END, "the house's record ends", {"status": Run.COMPLETE})
+        ended = Event(self._clock.now_ns(), "info", RUN_END, "the record between runs ends", {"status": Run.COMPLETE})
         recording.tap.give(ended)
         recording.tap.close()
         self._cut_off.append(recording)
@@ -159,7 +159,7 @@ class HouseRecord:
 
 
 class _Tap(Hub):
-    """The house's hub as one recorder sees it, until it is closed: `give` reaches that recorder alone."""
+    """The stand's hub as one recorder sees it, until it is closed: `give` reaches that recorder alone."""
 
     def __init__(self, hub: Hub) -> None:
         super().__init__()

@@ -129,8 +129,8 @@ class Orders:
 
     async def run_one(self, entry: Entry, notes: Notes, begun: Callable[[], None], tell: Callable[[str], None]) -> Path:
         """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
-        without the house's. Raises as a run does, Stopped when an operator has stopped it: who presses stop does not
-        want the next one to begin."""
+        without the record between runs. Raises as a run does, Stopped when an operator has stopped it: who presses
+        stop does not want the next one to begin."""
         session = self.directory / entry.session if entry.session else None
         if session is not None and await self.reading.call(is_complete, session):
             return session  # killed between its end and the note of it

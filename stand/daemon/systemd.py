@@ -1,4 +1,4 @@
-"""What systemd is told: READY, STATUS, WATCHDOG, STOPPING (sd_notify(3)), without a library."""
+"""The notices to systemd: READY, STATUS, WATCHDOG, STOPPING (sd_notify(3)), without a library."""
 
 from __future__ import annotations
 

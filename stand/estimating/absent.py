@@ -1,4 +1,4 @@
-"""What a stand lacks, and what it therefore cannot do: told with its plan and recorded with its runs."""
+"""What a stand lacks, and what it therefore cannot do: shown with its plan and recorded with its runs."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
@@ -38,15 +38,18 @@ class CameraOpening:
         deadline_ns: int,
         longest_retry_s: float = LONGEST_RETRY_S,
         is_vain: Callable[[], bool] = lambda: False,
+        proof: Callable[[], Awaitable[object]] | None = None,
     ) -> bool:
         """Try again after 1 s, 2 s, 4 s ... until `deadline_ns`; raises what the last try raised, and what `check`
-        raises before each. False when it is in vain."""
+        raises before each. False when it is in vain. proof: what has to succeed as well, such as a frame."""
         retry_s = RETRY_S
         while not is_vain():
             check()
             try:
                 async with self._turn:
                     await self._open()
+                if proof is not None:
+                    await proof()
             except Unreachable:
                 if self._clock.now_ns() >= deadline_ns:
                     raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Collection, Iterable
 from dataclasses import replace
+from functools import partial
 
 from drivers.devices.protocols import Shutter
 from foundation.clock import Clock, seconds_ns
@@ -14,7 +15,7 @@ from foundation.items import Event
 from foundation.readings import Frame
 from stand.config.stand_config import LEADING
 from stand.gate import CAMERA_LOST, Gate
-from stand.imaging.camera_opening import LONGEST_RETRY_S, LOST_LIMIT_S, RETRY_S
+from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
 from stand.imaging.camera_supply import CameraSupply
 from stand.imaging.cameras import Cameras
 from stand.interlock import Interlock, Motions
@@ -105,34 +106,17 @@ class Imaging:
         self._hub.publish(Event(begin_ns, "warning", "camera_lost", str(lost)))
         self._gate.hold(CAMERA_LOST)
         deadline_ns = begin_ns + limit_ns - self._without_camera_ns
+        supply, proof = self.supply, None
+        if self._without_camera_ns:
+            # It opened and gave no frame. The gate stays held until it gives one, which is not kept: else a hold would
+            # begin with each try, and the flap would never be shut in it.
+            proof = partial(self._cameras.grab, exposure_s, 0, cameras)
         try:
-            if self._without_camera_ns:
-                is_back = await self._until_frame(exposure_s, cameras, deadline_ns)
-            else:
-                is_back = await self._until_open(deadline_ns)
+            is_back = await supply.opening.until_open(
+                self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on, proof=proof
+            )
         finally:
             self._gate.clear(CAMERA_LOST)
             self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
         if is_back:
             self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
-
-    async def _until_open(self, deadline_ns: int) -> bool:
-        """False when the camera is without supply."""
-        supply = self.supply
-        return await supply.opening.until_open(self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on)
-
-    async def _until_frame(self, exposure_s: float, cameras: Collection[str], deadline_ns: int) -> bool:
-        """As `_until_open`, of a camera that opened and gave no frame: until it gives one, which is not kept. The gate
-        stays held meanwhile, or a hold would begin with each try, and the flap would never be shut in it."""
-        retry_s = RETRY_S
-        while await self._until_open(deadline_ns):
-            try:
-                await self._cameras.grab(exposure_s, 0, cameras)
-            except Unreachable:
-                if self._clock.now_ns() >= deadline_ns:
-                    raise
-            else:
-                return True
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(retry_s))
-            retry_s = min(2 * retry_s, LONGEST_RETRY_S)
-        return False

@@ -34,7 +34,7 @@ Result = TypeVar("Result")
 
 
 class Recorder(Recording, Protocol):
-    """Of what is recorded now, by a run or by the house."""
+    """Of what is recorded now, by a run or between runs."""
 
     def refound(self) -> None:
         """An operator has cleared the loss of its folder."""
@@ -306,6 +306,18 @@ async def _open(assembly: Assembly) -> None:
     if devices.imager is not None:
         await devices.imager.open()
     await stand.chamber.test_dead_man()
+
+
+async def made_safe(assembly: Assembly, stop: Stop) -> tuple[str, ...]:
+    """At the end of a stand without a guard: all that may have moved is safe, confirmed; what has not confirmed it
+    within guard.safe_limit_s."""
+    stop.taking_down()
+    await stop.settled()
+    safety = assembly.stand.safety
+    safety.demand()
+    await safety.confirmed(assembly.config.guard.safe_limit_s)
+    await safety.close()
+    return safety.unconfirmed
 
 
 async def close_devices(assembly: Assembly) -> None:

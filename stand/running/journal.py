@@ -126,7 +126,7 @@ class Journal:
     def _noted(self, task: Task[None]) -> None:
         self._notes.discard(task)
         if not task.cancelled():
-            task.exception()  # of a disk that was given up is told by whoever has given it up
+            task.exception()  # a disk that was given up is reported by what gave it up
 
     def _take(self, entries: Iterable[Written]) -> None:
         if self._lane is None:

@@ -170,7 +170,7 @@ def _directory(job: Job, clock: Clock) -> Path:
 
 async def _announce(job: Job, assembly: Assembly, *, has_own: bool = False) -> None:
     """What the session has to say before anything moves; what earlier runs that were killed have left is completed.
-    has_own: what is being recorded now is the stand's own record, which need not be told."""
+    has_own: what is being recorded now is the stand's own record, which need not be announced."""
     hub, clock = assembly.hub, assembly.clock
     for segment in await _salvaged(job):
         if has_own and segment.reason == BEING_RECORDED:

@@ -1,5 +1,5 @@
-"""What an operator says of a session through a stand's interface: kept in the session's file of notes, and told as an
-event, which is recorded by whatever records then."""
+"""What an operator says of a session through a stand's interface: kept in the session's file of notes, and published as
+an event, which is recorded by the session that is open then."""
 
 from __future__ import annotations
 

@@ -57,8 +57,8 @@ def camera_serials(assembly: Assembly) -> str:
 
 
 def tell_identities(assembly: Assembly) -> None:
-    """Which devices have answered, as events, but for the cameras, which are told when they are on; and what the stand
-    lacks."""
+    """Which devices have answered, as events, but for the cameras, which are reported when they are on; and what the
+    stand lacks."""
     devices, now_ns = assembly.devices, assembly.clock.now_ns()
     units = (devices.regulator, devices.relays, devices.heat_module, devices.thermometers, devices.inputs, devices.flap)
     for device in (*units, *devices.axes.values(), *devices.probes.values()):

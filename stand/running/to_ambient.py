@@ -1,7 +1,7 @@
-"""The end of a run whose plan is done: the chamber comes back to the laboratory's temperature, so that whoever opens it
-finds nothing cold that water would settle on, and nothing hot.
+"""The end of a run whose plan is done: the chamber comes back to the laboratory's temperature, so that a person who
+opens it finds nothing cold that water would settle on, and nothing hot.
 
-It remembers nothing: what is read says whether it is done. A run that is resumed here goes on with it.
+It remembers nothing: what is read says whether it is done. A run that is resumed here continues it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from stand.interlock import Interlocked
 from stand.stand import Stand
 
 _LOOK_S = 10.0
-_AGAIN_S = 60.0  # after a device that did not do as it was told
+_AGAIN_S = 60.0  # after a device that did not do what was commanded
 _FOLLOWS_K = 1.0  # the set-point follows the laboratory in such steps
 
 
@@ -64,7 +64,8 @@ def _ambient_degC(hub: Hub, config: StandConfig) -> float:
 
 
 def _lacks(hub: Hub, config: StandConfig) -> str:
-    """What is not there yet, in words; "" when all is. What cannot be read is not waited for."""
+    """What has not reached the laboratory's temperature yet, in words; "" when all has. What cannot be read is not
+    waited for."""
     ambient_degC, band_K = _ambient_degC(hub, config), config.ending.band_K
     air_degC = value_of(hub, AIR)
     if abs(air_degC - ambient_degC) > band_K:

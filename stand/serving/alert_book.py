@@ -1,4 +1,4 @@
-"""What is told of the events of a stand: each cause once, when it has lasted, and once more when it is over."""
+"""Which events of a stand become messages: each cause once, when it has lasted, and once more when it is over."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from foundation.clock import seconds_ns
 from foundation.items import Event
 from stand.config.alerts_section import Cause
 
-# raised: told at once. lasting: told when it is not over within the grace time. over: the end of one.
+# raised: sent at once. lasting: sent when it is not over within the grace time. over: the end of one.
 Phase = Literal["raised", "lasting", "over"]
 RUN_FAILED = "run_failed"  # of one that may not have begun; published to alerts only
 _HOUR_NS = seconds_ns(3600)
@@ -93,7 +93,7 @@ def sign_of(event: Event) -> Sign | None:
 @dataclass
 class AlertBook:
     """Which messages are due. Of one cause and key there is one message until it is over; a run's begin or end, and
-    what has no end, are told each time. With more than most_per_h in an hour only trips are told, and how many were
+    what has no end, are sent each time. With more than most_per_h in an hour only trips are sent, and how many were
     left out."""
 
     name: str
@@ -102,7 +102,7 @@ class AlertBook:
     most_per_h: int
     _open: dict[tuple[Cause, str], tuple[Event, bool]] = field(
         default_factory=dict[tuple[Cause, str], tuple[Event, bool]]
-    )  # the event, and whether it was told
+    )  # the event, and whether it was sent
     _told_ns: deque[int] = field(default_factory=deque[int])
     _left_out: int = 0
     _run_ended: bool = False
@@ -113,7 +113,7 @@ class AlertBook:
         return not any(cause in _BAD and key != "nearly full" for cause, key in tuple(self._open))
 
     def receive(self, event: Event, now_ns: int) -> list[Message]:
-        """What is to be told at once."""
+        """What is to be sent at once."""
         sign = sign_of(event)
         if sign is None:
             return []

@@ -1,6 +1,6 @@
 """The process that sends alerts for a daemon, see foundation/helper.py.
 
-A receiver that hangs hangs this process's thread, never the daemon. The secrets are read here, for each message anew,
+A receiver that hangs hangs this process's thread, never the daemon. The secrets are read here, again for each message,
 and nothing that is returned holds any of them.
 """
 

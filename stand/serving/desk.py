@@ -258,7 +258,7 @@ class Argument(Value):
 
 
 class DeviceVerb(Value):
-    """Something a device can be told by hand between runs."""
+    """A command that a device takes by hand between runs."""
 
     verb: str
     text: str
@@ -293,7 +293,7 @@ class Desk(Protocol):
         ...
 
     def devices(self) -> tuple[DeviceState, ...]:
-        """What may be told by hand."""
+        """The commands that devices take by hand."""
         ...
 
     def pause(self, who: Who, when: When = "now") -> Done:

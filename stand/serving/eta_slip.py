@@ -11,7 +11,7 @@ from foundation.items import Event, Item, StepMark
 
 ETA_SLIPPED = "eta_slipped"
 _SHARE = 0.1
-_LEAST_S = 300.0  # of a short run nobody is told a minute
+_LEAST_S = 300.0  # a minute's slip of a short run is not reported
 
 
 class EtaSlip:
@@ -21,7 +21,7 @@ class EtaSlip:
         self._hub, self._clock, self._left_s, self._utc_offset_ns = hub, clock, left_s, utc_offset_ns
         now_ns = clock.now_ns()
         self._step_s = max(_SHARE * left_s(now_ns), _LEAST_S)
-        self._end_s = now_ns / NS_PER_S + left_s(now_ns)  # as it was told last
+        self._end_s = now_ns / NS_PER_S + left_s(now_ns)  # as it was reported last
 
     def __call__(self, item: Item) -> None:
         """Look at the end when a step begins or ends, or something holds the run or lets it go."""

@@ -1,8 +1,8 @@
 """What the page shows of a frame: a picture of half its size, the markers in it and how far each has moved since the
 reference, and what helps to set a camera up. Arrays in, values out; the first frame of a target takes the longest.
 
-Drift is that of the camera, so it is told for frames in which nothing else moves: those of the roles in DRIFT_ROLES and
-between runs. The reference is the last frame that was asked for as one.
+Drift is that of the camera, so it is measured in frames in which nothing else moves: those of the roles in DRIFT_ROLES
+and between runs. The reference is the last frame that was asked for as one.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Setup:
 class Preview:
     """width, height: of the whole frame, px, in which all else is given. markers: number, x, y, and its drift (dx, dy)
     or None. mean_px: length of the mean drift; mean_dx, mean_dy: that; worst_px: the largest drift, of marker `worst`.
-    reference_ns: the time of the frame that drift is told against. trouble: why there are no markers."""
+    reference_ns: the time of the frame that drift is measured against. trouble: why there are no markers."""
 
     camera: str
     time_ns: int
@@ -120,7 +120,7 @@ class Previewer:
         return self.look(shot).mean_px
 
     def _drift(self, shot: Shot, found: Detection) -> Float:
-        """Of each marker, px; NaN where there is none to be told."""
+        """Of each marker, px; NaN where it is unknown."""
         if shot.role not in DRIFT_ROLES:
             return np.full_like(found.centres_px, np.nan)
         if shot.as_reference or shot.camera not in self._reference:

@@ -46,7 +46,7 @@ class Recalled:
 
 
 def run_references(path: Path | str) -> tuple[Recalled, ...]:
-    """What drift was told against when the run of this session was interrupted, for each camera whose frames are
+    """What drift was measured against when the run of this session was interrupted, for each camera whose frames are
     recorded; found by the rule that held when they came. SessionError when the session cannot be read."""
     session = Session.open(path)
     table = session.frames_table()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from experiments.steps import Role
 
-# Drift is that of the camera, so it is told for frames in which nothing else moves. "": a frame that no capture of a
+# Drift is that of the camera, so it is measured in frames in which nothing else moves. "": a frame that no capture of a
 # run asked for.
 DRIFT_ROLES = frozenset({"", Role.REFERENCE, Role.FIT, Role.VALIDATION, Role.WARM_UP, Role.SETTLING})
 

@@ -1,1 +1,1 @@
-"""A run as whoever sits at the terminal sees it."""
+"""A run as it is shown at a terminal."""

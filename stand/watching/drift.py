@@ -29,7 +29,7 @@ class DriftWatch:
     def __init__(self, target_text: str, resumed: Path | None = None) -> None:
         self.mean_px: float | None = None
         self._target_text, self._resumed = target_text, resumed
-        self._role = self._camera = ""  # drift is told of the first camera that gives a frame
+        self._role = self._camera = ""  # drift is shown of the first camera that gives a frame
         self._newest: tuple[Frame, str] | None = None
         self._ending = Flag()
         self._thread = Thread(target=self._work, name="drift", daemon=True)

@@ -1,4 +1,4 @@
-"""What whoever watches a run is shown at one instant, be it from the run's own hub or from a daemon's state."""
+"""What the watchers of a run are shown at one instant, be it from the run's own hub or from a daemon's state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SET_POINT, AIR, CAMERA = "regulator.sp", "thermometers.air", "camera.temperature
 class Moment:
     """now_ns, end_ns: UTC, ns since the epoch. share: how much of the run is done, 0..1, None without one. step: number
     of the step under way, 0 before the first; doing: that step in words. held: what holds the run, in words. A
-    temperature that is BAD or unknown is None, as all else that nobody has told. end_within_s: by how much the end may
+    temperature that is BAD or unknown is None, as all else that is not known. end_within_s: by how much the end may
     be earlier or later. drift_px: mean drift of the markers in the last frame that was looked at.
     """
 

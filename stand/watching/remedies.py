@@ -1,4 +1,4 @@
-"""What to type after a message: whoever reads it at the terminal need not look it up."""
+"""What to type after a message, so that its reader at the terminal need not look it up."""
 
 from __future__ import annotations
 

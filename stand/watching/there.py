@@ -42,7 +42,7 @@ class There:
         return moment_of(state, None if state.run is None else self._drift_px())
 
     def line(self, event: EventData) -> str:
-        """An event as it is told, with what to type."""
+        """An event as it is shown, with what to type."""
         return event_line(event, self.session)
 
     def _know(self, state: StandState) -> None:

@@ -236,7 +236,7 @@ def is_open(path: str) -> bool:
 
 
 class Gatekeeper:
-    """Before an ASGI application: checks, limits, and the headers of every answer. `failed` is told of what the
+    """Before an ASGI application: checks, limits, and the headers of every answer. `failed` is called with what the
     application raises, which is answered with 500."""
 
     def __init__(self, app: App, access: Access, pace: Pace, failed: Callable[[Exception], None]) -> None:

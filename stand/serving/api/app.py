@@ -46,7 +46,8 @@ def make_app(
     interface: Interface,
     failed: Callable[[Exception], None],
 ) -> App:
-    """The ASGI application behind the one check of who may ask. `failed` is told of what should not happen."""
+    """The ASGI application behind the one check of who may ask. `failed` is called with errors that should not
+    happen."""
     app = FastAPI(
         title="thermostand",
         version=importlib.metadata.version("thermostand"),
@@ -91,7 +92,7 @@ def _refused(_: Request, error: Exception) -> Response:
 
 
 def _failed(_: Request, error: Exception) -> Response:
-    """What should not happen; the gatekeeper is told as well."""
+    """What should not happen; the gatekeeper gets it as well."""
     return _error(500, f"failed ({type(error).__name__}); the stand's events say more")
 
 

@@ -29,8 +29,8 @@ _REFRESH_S = 0.5
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
 _FRESH_S = 0.3  # so long one who asks for the state waits for a new one
 _QUEUE = 20_000  # items, which are some MB; the thread takes them four times a second at the least
-_PLAN_AGE_S = 5.0  # what a plan has earned and expects changes slowly; a step that begins or ends is told at once
-_STOPPED_S = 0.1  # between two stops, whoever asks for them: a flood must not fill the recording
+_PLAN_AGE_S = 5.0  # what a plan has earned and expects changes slowly; the begin or end of a step is shown at once
+_STOPPED_S = 0.1  # between two stops, from any client: a flood must not fill the recording
 COMMAND_LIMIT_S = 5.0
 _FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
@@ -108,13 +108,13 @@ class Bridge:
             self._next = self._loop.call_at(due_s, self._refresh)
 
     def _refresh(self) -> None:
-        """Swap in what is now; what cannot be told leaves the last one, which grows old."""
+        """Swap in what is now; where that fails the last one stays, which grows old."""
         if not self._is_open:
             return
         try:
             state = self._desk.state().model_copy(update={"seq": self._seq})
             self.snapshot, self.failure = Snapshot(state, time.monotonic()), ""
-        except Exception as error:  # noqa: BLE001 - clients are told; the run goes on without them
+        except Exception as error:  # noqa: BLE001 - clients see that it is old; the run does not depend on them
             self.failure = failure_text(error)
         self._next = None
         self._refresh_within(_REFRESH_S)

@@ -2,9 +2,9 @@
 
 It accepts by itself and not with asyncio's server, which stops accepting for 1 s when no descriptor is left. There is
 always room for one more: with MOST_CLIENTS connected, or no descriptor left, the client that was silent longest is
-disconnected; a few spare descriptors are kept for that case. When all of them wait for an answer, whoever has been
-answered leaves, and the next ones come in, in the order of the kernel's queue. Who neither asks nor reads is not kept
-for ever.
+disconnected; a few spare descriptors are kept for that case. When all of them wait for an answer, a client that has
+been answered leaves, and the next ones come in, in the order of the kernel's queue. Who neither asks nor reads is not
+kept for ever.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Listening:
             lifespan="off",
             interface="asgi3",
             log_config=None,
-            log_level="critical",  # what fails is told by the gatekeeper
+            log_level="critical",  # what fails is reported by the gatekeeper
             access_log=False,
             proxy_headers=False,
             server_header=False,

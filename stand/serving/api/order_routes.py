@@ -171,7 +171,7 @@ def _of_the_queue(router: APIRouter, bridge: Bridge) -> None:
 def _of_devices(router: APIRouter, bridge: Bridge) -> None:
     @router.get("/devices", response_model=list[DeviceState])
     async def devices() -> Response:
-        """What there is, and what may be told by hand between runs."""
+        """What there is, and which commands it takes by hand between runs."""
         return _list(await bridge.ask(lambda desk: desk.devices()))
 
     @router.post("/devices/{name}/{verb}", response_model=Done)

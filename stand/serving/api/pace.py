@@ -12,9 +12,9 @@ _BURST_S = 0.5  # of work that is done at once: a page that opens
 
 
 class Pace:
-    """A budget of processor time, that of the calling thread. Nobody is refused for it: whoever asks waits.
+    """A budget of processor time, that of the calling thread. No client is refused for it: it waits.
 
-    is_crowded: clients wait to be let in, and whoever has been answered goes back to the end of the line.
+    is_crowded: clients wait to be let in, and a client that has been answered goes back to the end of the line.
 
     `thread_s` reads the thread's processor time, `now_s` the clock; tests give their own.
     """

@@ -115,7 +115,7 @@ def _add_logins(router: APIRouter, access: Access, url: str) -> None:
 
     @router.get(LOGIN_PATH, response_class=Response, include_in_schema=False)
     async def login(once: str = "") -> Response:
-        """The page for whoever has a one-time address of `stand token login`: a cookie instead of it."""
+        """The page for a browser with a one-time address of `stand token login`: a cookie instead of it."""
         cookie = access.log_in(once[:100])
         if not cookie:
             return _json(json_of({"error": "this address has been used, or is too old; `stand token login`"}), 401)

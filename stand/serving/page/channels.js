@@ -1,4 +1,4 @@
-// What each channel is called, and how its curve looks: colour, dash and label differ, so that no curve is told by its
+// What each channel is called, and how its curve looks: colour, dash and label differ, so that no curve is known by its
 // colour alone.
 
 const KNOWN = {
@@ -33,7 +33,7 @@ export function look_of(channel) {
 
 const of = (channel) => (channel.startsWith("camera.") ? "" : `, ${channel.split(".")[0]}`);
 
-// Temperatures in the order of the stand's importance to whoever looks.
+// Temperatures in the order of the stand's importance to a reader.
 export function temperatures(units) {
   const found = Object.keys(units).filter((channel) => units[channel] === "degC");
   const place = (channel) => (ORDER.indexOf(channel) < 0 ? ORDER.length : ORDER.indexOf(channel));

@@ -29,7 +29,7 @@ export class Curves {
     this.resizing.observe(place);
   }
 
-  // Draws this; the plot is made anew only when its channels or the colours have changed.
+  // Draws this; the plot is made again only when its channels or the colours have changed.
   show(history, channels, hidden, from_s, to_s, offset_s) {
     this.history = history;
     this.offset_s = offset_s;

@@ -135,7 +135,7 @@ export class CameraView {
     this.aids = [
       h("section", { class: "panel" }, h("h2", {}, "Light"), this.histogram, h("p", { class: "quiet" }, "number of pixels (logarithmic) from black to white"), this.light),
       h("section", { class: "panel" }, h("h2", {}, "Focus"), this.focus),
-      h("section", { class: "panel" }, h("h2", {}, "Target against camera"), this.tilt, h("p", { class: "quiet" }, "Both keystones are 0 when camera and target face each other. The tilt is told from some degrees on."))];
+      h("section", { class: "panel" }, h("h2", {}, "Target against camera"), this.tilt, h("p", { class: "quiet" }, "Both keystones are 0 when camera and target face each other. The tilt is found from some degrees on."))];
     this.frame = new FramePanel(left, app, true);
     this.sharpest = null;
     this.frame.on_frame = (frame) => this.show(frame);

@@ -13,7 +13,7 @@ export class Notices {
     this.parts = {};
   }
 
-  // One notice of each kind, made when there is cause and removed when there is none; never made anew while it is there.
+  // One notice of each kind, made when there is cause and removed when there is none; never made again while it is there.
   set(kind, key, make) {
     const part = this.parts[kind];
     if (part?.key === key) return part;

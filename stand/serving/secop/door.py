@@ -52,7 +52,7 @@ def door_at(port: int) -> OtherDoor:
 
 
 class Door:
-    """Serves the node at a listening socket until cancelled. `failed` is told of what should not happen."""
+    """Serves the node at a listening socket until cancelled. `failed` is called with errors that should not happen."""
 
     def __init__(
         self, listening: socket.socket, bridge: Bridge, pace: Pace, failed: Callable[[Exception], None]
@@ -159,7 +159,7 @@ class _Client:
         return self._loop.time() - self._heard_s
 
     def follows(self, module: str) -> bool:
-        """Whether it is told what changes there."""
+        """Whether it gets what changes there."""
         return module in self._followed
 
     def update(self, place: Place, line: bytes) -> None:
@@ -179,7 +179,7 @@ class _Client:
         tasks = [asyncio.ensure_future(work()) for work in (self._receive, self._answer, self._send)]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            if self._is_leaving:  # what it was told last still arrives
+            if self._is_leaving:  # what it was sent last still arrives
                 await asyncio.wait([tasks[2]], timeout=_FAREWELL_S)
         finally:
             for task in tasks:

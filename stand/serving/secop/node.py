@@ -169,7 +169,7 @@ class Node:
         return None
 
     async def _ordered(self, order: Order, name: str, target: JsonValue) -> Done | QueuedRun:
-        """What came of it; what it changes at once has been told when this returns."""
+        """What came of it; what it changes at once has been sent when this returns."""
 
         module, began_ns = self.modules[name], self._bridge.snapshot.state.now_ns
 
