@@ -35,7 +35,8 @@ _NAME, _VERDICT = 16, 11  # columns
 def check(
     config: ConfigOption = "simulated",
     moves: Annotated[
-        bool, typer.Option("--moves", help="Flap, stages and cameras, too, and the timer that guards the heat.")
+        bool,
+        typer.Option("--moves", help="Also move flap and stages, take frames, and test the timer that ends the heat."),
     ] = False,
     genicam: Annotated[
         Path | None,

@@ -40,7 +40,7 @@ def status(
     server: Server,
     plan: Annotated[bool, typer.Option("--plan", help="The steps of the plan in force, and where they are.")] = False,
 ) -> None:
-    """What the running session is doing: step, state, expected end, temperatures, frames, disk, last warning.
+    """Show what the run under way is doing: step, state, expected end, temperatures, frames, disk, last warning.
 
     Without DIR, when none runs in recording.directory: the only one on this machine. The same for `stand stop`.
 
@@ -55,7 +55,7 @@ def status(
 @app.command()
 @on_stand(anywhere=True)
 def watch(server: Server) -> None:
-    """What happens, as it happens, above a panel with step, temperatures, frames, disk and end; without a terminal a
+    """A run's messages as they come, above a panel with step, temperatures, frames, disk and end; without a terminal a
     line a minute. With --json the events, one a line. Ctrl-C ends watching, not the run.
 
     Example: stand watch
@@ -140,7 +140,7 @@ def skip(
 def extend(
     server: Server,
     step: StepArgument,
-    minutes: Annotated[float, typer.Argument(help="So much longer, in minutes.")],
+    minutes: Annotated[float, typer.Argument(help="How much longer, in minutes.")],
 ) -> None:
     """Soak for longer in a step.
 

@@ -17,7 +17,7 @@ app = App(no_args_is_help=True)
 
 @app.command()
 def recipes() -> None:
-    """The installed recipes. A file of your own is given by its path.
+    """List the installed recipes. A file of your own is given by its path.
 
     Example: stand recipes
     """
@@ -26,7 +26,7 @@ def recipes() -> None:
 
 @app.command()
 def configs() -> None:
-    """The installed stands' files. Copy laboratory.yaml for your own stand.
+    """List the installed configurations of stands. Copy laboratory.yaml for your own stand.
 
     Example: stand configs
     """

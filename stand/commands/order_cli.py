@@ -32,10 +32,14 @@ _LIMIT_S = 60.0  # a device may move for so long
 def submit(
     server: Server,
     recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
-    attended: Annotated[bool, typer.Option("--attended", help="Somebody does what the plan prompts for.")] = False,
-    key: Annotated[str, typer.Option(help="Your own word for this run: given again, nothing is queued twice.")] = "",
+    attended: Annotated[
+        bool, typer.Option("--attended", help="A person will do what the plan's prompts ask for.")
+    ] = False,
+    key: Annotated[
+        str, typer.Option(help="A name of your own for this order: the same name again queues nothing.")
+    ] = "",
 ) -> None:
-    """Queue a run of the stand's daemon, as the recipe is now. Prints its number.
+    """Submit a recipe, as it is now, to the stand's daemon, which queues it. Prints its number.
 
     Example: stand submit night.yaml --key monday
     """
@@ -56,7 +60,7 @@ def device(
     url: UrlOption = "",
     token_file: TokenOption = None,
 ) -> None:
-    """Tell a device something by hand, between runs, through the same gate as a run. Without a daemon the device is
+    """Command one device by hand, between runs, through the same gate as a run. Without a daemon the device is
     opened for it, and made safe and closed at the end; it then knows read, registers and grab, too.
 
     Example: stand device flap open

@@ -103,7 +103,9 @@ def start(
     virtual_time: Annotated[
         bool, typer.Option("--virtual-time", help="As fast as it goes, each with a simulated laboratory of its own.")
     ] = False,
-    clear: Annotated[bool, typer.Option("--clear", help="After a trip whose cause has been removed.")] = False,
+    clear: Annotated[
+        bool, typer.Option("--clear", help="Clear a trip first; only when its cause has been removed.")
+    ] = False,
     report: Annotated[bool, typer.Option("--report", help="As of `stand run`, after each run with a drift.")] = False,
 ) -> None:
     """Run what is queued, one after another, until nothing is left; what was interrupted is resumed first.

@@ -122,7 +122,9 @@ def resume_run(
     config: Annotated[
         str, typer.Option("--config", help="This stand's configuration: a file, or the name of an installed one.")
     ] = "simulated",
-    clear: Annotated[bool, typer.Option("--clear", help="After a trip whose cause has been removed.")] = False,
+    clear: Annotated[
+        bool, typer.Option("--clear", help="Clear a trip first; only when its cause has been removed.")
+    ] = False,
     attended: AttendedOption = False,
     report: ReportOption = False,
 ) -> None:

@@ -49,7 +49,7 @@ def serve(
     secop: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Serve SECoP on this machine, usually at 10767.")
     ] = None,
-    no_reports: Annotated[bool, typer.Option("--no-reports", help="Report no run when it is complete.")] = False,
+    no_reports: Annotated[bool, typer.Option("--no-reports", help="Write no report when a run is complete.")] = False,
 ) -> None:
     """Own the stand until it is stopped: status, devices by hand, and a queue whose runs are its guests.
 

@@ -50,7 +50,7 @@ def archive_sessions(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Delete; without it what would be deleted is only shown.")] = False,
 ) -> None:
-    """Copy finished sessions to another disk and read the copies back. One that was interrupted goes on where it was;
+    """Copy finished sessions to another disk and read the copies back. An interrupted copy continues where it was;
     a session that is being recorded is not touched.
 
     Example: stand session archive /data/sessions --to /mnt/nas/sessions --delete-after 30

@@ -27,7 +27,7 @@ _BYTES = 32
 
 @app.command()
 def add(name: NameArgument, config: ConfigOption = "simulated") -> None:
-    """Make a token and print it, once. A daemon that runs already takes it when it is started again.
+    """Make a token and print it, once. A daemon that is already running knows it after its next start.
 
     Example: stand token add rose --config my-stand.yaml
     """

@@ -60,7 +60,7 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
 async def drain(
     directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: QueueDisk, patience: Patience
 ) -> None:
-    """As `work`, for a caller that is `working` on the queue already, and for `patience`, with the disk at a run's end."""
+    """As `work`, for a caller that is `working` on the queue already; with `patience` for the disk at a run's end."""
     while (entry := await disk.call(take, directory, clock.now_ns())) is not None:
         run = _Run(directory, entry, clock, tell, disk, patience)
         if entry.fruitless_starts >= MOST_FRUITLESS_STARTS:
