@@ -159,3 +159,13 @@ def test_a_relay_that_the_map_has_not_is_a_config_error() -> None:
     bus = Bus("rs485", BusSettings(address="tcp:localhost:502"), WallClock())
     with pytest.raises(ConfigError, match=r"relays.a: register map .* has no relay_8"):
         Relays("relays", bus, MAP, {"a": 8})
+
+
+def test_a_board_without_a_timed_on_is_refused_for_heat_and_cold_and_may_feed_a_camera() -> None:
+    bus = Bus("rs485", BusSettings(address="tcp:localhost:502"), WallClock())
+    points = {name: point.model_copy(update={"pulse": None}) for name, point in MAP.points.items()}
+    plain = MAP.model_copy(update={"points": points})
+    for channel in ("heater_enable", "compressor", "heat"):
+        with pytest.raises(ConfigError, match=rf"relays.{channel}: .* knows no timed-on of relay_0, without which"):
+            Relays("relays", bus, plain, {channel: 0})
+    Relays("relays", bus, plain, {"camera_power": 0})

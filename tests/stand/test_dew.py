@@ -11,7 +11,7 @@ from foundation.clock import seconds_ns
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from foundation.items import Batch
-from foundation.readings import Reading
+from foundation.readings import Reading, bad_reading
 from stand.config.dew import DewConfig, dew_point_degC
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price, way_back_s
@@ -90,9 +90,10 @@ def test_no_set_point_changes_faster_than_a_camera_allows(tmp_path: Path):
 class Night:
     """The guard's rules over a hub, the laboratory at 24 degC and 50 %: its dew point is 12.9 degC."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, **sections: object):
         self.hub = Hub()
-        config = load_config(stand(folder, dew={"humidity_percent": 50, "margin_K": 1, "flap_s": 10}))
+        dew = {"humidity_percent": 50, "margin_K": 1, "flap_s": 10}
+        config = load_config(stand(folder, **{"dew": dew, **sections}))
         self.watches = watches(config, Announcements())
 
     def look(self, at_s: float, flap: float, target_degC: float, camera_degC: float = 40.0) -> list[Fault]:
@@ -122,3 +123,27 @@ def test_an_open_flap_over_a_cold_target_holds_and_a_closed_one_does_not(tmp_pat
     )
     assert night.look(62, 0.0, 13.5) == []
     assert [len(night.look(at_s, 1.0, 20.0, 5.0)) for at_s in (70, 81)] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("humidity_percent", "target_degC", "rules"),
+    [(80, 20.0, ["dew"]), (80, 22.0, []), (20, 2.0, []), (None, 13.5, ["dew"]), (None, 14.2, []), (0, 13.5, ["dew"])],
+    ids=["wetter than given", "above it", "drier than given", "silent: as given", "silent, above", "no humidity"],
+)
+def test_what_a_hygrometer_measures_counts_and_what_is_given_while_it_tells_nothing(
+    tmp_path: Path, humidity_percent: float | None, target_degC: float, rules: list[str]
+):
+    """At 24 degC 80 % has its dew point at 20.3, 50 % at 12.9, 20 % at -0.2 degC."""
+    night = Night(
+        tmp_path,
+        dew={"humidity_percent": 50, "margin_K": 1, "flap_s": 10, "hygrometer": "room"},
+        probes={"room": {"protocol": "vaisala", "address": "tcp:127.0.0.1:1"}},
+    )
+    told = (
+        bad_reading("room.humidity", "%", 0, "no answer")
+        if humidity_percent is None
+        else Reading("room.humidity", humidity_percent, "%", 0)
+    )
+    night.hub.publish(Batch("room", 0, (told, Reading("room.temperature", 24.0, "degC", 0))))
+    night.look(0, 1.0, target_degC)
+    assert [fault.rule for fault in night.look(11, 1.0, target_degC)] == rules

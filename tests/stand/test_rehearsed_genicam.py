@@ -1,10 +1,13 @@
 """A camera's GenICam file before the camera is there: which features would be used, or which one is missing."""
 
+import json
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from foundation.errors import ConfigError
+from stand.commands.command_table import app
 from stand.commissioning.genicam_rehearsal import rehearse
 from tests.dialects import DIALECTS
 from tests.system.conftest import require_aravis
@@ -34,3 +37,22 @@ async def test_what_is_no_genicam_file_is_refused(tmp_path: Path):
     file.write_text("<html/>")
     with pytest.raises(ConfigError, match="is no GenICam file"):
         await rehearse(file)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "status", "shown"),
+    [
+        ("abs", 0, "exposure      ExposureTimeAbs"),
+        ("no exposure", 1, "refused: camera: the camera has no ExposureTime"),
+    ],
+)
+def test_the_command_says_it_and_its_status_whether_it_opened(tmp_path: Path, dialect: str, status: int, shown: str):
+    require_aravis()
+    file = tmp_path / "camera.xml"
+    file.write_bytes(DIALECTS[dialect].xml(dialect))
+    result = CliRunner().invoke(app, ["check", "--genicam", str(file)])
+    assert result.exit_code == status
+    assert shown in result.output
+    if status:
+        told = json.loads(CliRunner().invoke(app, ["check", "--genicam", str(file), "--json"]).stdout)
+        assert "ExposureTime" in told["refusal"]
