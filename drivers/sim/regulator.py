@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from enum import IntEnum
 from typing import Protocol
 
+from drivers.sim import self_tuning
 from drivers.sim.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
@@ -42,12 +43,13 @@ from drivers.sim.regulator_table import (
     PARAMETERS,
     PT100_RANGE_DEGC,
     SETPOINT,
+    TUNED,
     Writable,
     stored_at,
     to_value,
     to_word,
 )
-from foundation.clock import Now, seconds_ns
+from foundation.clock import NS_PER_S, Now, seconds_ns
 
 MOST_WORDS = 104
 STILL_AIR_LAG_S = 30.0  # of a probe that hangs in the laboratory
@@ -57,6 +59,7 @@ SHORT_PERIODS_S = {-2: 0.1, -1: 0.2, 0: 0.5}  # coded values of the control peri
 class Chamber(Timeline, Protocol):
     """What the regulator sees and moves of the plant."""
 
+    now_ns: int
     heater_on_fraction: float
     chamber_degC: float  # where the regulator's probe is
     air_degC: float  # where the thermometer near the camera is
@@ -102,6 +105,7 @@ class FakeRegulator:
         self.display_decimals = 1
         self.setpoint_clamp_degC: tuple[float, float] | None = None
         self._tuning_share = 1.0
+        self._cycle: self_tuning.Cycle | None = None
         self._plant = plant
         self._clock = clock
         self._drifted_K = 0.0
@@ -244,11 +248,11 @@ class FakeRegulator:
         self.outputs = _signed(self._ram[MV_AT_STOP])
 
     def _tune(self, share: float) -> None:
-        """A limit cycle with that share of the outputs, around the set point; it lasts until cancelled, and the gains
-        stay what they are."""
+        """A limit cycle with that share of the outputs, around the set point, until it is cancelled or has shown the
+        constants, which are stored then."""
         if self._modes & {Mode.STOP, Mode.MANUAL}:
             raise Refusal(OPERATION_ERROR)
-        self._tuning_share = share
+        self._tuning_share, self._cycle = share, None
         self._modes.add(Mode.TUNING)
 
     def _automatic(self) -> None:
@@ -345,10 +349,24 @@ class FakeRegulator:
         pv_degC = self._pv_degC()
         if Mode.TUNING in self._modes:
             self._pid = None
-            heats = pv_degC < self._ram[SETPOINT]
-            return _signed(self._tuning_share * self._ram[MV_UPPER if heats else MV_LOWER])
+            return self._tuned(pv_degC - self._ram[SETPOINT])
         outputs, self._pid = step(self._pid or start(pv_degC), self._ram[SETPOINT], pv_degC, dt_s, self._gains())
         return outputs
+
+    def _tuned(self, error_K: float) -> Outputs:
+        """One step of the limit cycle; at its end the constants are those it has shown."""
+        upper, lower = (self._tuning_share * self._ram[limit] for limit in (MV_UPPER, MV_LOWER))
+        cycle = self._cycle or self_tuning.begin(error_K)
+        self._cycle = cycle = self_tuning.step(cycle, error_K, self._plant.now_ns / NS_PER_S)
+        if cycle.is_over:
+            found = self_tuning.constants(cycle, upper - lower)
+            for addresses, value in zip(TUNED, found, strict=True):
+                for address in addresses:
+                    known = PARAMETERS[address]
+                    value = round(min(known.high, max(known.low, value)), known.decimals or 1)
+                    self._store(address, value, keep=Mode.RAM not in self._modes)
+            self._modes.discard(Mode.TUNING)
+        return _signed(upper if cycle.heats else lower)
 
     def _pv_degC(self) -> float:
         if self.stuck_pv_degC is not None:

@@ -41,6 +41,7 @@ MV_AT_STOP, MV_AT_ERROR = 0x270F, 0x2711
 INPUT_SHIFT = 0x2723
 HEAT_BAND, HEAT_INTEGRAL, HEAT_DERIVATIVE = 0x2A00, 0x2A01, 0x2A02
 MV_UPPER, MV_LOWER = 0x2A05, 0x2A06
+TUNED = (HEAT_BAND, COOL_BAND), (HEAT_INTEGRAL, COOL_INTEGRAL), (HEAT_DERIVATIVE, COOL_DERIVATIVE)  # by autotuning
 SETPOINT_0 = 0x2900  # the same set point as 0x2103 while multi-SP is off
 
 # Stored only. Alarm 1: value, upper and lower limit of an alarm of type 0. SP1..SP7 while multi-SP is off.
