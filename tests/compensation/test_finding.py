@@ -3,7 +3,10 @@ twice."""
 
 import multiprocessing
 import os
+import select
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -78,6 +81,29 @@ def test_a_killed_process_loses_nothing(pieces: list[Piece], serial: list[FoundM
         assert index not in found
         found[index] = markers
     assert_all_same(found, serial)
+
+
+OWNER = """if True:
+    import os, time
+    from compensation.finding.workers import _pool
+    if __name__ == "__main__":
+        with _pool(1) as pool:
+            print(pool.submit(os.getpid).result(), flush=True)
+            time.sleep(60)
+"""
+
+
+def test_a_process_ends_with_the_command_that_was_killed(tmp_path: Path):
+    (tmp_path / "owner.py").write_text(OWNER)
+    owner = subprocess.Popen([sys.executable, tmp_path / "owner.py"], stdout=subprocess.PIPE, text=True)
+    assert owner.stdout is not None
+    with owner.stdout:
+        worker = os.pidfd_open(int(owner.stdout.readline()))
+    owner.kill()
+    owner.wait()
+    has_ended, *_ = select.select([worker], [], [], 10.0)
+    os.close(worker)
+    assert has_ended
 
 
 class Poison(Piece):
