@@ -47,6 +47,7 @@ class Language:
     def __init__(self, name: str, settings: Ascii2Settings) -> None:
         self._settings = settings
         self._shape: tuple[int, int] | None = None  # fields and digits of the last reply
+        self._way_degC: tuple[float, float] | None = None  # of the last set-point: from where, to where
         line = SerialSettings(settings.baud, 1)
         self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
 
@@ -104,7 +105,8 @@ class Language:
         values, digits = self._read()
         fields = [values[field] for field in self._settings.write_fields]
         if degC is not None:
-            fields[0] = degC
+            self._way_degC = (fields[0], degC)
+        fields[0] = self._target_degC(fields[0])
         written = "".join(str(int(bits.get(index, digit == "1"))) for index, digit in enumerate(digits))
         request = self._bytes("E " + " ".join([*map(number, fields), written]))
         try:
@@ -112,6 +114,13 @@ class Language:
         except Unreachable:  # some units do not answer a write
             if not self.client.connected:
                 self._read()  # over a new link; Unreachable when it is gone
+
+    def _target_degC(self, nominal_degC: float) -> float:
+        """A nominal value that is on its way is not where it goes: written back, it would end the ramp there."""
+        if self._way_degC is None or not self._settings.shows_ramp:
+            return nominal_degC
+        low_degC, high_degC = sorted(self._way_degC)
+        return self._way_degC[1] if low_degC <= nominal_degC <= high_degC else nominal_degC
 
     def _bytes(self, command: str) -> bytes:
         return f"${self._settings.unit:02d}{command}\r".encode("ascii")

@@ -74,6 +74,8 @@ class Language:
         actual, nominal = self.client.query(*self._asked("A0", 14, self._temperatures))
         flags, code = self.client.query(*self._asked("S", 10, self._flags))
         alarms = (self._error_text(code),) if flags[1] == "1" or ord(code) & 0x7F not in _NO_ERROR else ()
+        if flags[2] == "0":
+            alarms = (*alarms, "it is paused")
         is_open = self._door_reply is not None and self.client.query(*self._asked("O", self._door_reply, _door_open))
         return ChamberState(
             actual, nominal, flags[0] == "1", alarms, humidity_on=flags[3] == "1", door_open=bool(is_open)

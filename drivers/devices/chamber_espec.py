@@ -67,9 +67,9 @@ class Language:
         """Of TEMP?, MON?, HUMI? and ALARM?."""
         actual_degC, set_degC, _, _ = self._temperatures()
         _, humidity, mode, alarms = self._monitored()
-        if mode.split(",")[0].split()[0] not in _MODES:
+        word = (mode.split() or [""])[0]
+        if word not in _MODES:
             raise GarbledReply(self._name, f"unknown mode {mode!r}")
-        word = mode.split(",")[0].split()[0]
         codes = self._ask("ALARM?").split(",")[1:] if alarms else []
         return ChamberState(
             actual_degC,

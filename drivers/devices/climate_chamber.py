@@ -163,8 +163,8 @@ class ClimateChamber:
     def _set(self, degC: float) -> None:
         state = self._ready()
         near_K = self._language.resolution_K / 2
-        if abs(state.set_degC - degC) < near_K:
-            return
+        if abs(state.set_degC - degC) < near_K and (state.ramp_degC is None or self._sp_degC == degC):
+            return  # one that moves may only pass there
         self._from_degC = state.set_degC
         self._language.set_temperature(degC)
         for _ in range(_LOOKS):

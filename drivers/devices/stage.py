@@ -15,7 +15,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from drivers.devices.motion import Motion, Turn
-from drivers.devices.stage_identity import changed_settings, identity_of, power_off_s
+from drivers.devices.stage_identity import changed_settings, identity_of, power_off_s, speed_steps_s
 from drivers.devices.stage_profiles import PROFILES, ProfileName, StageProfile
 from drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
 from drivers.wires.link import SerialSettings, open_link
@@ -38,7 +38,7 @@ _ARRIVED_MICROSTEPS = 256
 # Upwr, Iusb, Uusb, CurT, Flags, GPIOFlags, CmdBufFree
 _STATUS = struct.Struct("<BBBBBihqih5hIIB4x")
 _ENGINE = struct.Struct("<HHIBHhBH12x")  # NomVoltage, NomCurrent, NomSpeed, uNomSpeed, flags, Antiplay, mode, steps
-_MOVE = struct.Struct("<IBHHIBB9x")  # Speed, uSpeed, Accel, Decel, AntiplaySpeed, uAntiplaySpeed, MoveFlags
+_LEAST_STEPS_S = 0.01  # of a deadline
 _TARGET = struct.Struct("<ih6x")
 _SERIAL = struct.Struct("<I")
 
@@ -317,8 +317,8 @@ class Axis:
         mode = _ENGINE.unpack(self._client.query("geng", _ENGINE.size))[6]
         if mode != _MICROSTEP_MODE_256:
             raise Refused(self.name, f"microstep mode {mode}, expected {_MICROSTEP_MODE_256} (1/256)")
-        speed, *_ = _MOVE.unpack(self._client.query("gmov", _MOVE.size))
-        self._speed_steps_s = float(max(1, speed))
+        speed = speed_steps_s(self._client)
+        self._speed_steps_s = max(_LEAST_STEPS_S, speed)
         self._changed = changed_settings(self.profile, speed, power_off_s(self._client))
 
     def _identified(self) -> XimcClient:

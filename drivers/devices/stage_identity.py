@@ -33,6 +33,16 @@ def power_off_s(client: XimcClient) -> float | None:
     return float(delay_s) if flags & _POWER_OFF_ENABLED else None
 
 
+_MOVE = struct.Struct("<IBHHIBB9x")  # Speed, uSpeed, Accel, Decel, AntiplaySpeed, uAntiplaySpeed, MoveFlags
+_THOUSANDTHS = 0x1  # of MoveFlags: the speeds are divided by 1000
+
+
+def speed_steps_s(client: XimcClient) -> float:
+    """At which it moves, full steps/s; blocking. Unreachable, GarbledReply."""
+    speed, *_, flags = _MOVE.unpack(client.query("gmov", _MOVE.size))
+    return speed / 1000 if flags & _THOUSANDTHS else float(speed)
+
+
 def changed_settings(profile: StageProfile, speed: float, power_off: float | None) -> str:
     """What somebody else has changed, in words; "" when all is as the profile says."""
     pairs = (("speed", speed, profile.speed, "steps/s"), ("power-off delay", power_off, profile.power_off_s, "s"))

@@ -125,7 +125,10 @@ class Conversation:
 
 
 class FakeEspec(FakeClimateChamber):
-    """P300: commands and replies are lines, CR LF; `NA:` and a reason when refused."""
+    """P300: commands and replies are lines, CR LF; `NA:` and a reason when refused. mode: what it says instead of its
+    own."""
+
+    mode = ""
 
     def engine(self) -> Conversation:
         """Lines."""
@@ -140,12 +143,12 @@ class FakeEspec(FakeClimateChamber):
 
     def _answer(self, command: str) -> str:
         low_degC, high_degC = self.limits_degC
-        alarms = [self.alarm] if self.alarm else []
+        alarms, mode = [self.alarm] if self.alarm else [], "CONSTANT" if self.running else "STANDBY"
         queries = {
             "TEMP?": f"{self.actual_degC:.1f},{self.setpoint_degC:.1f},{high_degC:.1f},{low_degC:.1f}",
-            "MON?": f"{self.actual_degC:.1f},50,{'CONSTANT' if self.running else 'STANDBY'},{len(alarms)}",
+            "MON?": f"{self.actual_degC:.1f},50,{self.mode or mode},{len(alarms)}",
             "HUMI?": f"48,{'50' if self.humidity_on else 'OFF'},100,0",
-            "MODE?": "CONSTANT" if self.running else "STANDBY",
+            "MODE?": mode,
             "ALARM?": ",".join([str(len(alarms)), *alarms]),
             "TYPE?": "T,T,S2,160.0",
         }
@@ -179,7 +182,10 @@ class FakeEspec(FakeClimateChamber):
 
 class FakeCts(FakeClimateChamber):
     """CTS unit `unit`. On a serial line STX, 80+unit, text, CHK, ETX with bit 7 set between STX and ETX and CHK the XOR
-    of address and text; over TCP the bare text without an end. An unknown command is not answered."""
+    of address and text; over TCP the bare text without an end. An unknown command is not answered. paused: at its
+    panel."""
+
+    paused = False
 
     def __init__(self, plant: Chamber, clock: Now, unit: int = 1, *, is_serial: bool = False) -> None:
         super().__init__(plant, clock)
@@ -228,7 +234,7 @@ class FakeCts(FakeClimateChamber):
                 self.switch(command[3] == "1")
                 return "s1"
             case "S":
-                flags = (self.running, bool(self.alarm), True, self.humidity_on, False, False, False, False)
+                flags = (self.running, bool(self.alarm), not self.paused, self.humidity_on, False, False, False, False)
                 code = chr(int(self.alarm, 16)) if self.alarm else "0"
                 return "S" + "".join(str(int(flag)) for flag in flags) + code
             case "O":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 
 from drivers.sim import ximc_table as table
 from drivers.sim.kinematics import Pace
@@ -69,8 +70,9 @@ class Settings:
 
     def pace(self) -> Pace:
         """Of MOVE, MOVR, LEFT, RIGT, LOFT and SSTP."""
-        speed, micro_speed, *_ = self._fields("mov")
-        return self._pace(speed, micro_speed)
+        speed, micro_speed, *_, flags = self._fields("mov")
+        pace = self._pace(speed, micro_speed)
+        return replace(pace, speed=pace.speed / 1000) if flags & table.MOVE_THOUSANDTHS else pace
 
     def antiplay_steps(self) -> int:
         """Length of the backlash move."""

@@ -194,9 +194,43 @@ async def test_a_set_point_that_moves_in_a_ramp_is_no_change_at_the_panel(tmp_pa
             bench.wait(60.0)
             found = await bench.read()
             assert (found["sp"].value, found["fault"].reason) == (40.0, "")
+        bench.wait(1200.0)
+        assert (await bench.read())["pv"].value == pytest.approx(
+            40.0, abs=3.0
+        )  # not where the ramp was when it started
         bench.fake.press_setpoint(10.0)
         bench.wait(2400.0)
         assert "set point changed at the unit" in (await bench.read())["fault"].reason
+
+
+async def test_a_set_point_that_a_ramp_passes_on_its_way_elsewhere_is_sent_all_the_same(tmp_path: Path):
+    async with bench_of("ascii2", "tcp", tmp_path, shows_ramp=True) as bench:
+        await bench.driver.open()
+        bench.fake.ramp_K_per_min = 1.0
+        await bench.driver.set_temperature(50.0)
+        bench.wait(7 * 60.0)
+        passed_degC = float(f"{bench.fake._nominal_degC():.1f}")
+        await bench.driver.set_temperature(passed_degC)
+        bench.wait(1800.0)
+        assert (await bench.read())["sp"].value == passed_degC
+        assert bench.fake.setpoint_degC == passed_degC
+
+
+async def test_a_mode_that_is_missing_from_a_reply_is_no_reply(tmp_path: Path):
+    async with bench_of("espec", "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        bench.fake.mode = " "
+        with pytest.raises(GarbledReply, match="unknown mode"):
+            await bench.driver.read()
+
+
+async def test_a_cts_that_is_paused_at_its_panel_says_so_and_is_not_started(tmp_path: Path):
+    async with bench_of("cts", "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        bench.fake.paused = True
+        assert "paused" in (await bench.read())["fault"].reason
+        with pytest.raises(DeviceFault, match="paused"):
+            await bench.driver.run()
 
 
 async def test_a_reply_of_another_address_is_discarded(tmp_path: Path):

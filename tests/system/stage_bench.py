@@ -158,6 +158,10 @@ class Bench:
         """As somebody with the vendor's program would."""
         self._change("mov", "<IBHHIBB9x", 0, steps_s)
 
+    def set_thousandths(self) -> None:
+        """Speeds in 1/1000 steps/s, by MoveFlags."""
+        self._change("mov", "<IBHHIBB9x", 6, 1)
+
     def set_power_off(self, after_s: int | None) -> None:
         """After how long at rest its motor goes off, None for never."""
         self._change("pwr", "<BHHHB6x", 4, 5 if after_s is None else 7)

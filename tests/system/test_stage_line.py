@@ -148,6 +148,20 @@ async def test_what_somebody_has_set_otherwise_meanwhile_is_told_when_it_is_back
     )
 
 
+async def test_speeds_in_thousandths_are_read_as_such_and_a_move_has_the_time_it_takes(bench: Bench) -> None:
+    axis = await bench.ready()
+    bench.set_thousandths()
+    bench.set_speed(100_000)
+    bench.unplug()
+    with pytest.raises(Unreachable):
+        await axis.read()
+    bench.plug(bench.tap)
+    *_, homed = await axis.read()
+    assert homed.reason == "speed 100 steps/s, not 1000 steps/s as in its profile"
+    await axis.move_to(6.0)  # takes longer than at 1000 steps/s
+    assert (await bench.position()).value == pytest.approx(6.0)
+
+
 @pytest.mark.parametrize("wire", ["tcp"])
 async def test_a_gateway_that_hung_up_costs_one_reading(bench: Bench) -> None:
     axis = await bench.ready()
