@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import replace
 
 from drivers.sim import ximc_table as table
 from drivers.sim.kinematics import Pace
@@ -71,8 +70,7 @@ class Settings:
     def pace(self) -> Pace:
         """Of MOVE, MOVR, LEFT, RIGT, LOFT and SSTP."""
         speed, micro_speed, *_, flags = self._fields("mov")
-        pace = self._pace(speed, micro_speed)
-        return replace(pace, speed=pace.speed / 1000) if flags & table.MOVE_THOUSANDTHS else pace
+        return self._pace(speed, micro_speed, 1000 if flags & table.MOVE_THOUSANDTHS else 1)
 
     def antiplay_steps(self) -> int:
         """Length of the backlash move."""
@@ -116,11 +114,11 @@ class Settings:
     def _fields(self, name: str) -> tuple[int, ...]:
         return struct.unpack(table.SETTINGS[name], self._ram[name])
 
-    def _pace(self, speed: int, micro_speed: int) -> Pace:
+    def _pace(self, speed: int, micro_speed: int, divisor: int = 1) -> Pace:
         """ENG may limit a speed to the nominal one; accelerations are those of MOV."""
         _, _, accel, decel, *_ = self._fields("mov")
         _, _, nominal, nominal_micro, flags, *_ = self._fields("eng")
-        top = self.steps(speed, micro_speed)
+        top = self.steps(speed, micro_speed) / divisor
         if flags & table.ENGINE_LIMIT_SPEED:
             top = min(top, self.steps(nominal, nominal_micro))
         return Pace(top, accel, decel)
