@@ -7,8 +7,7 @@ end: the run stopped, the stand safe and tried until it confirms, the record com
 from __future__ import annotations
 
 import asyncio
-import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, suppress
 from pathlib import Path
 from typing import cast
@@ -29,11 +28,11 @@ from stand.daemon.daemon_file import Kept, KeptFile, Latch
 from stand.daemon.house_record import HouseRecord
 from stand.daemon.orders import Orders
 from stand.fault import Fault
-from stand.queueing.queue_file import Entry, working
+from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
 from stand.running.house import House
-from stand.running.stop import STOPPED, Interrupted
+from stand.running.stop import STOPPED, Interrupted, catch_signals
 from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 
@@ -170,24 +169,21 @@ class Daemon:
                 latch = self._kept.latch
                 self.house.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
             self.house.guard.look()
-            _catch_signals(self.leave)
+            catch_signals(self.leave)
             await watched(self._serve(answering), self.house.tasks)
 
     async def _serve(self, answering: Answering) -> None:
-        with working(self.orders.directory):
-            await self.orders.ready()
-            self.wake()
-            worker = asyncio.create_task(self._work())
-            tasks = [worker, asyncio.create_task(self._look_after()), asyncio.create_task(self._feed())]
-            try:
-                async with answering(self._hub, cast("WallClock", self._clock)):
-                    systemd.tell(systemd.READY, "STATUS=idle")
-                    try:
-                        await watched(self._left(), tasks)
-                    finally:
-                        await self._end_guest(worker)
-            finally:
-                await cancelled([*tasks, *self._hands, *self._others])
+        worker = asyncio.create_task(self._work())
+        tasks = [worker, asyncio.create_task(self._look_after()), asyncio.create_task(self._feed())]
+        try:
+            async with answering(self._hub, cast("WallClock", self._clock)):
+                systemd.tell(systemd.READY, "STATUS=idle")
+                try:
+                    await watched(self._left(), tasks)
+                finally:
+                    await self._end_guest(worker)
+        finally:
+            await cancelled([*tasks, *self._hands, *self._others])
 
     async def _left(self) -> None:
         await self._leaving.wait()
@@ -208,6 +204,8 @@ class Daemon:
 
     async def _work(self) -> None:
         """The queue, whenever there is something in it and nothing is halted."""
+        await self.orders.ready()
+        self.wake()
         await self._adopt_camera()
         disk, directory = self.orders.disk, self.orders.directory
         while True:
@@ -288,13 +286,13 @@ class Daemon:
     async def _look_after(self) -> None:
         """Midnight, a record that has ended by itself, and what is kept for the next start."""
         kept_ns = read_ns = self._clock.now_ns()
+        reading: asyncio.Future[None] | None = None
         while True:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_LOOK_S))
             if self._clock.now_ns() - read_ns >= _READ_EVERY_S * NS_PER_S and not self.has_guest:
                 read_ns = self._clock.now_ns()
-                with suppress(SessionError):
-                    await self.orders.read()  # `stand queue add` writes it, too
-                self.wake()
+                if reading is None or reading.done():  # another program may have locked it
+                    reading = self._beside(self._read_queue())
             may_begin = not (self.has_guest or self.orders.leaving)
             if may_begin and self._is_midnight():
                 await self._turn_day()
@@ -355,6 +353,12 @@ class Daemon:
                 systemd.tell(systemd.FED)
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(every_s))
 
+    async def _read_queue(self) -> None:
+        """`stand queue add` writes it, too."""
+        with suppress(SessionError):
+            await self.orders.read()
+        self.wake()
+
     async def _clear_queue(self) -> None:
         try:
             await self.orders.clear()
@@ -369,10 +373,11 @@ class Daemon:
         if not self.house.guard.may_permit():
             raise Conflict("the guard does not permit heat now: it waits for fresh readings, or holds the stand")
 
-    def _beside(self, work: object) -> None:
-        task = asyncio.ensure_future(cast("asyncio.Future[None]", work))
-        self._others.add(cast("asyncio.Task[None]", task))
-        task.add_done_callback(lambda done: self._others.discard(cast("asyncio.Task[None]", done)))
+    def _beside(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(work)
+        self._others.add(task)
+        task.add_done_callback(self._others.discard)
+        return task
 
     def _follow(self, item: Item) -> None:
         """The hub's subscriber: what has tripped is kept at once."""
@@ -388,13 +393,3 @@ class Daemon:
     def _tell_failure(self, what: str, ended: asyncio.Future[object]) -> None:
         if not ended.cancelled() and (error := ended.exception()) is not None:
             self._tell("warning", "by_hand_failed", f"{what}: {failure_text(error)}")
-
-
-def _catch_signals(leave: Callable[[], None]) -> None:
-    """The signals that end the daemon call `leave`, each time they come, and for good: nothing may end the process
-    while the stand is being made safe."""
-    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    for number in numbers:
-        asyncio.get_running_loop().add_signal_handler(number, leave)

@@ -147,7 +147,7 @@ class DaemonDesk:
         """Of any session in the daemon's folder."""
         said, orders = Said(who, text, tags), self._daemon.orders
         folder = await orders.reading.call(orders.folder_of, session)
-        await keep(said, folder, self._assembly.hub, self._assembly.clock)
+        await keep(said, folder, self._assembly.hub, self._assembly.clock, orders.notes)
         self._tell(who, "note", {"tags": list(tags)})
         return self._done("note", "noted")
 

@@ -21,18 +21,20 @@ from foundation.hub import Hub
 from foundation.lane import Lane
 from foundation.readings import Quality
 from recording.reading.session import Session
-from recording.writing.disk import Disk
+from recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, Disk, DiskCalls
 from stand.config.checked import ATTACHMENT
+from stand.config.stand_config import StandConfig
+from stand.estimating.learned import learn
 from stand.estimating.run_estimate import Night, existing, price_night, small_disk
 from stand.queueing import queue
 from stand.queueing.queue import Asked, order_of
-from stand.queueing.queue_disk import QueueDisk
-from stand.queueing.queue_file import Entry, Queue, State
-from stand.queueing.queue_run import Watch, conclude, interruption_of, is_complete
-from stand.queueing.queue_work import Notes, Stopped
+from stand.queueing.queue_file import Entry, Queue, State, worked_on
+from stand.queueing.queue_run import Watch, interruption_of, is_complete
+from stand.queueing.queue_work import Halt, Notes, Stopped
 from stand.running.guest import Job
 from stand.running.house import House
 from stand.running.order import Order, check_plan, parse_order
+from stand.running.resume import Interruption, repaired
 from stand.running.run import run_in
 from stand.running.said import Said, keep
 from stand.running.settling_watch import load_for
@@ -62,7 +64,10 @@ class Orders:
         self.stop: Stop | None = None
         self.leaving = False
         self.directory = directory
-        self.disk = QueueDisk(disk, house.assembly.clock)  # the queue is written by the disk's process
+        clock = house.assembly.clock
+        # What writes is done by the disk's process: a thread that writes to a disk that hangs keeps its process.
+        self.disk = DiskCalls(disk, QUEUE_LINE, clock)
+        self.notes, self.repair = DiskCalls(disk, NOTES_LINE, clock), DiskCalls(disk, REPAIR_LINE, clock)
         self.reading = Lane("orders", house.assembly.clock, patient=False)
         self._house = house
         self._config_name = config_name
@@ -75,7 +80,9 @@ class Orders:
         self.queued = await self.disk.call(queue.queued, self.directory)
 
     async def ready(self) -> None:
-        """What a daemon that was killed had under way is not resumed by itself: somebody has to ask for it."""
+        """The queue is this daemon's while the disk's process lives; SessionError when another program runs it. What a
+        daemon that was killed had under way is not resumed by itself: somebody has to ask for it."""
+        await self.disk.keep("worker", worked_on, self.directory)
         await self.read()
         first = next((entry for entry in self.queued.entries if entry.is_open), None)
         if first is not None and first.state is State.INTERRUPTED:
@@ -120,6 +127,13 @@ class Orders:
 
     async def resume(self, session: str) -> Entry:
         """Its run is the next one."""
+        folder = await self.reading.call(self.folder_of, session)
+        try:
+            is_whole = await self.repair.call(is_complete, folder)
+        except StandError as error:
+            raise Conflict(str(error)) from error
+        if is_whole:
+            raise Conflict(f"{session}: its run is complete; there is nothing to resume")
         order = await self.reading.call(self._recorded, session)
         now_ns = self._house.assembly.clock.now_ns()
         wanted = queue.entry_of(order, self._config_name, now_ns)
@@ -132,13 +146,11 @@ class Orders:
         without the record between runs. Raises as a run does, Stopped when an operator has stopped it: who presses
         stop does not want the next one to begin."""
         session = self.directory / entry.session if entry.session else None
-        if session is not None and await self.reading.call(is_complete, session):
+        if session is not None and await self.repair.call(is_complete, session):
             return session  # killed between its end and the note of it
         order = await self.reading.call(self._order_of, entry)
         config = order.config
-        before = (
-            None if session is None else await self.reading.call(partial(interruption_of, session, config, clear=True))
-        )
+        before = None if session is None else await self._interruption(session, config)
         watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
         hub = self._house.assembly.hub
 
@@ -147,7 +159,7 @@ class Orders:
             begun()
             if session is None and (said := _said(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
                 try:
-                    await keep(said, folder, hub, self._house.assembly.clock)
+                    await keep(said, folder, hub, self._house.assembly.clock, self.notes)
                 except SessionError as error:
                     tell(f"warning: {error}")
 
@@ -169,10 +181,23 @@ class Orders:
         finally:
             self.stop = None
             hub.unsubscribe(watch)
-        await self.reading.call(partial(conclude, entry, done, tell, report=False))
+        try:
+            await self.repair.call(learn, self.directory, config)
+        except SessionError as error:
+            tell(f"warning: what this run has taught of durations is not kept: {error}")
         if self._recorded_whole is not None and any(isinstance(planned.step, Capture) for planned in plan):
             self._recorded_whole(done)
         return done
+
+    async def _interruption(self, session: Path, config: StandConfig) -> Interruption:
+        """What is left of its run; Halt when it cannot be resumed. What has to be written for that is written by the
+        disk's process."""
+        try:
+            salvaged = await self.repair.call(repaired, session)
+        except SessionError as error:
+            raise Halt(str(error)) from error
+        before = await self.reading.call(partial(interruption_of, session, config, clear=True))
+        return replace(before, salvaged=(*salvaged, *before.salvaged))
 
     def shown(self) -> tuple[QueuedRun, ...]:
         """The queue for clients: the last that have ended, the run under way, those to be done."""
@@ -244,12 +269,10 @@ class Orders:
         """What a session was to run; Missing when there is no such session, Conflict when it cannot be resumed."""
         folder = self.folder_of(session)
         try:
-            if is_complete(folder):
-                raise Conflict(f"{session}: its run is complete; there is nothing to resume")
             texts = dict(Session.open(folder).attachments)
             return parse_order({**self._texts, **texts}, {name: f"{session}: {name}" for name in texts})
         except (StandError, LookupError) as error:
-            raise error if isinstance(error, Conflict) else Conflict(str(error)) from error
+            raise Conflict(str(error)) from error
 
     def _night(self, order: Order) -> Night:
         """What the run will take; Conflict when the disk has no room for it."""

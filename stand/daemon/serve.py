@@ -67,7 +67,7 @@ async def serve(
                 reports = Reports(hub, clock)
                 stack.push_async_callback(reports.close)
                 orders = Orders(house, house.disk, out, config_name, texts, reports.add if has_reports else None)
-                for segment in await asyncio.to_thread(salvage_unfinished, out):
+                for segment in await orders.repair.call(salvage_unfinished, out):
                     hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
                 if accepted := config.accepted():
                     hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))

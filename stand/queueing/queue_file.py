@@ -10,7 +10,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
@@ -147,6 +147,13 @@ def working(directory: Path) -> Generator[None]:
             if _running(found):
                 _store(directory, _interrupted(found))
         yield
+
+
+def worked_on(directory: Path) -> ExitStack:
+    """`working` until what is returned is closed, or its process ends."""
+    stack = ExitStack()
+    stack.enter_context(working(directory))
+    return stack
 
 
 def _settled(directory: Path, queue: Queue) -> Queue:

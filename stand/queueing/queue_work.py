@@ -11,9 +11,8 @@ from pathlib import Path
 from foundation.clock import Now, WallClock
 from foundation.errors import DeviceError, InUse, SessionError, StandError, StandTripped
 from foundation.patience import Patience
-from recording.writing.disk import Disk
+from recording.writing.disk import QUEUE_LINE, Disk, DiskCalls
 from stand.queueing.queue import finish, note_session, note_step, queued, take
-from stand.queueing.queue_disk import QueueDisk
 from stand.queueing.queue_file import Entry, State, working
 from stand.running.stop import Interrupted
 
@@ -48,7 +47,7 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
     from their turn.
     """
     disk = Disk()
-    calls = QueueDisk(disk, WallClock())
+    calls = DiskCalls(disk, QUEUE_LINE, WallClock())
     try:
         with working(directory):
             await drain(directory, run_one, clock, tell, calls, Patience())
@@ -58,7 +57,7 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
 
 
 async def drain(
-    directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: QueueDisk, patience: Patience
+    directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: DiskCalls, patience: Patience
 ) -> None:
     """As `work`, for a caller that is `working` on the queue already; with `patience` for the disk at a run's end."""
     while (entry := await disk.call(take, directory, clock.now_ns())) is not None:
@@ -88,7 +87,7 @@ class _Run:
         entry: Entry,
         clock: Now,
         tell: Callable[[str], None],
-        disk: QueueDisk,
+        disk: DiskCalls,
         patience: Patience,
     ) -> None:
         self._directory = directory

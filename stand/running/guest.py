@@ -21,6 +21,7 @@ from foundation.tasks import cause_of, failure_text, watched
 from markers.target import Target
 from recording.reading.contents import RUN_END
 from recording.reading.run_word import Run
+from recording.writing.disk import NOTES_LINE, DiskCalls
 from recording.writing.recorder import Recorder
 from stand.assembly import Assembly
 from stand.estimating.run_estimate import price_night
@@ -212,8 +213,18 @@ class Guest:
     def _desk(self, board: StatusBoard, executor: Executor, leaving: AsyncExitStack) -> RunDesk:
         """What may be asked of the run."""
         assembly, directory, house = self._assembly, self.recorder.directory, self._house
+        notes = DiskCalls(self.recorder.disk, NOTES_LINE, assembly.clock)
+        leaving.callback(notes.close)
         desk = RunDesk(
-            assembly, directory, self.stop, self.log, executor, board.status, lambda: house.latched, board.priced_s
+            assembly,
+            directory,
+            self.stop,
+            self.log,
+            executor,
+            board.status,
+            lambda: house.latched,
+            notes,
+            board.priced_s,
         )
         assembly.hub.subscribe(desk)
         leaving.callback(assembly.hub.unsubscribe, desk)

@@ -23,7 +23,7 @@ from recording.reading.contents import PLAN_CHANGED, RUN_BEGINS, RUN_END
 from recording.reading.glance import glance
 from recording.reading.run_word import Run, last_run_event
 from recording.reading.session import Session
-from recording.repair.salvage import Salvaged, salvage_unfinished
+from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
 from recording.writing.recorder_settings import SessionInfo
 from stand.config.stand_config import StandConfig
 from stand.running.actions import cold_start
@@ -81,6 +81,14 @@ class Interruption:
     def release(self) -> None:
         """Give the session free for another daemon; may be called twice."""
         self.journal.release()
+
+
+def repaired(directory: Path) -> tuple[Salvaged, ...]:
+    """What `interruption` would have to write: the journal's torn end is cut off, unfinished segments are finished.
+    SessionError as there. For the process that touches the disk; those that are being recorded are not among them."""
+    Journal.open(directory)[0].release()
+    found = salvage_unfinished(directory.resolve().parent)
+    return tuple(segment for segment in found if segment.reason != BEING_RECORDED)
 
 
 def interruption(directory: Path, own: StandConfig | None = None, *, clear: bool = False) -> Interruption:

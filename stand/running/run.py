@@ -15,7 +15,7 @@ from foundation.items import Event, Item
 from foundation.progress import late_progress
 from foundation.tasks import cancelled, cause_of, failure_text
 from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
-from recording.writing.disk import Disk
+from recording.writing.disk import REPAIR_LINE, Disk, DiskCalls
 from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly, assemble
@@ -94,7 +94,7 @@ async def run_in(house: House, job: Job, stop: Stop) -> Path:
     hub.subscribe(early)
     try:
         job.watch(hub)
-        await _announce(job, house.assembly, has_own=True)
+        await _announce(job, house.assembly, house.disk, has_own=True)
         directory = _directory(job, house.assembly.clock)
         async with _telling_failure(house.assembly, directory, stop), AsyncExitStack() as stack:
             disk = Disk()
@@ -168,11 +168,11 @@ def _directory(job: Job, clock: Clock) -> Path:
     return job.before.directory if job.before is not None else session_directory(job.out, job.order, clock)
 
 
-async def _announce(job: Job, assembly: Assembly, *, has_own: bool = False) -> None:
+async def _announce(job: Job, assembly: Assembly, disk: Disk | None = None, *, has_own: bool = False) -> None:
     """What the session has to say before anything moves; what earlier runs that were killed have left is completed.
     has_own: what is being recorded now is the stand's own record, which need not be announced."""
     hub, clock = assembly.hub, assembly.clock
-    for segment in await _salvaged(job):
+    for segment in await _salvaged(job, assembly.clock, disk):
         if has_own and segment.reason == BEING_RECORDED:
             continue
         hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
@@ -184,10 +184,17 @@ async def _announce(job: Job, assembly: Assembly, *, has_own: bool = False) -> N
         hub.publish(Event(clock.now_ns(), "warning", "stand_differs", str(difference), difference.data()))
 
 
-async def _salvaged(job: Job) -> tuple[Salvaged, ...]:
-    """What earlier runs that were killed have left unfinished, finished before anything moves."""
+async def _salvaged(job: Job, clock: Clock, disk: Disk | None) -> tuple[Salvaged, ...]:
+    """What earlier runs that were killed have left unfinished, finished before anything moves; where a stand is open,
+    by the process that touches its disk."""
     if job.before is not None:
         return job.before.salvaged
+    if disk is not None:
+        repair = DiskCalls(disk, REPAIR_LINE, clock)
+        try:
+            return tuple(await repair.call(salvage_unfinished, job.out))
+        finally:
+            repair.close()
     with late_progress("salvage", 1.0) as report:
         return tuple(await asyncio.to_thread(salvage_unfinished, job.out, report))
 

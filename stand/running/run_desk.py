@@ -13,6 +13,7 @@ from experiments.words import in_words
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError, SessionError
 from foundation.items import Event, Item, StepMark, StepState
+from recording.writing.disk import DiskCalls
 from stand.assembly import Assembly
 from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR, Phase
@@ -52,7 +53,7 @@ class RunDesk:
     """The desk of a run (stand/serving/desk.py has what each method does). A subscriber of the hub.
 
     session: its folder. status: the published state of the run. latched: why the guard holds the stand. duration_s:
-    expected of the steps that were planned, by their ids.
+    expected of the steps that were planned, by their ids. notes: where the session's file of notes is written.
     """
 
     assembly: Assembly
@@ -62,6 +63,7 @@ class RunDesk:
     executor: Executor
     status: Callable[[], RunStatus]
     latched: Callable[[], Fault | None]
+    notes: DiskCalls
     duration_s: Mapping[str, float] = field(default_factory=dict[str, float])
 
     def __post_init__(self) -> None:
@@ -198,7 +200,7 @@ class RunDesk:
         """Of the session of this run."""
         if session != self.session.name:
             raise Missing(f"the session under way is {self.session.name}; others get notes from `stand session`")
-        await keep(Said(who, text, tags), self.session, self.assembly.hub, self.assembly.clock)
+        await keep(Said(who, text, tags), self.session, self.assembly.hub, self.assembly.clock, self.notes)
         return self._done(who, "note", {"tags": list(tags)}, "noted")
 
     def _done(self, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], text: str) -> Done:

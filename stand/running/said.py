@@ -11,8 +11,8 @@ from foundation.clock import Clock
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from foundation.items import Event
-from foundation.lane import Lane
 from recording.reading.notes import add_note, add_tags, check_tag
+from recording.writing.disk import DiskCalls
 from stand.serving.desk import Who
 
 _NOTE = "note"
@@ -33,13 +33,9 @@ class Said:
             check_tag(tag)
 
 
-async def keep(said: Said, session: Path, hub: Hub, clock: Clock) -> None:
-    """Durable when this returns; SessionError when it is not. No loop waits for the disk, which may hang."""
-    lane = Lane("notes", clock, patient=False)
-    try:
-        await lane.call(_keep, said, session, clock.now_ns())
-    finally:
-        lane.close()
+async def keep(said: Said, session: Path, hub: Hub, clock: Clock, notes: DiskCalls) -> None:
+    """Durable when this returns; SessionError when it is not. `notes` touches the disk, which may hang."""
+    await notes.call(_keep, said, session, clock.now_ns())
     who, data = said.who, {"session": session.name, "tags": list(said.tags)}
     hub.publish(Event(clock.now_ns(), "info", _NOTE, said.text, {"who": who.name, "how": who.how, **data}))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from collections.abc import Callable
 
 from foundation.errors import SessionError, StandError, StandTripped
 from foundation.patience import Patience
@@ -123,3 +124,13 @@ class Stop:
         if isinstance(error, asyncio.CancelledError):
             self._run.uncancel()
         raise (Interrupted(text) if self.fault.rule == STOPPED_BY_OPERATOR else StandTripped(text)) from error
+
+
+def catch_signals(leave: Callable[[], None]) -> None:
+    """The signals that end the daemon call `leave`, each time they come, and for good: nothing may end the process
+    while the stand is being made safe."""
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        asyncio.get_running_loop().add_signal_handler(number, leave)

@@ -15,13 +15,12 @@ from foundation.errors import SessionError
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.patience import BUDGET_S, LEAST_S, Patience
-from recording.writing.disk import FILES_LINE, Disk
+from recording.writing.disk import FILES_LINE, QUEUE_LINE, Disk, DiskCalls
 from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from stand.chamber.compressor import CompressorState
 from stand.chamber.compressor_file import CompressorFile
 from stand.daemon.daemon_file import Kept, KeptFile
 from stand.queueing.queue import append
-from stand.queueing.queue_disk import QueueDisk
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
 from stand.running.entries import Begun, Ended
@@ -116,7 +115,7 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
         recording = asyncio.create_task(recorder.run())
         log, journal = Logbook(hub, clock, RunState(())), Journal.create(recorder.directory)
         await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
-        queue, told = QueueDisk(own, clock), []
+        queue, told = DiskCalls(own, QUEUE_LINE, clock), []
         entry = Entry(id=1, recipe="r", config="c", config_text="", recipe_text="", target_text="", added_ns=1)
         await queue.call(append, tmp_path, entry)
         kept = KeptFile(tmp_path, own.line(FILES_LINE).run, hub, clock)

@@ -1,12 +1,13 @@
 """Faults of a served stand that has a run, over real wires and signals: two at once."""
 
+import fcntl
 import os
 import signal
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -38,16 +39,28 @@ def served(tmp_path: Path, order: Callable[..., Order], simulator: Callable[...,
             served.process.communicate()
 
 
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    path.parent.mkdir(exist_ok=True)
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def suppressed(work: Callable[[], object]) -> None:
     with suppress(SessionError):
         work()
 
 
 def test_a_hung_disk_holds_the_stand_over_a_stop_of_the_process_and_keeps_nobody_from_leaving(served: Served):
-    """While somebody asks for the queue and the sessions, which lie on that disk."""
-    served.until(is_idle)
+    """While somebody asks for the queue and the sessions, and writes notes, which lie on that disk. Before that another
+    program has locked the queue when the daemon is started."""
+    with locked(served.out / ".queue.lock"):
+        served.until(is_idle)
     served.submit(SOAK)
-    served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
+    heating = served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
+    assert heating.run is not None
+    session = Path(heating.run.session).name
     run("fsfreeze", "-f", served.out.parent)
 
     def is_held(state: StandState) -> bool:
@@ -61,7 +74,11 @@ def test_a_hung_disk_holds_the_stand_over_a_stop_of_the_process_and_keeps_nobody
     time.sleep(STOPPED_S)  # noqa: TID251 - a process that is stopped for real
     os.kill(served.process.pid, signal.SIGCONT)
     assert is_held(served.state())
-    for work in (lambda: served.server.request("GET", "/api/v1/sessions"), lambda: served.submit(SOAK)):
+    for work in (
+        lambda: served.server.request("GET", "/api/v1/sessions"),
+        lambda: served.submit(SOAK),
+        lambda: served.post(f"sessions/{session}/notes", text="the disk is hung"),
+    ):
         threading.Thread(target=suppressed, args=(work,), daemon=True).start()
     assert is_held(served.state())
     served.process.send_signal(signal.SIGTERM)
