@@ -75,8 +75,10 @@ def _finished(
 
 @contextmanager
 def _pool(workers: int) -> Generator[ProcessPoolExecutor]:
-    """Started afresh (a fork would copy our threads' locks); what is not begun is dropped on any early way out."""
-    context = multiprocessing.get_context("spawn")
+    """Forked from a process of their own kind that has loaded what they need, once for all pools (a fork of this one
+    would copy its threads' locks); what is not begun is dropped on any early way out."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([find_markers.__module__])
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     try:
         yield pool

@@ -27,13 +27,13 @@ from recording.reading.session import Session
 from .conftest import Recorded
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def pieces(recorded: Recorded) -> list[Piece]:
     session = Session.open(recorded.path)
     return pieces_of(session, session_target(session), frames_per_piece=5)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def serial(pieces: list[Piece]) -> list[FoundMarkers]:
     return [found for _, found in in_turn(pieces)]
 
@@ -127,8 +127,11 @@ def test_a_segment_that_cannot_be_read_ends_the_work_with_its_sentence(pieces: l
 
 def test_a_cluster_finds_the_same_bits_also_when_a_worker_is_killed(pieces: list[Piece], serial: list[FoundMarkers]):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as here:
-        assert_all_same(dict(on_cluster(here.scheduler_address)(pieces)), serial)
+    dask = pytest.importorskip("dask")
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as here,
+    ):
         found: dict[int, FoundMarkers] = {}
         for index, markers in on_cluster(here.scheduler_address)(pieces):
             if not found:
