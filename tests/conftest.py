@@ -10,7 +10,7 @@ import pytest
 
 from recording.writing import notices
 from stand import simulator
-from tests.forked import Laboratories
+from tests.forked import Forks, Laboratories
 from tests.stock_camera import run_stock_camera
 
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
@@ -70,13 +70,13 @@ def _roomy_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _forked_laboratories() -> Iterator[None]:
-    """A simulator that a test's own process starts begins at once."""
-    laboratories = Laboratories()
+def _forked_programs(runtime_folder: Path) -> Iterator[None]:
+    """A program that a test starts begins at once."""
+    forks = Forks()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulator, "subprocess", laboratories)
+        patch.setattr(simulator, "subprocess", Laboratories)
         yield
-    laboratories.close()
+    forks.close()
 
 
 @pytest.fixture(scope="session")

@@ -1,147 +1,232 @@
-"""The simulated laboratories of the tests are forked from one process that has their modules loaded: a start then
-does without the 0.44 s of processor time that importing them takes. What a person starts is a program of its own, and
-so are those that other programs of the tests start."""
+"""The programs of the tests are forked from a process that has their modules loaded: a start then does without the
+second of processor time that importing them takes. So are the simulated laboratories that they start themselves. What
+a person starts is a program of its own, which a few tests start as such."""
 
 from __future__ import annotations
 
 import gc
+import importlib
 import json
 import os
-import select
+import selectors
 import signal
 import socket
 import subprocess
 import sys
-import traceback
-from collections.abc import Sequence
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from threading import Lock
-from typing import Any, NoReturn
+from select import select
+from typing import Any
 
-_COMMAND = [sys.executable, "-m", "drivers.sim"]
+_ENTRIES = {"drivers.sim": "drivers.sim.__main__:main", "stand.cli": "stand.cli:app"}
+"""Of what `python -m` starts, what runs it; of other modules it is `main`."""
+_LOADED = {
+    "stand.cli": ("stand.commands.run_cli", "stand.commands.serve_cli", "stand.commands.queue_cli"),
+}
+"""What such a program imports on its way, too."""
+_AT_THE_START = ("PYTHONPATH", "LD_PRELOAD", "NUMBA_CACHE_DIR", "PYTHONWARNINGS")
+"""Who changes one of these gets a program of its own: they count while modules are loaded."""
 _MESSAGE_BYTES = 200_000
+_address = ""
+"""Where the process that forks answers."""
 
 
-class Forked:
-    """Of subprocess.Popen what a Simulator uses; the exit code is not known."""
+def popen(command: Sequence[Any], **options: Any) -> subprocess.Popen[Any]:
+    """As subprocess.Popen, for `python -m module arguments`."""
+    words, env = [os.fspath(word) for word in command], options.get("env") or os.environ
+    is_alike = all(env.get(name) == os.environ.get(name) for name in _AT_THE_START)
+    if not _address or not is_alike or words[:2] != [sys.executable, "-m"]:
+        return subprocess.Popen(words, **options)
+    return _Forked(words, **options)
 
-    def __init__(self, pid: int, pipes: Sequence[int]) -> None:
-        self.pid = pid
-        self.stdin = os.fdopen(pipes[0], "w")
-        self.stdout, self.stderr = (os.fdopen(pipe) for pipe in pipes[1:])
+
+def run(command: Sequence[Any], timeout: float | None = None, **options: Any) -> subprocess.CompletedProcess[Any]:
+    """As subprocess.run without `check`."""
+    if options.pop("capture_output", False):
+        options |= {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with popen(command, **options) as process:
         try:
-            self._pidfd = os.pidfd_open(pid)
-        except ProcessLookupError:
-            self._pidfd = -1
-
-    def send_signal(self, number: int) -> None:
-        if self._pidfd >= 0:
-            with suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._pidfd, number)
-
-    def terminate(self) -> None:
-        self.send_signal(signal.SIGTERM)
-
-    def kill(self) -> None:
-        self.send_signal(signal.SIGKILL)
-
-    def wait(self, timeout: float | None = None) -> int:
-        if self._pidfd >= 0:
-            if not select.select([self._pidfd], [], [], timeout)[0]:
-                raise subprocess.TimeoutExpired(_COMMAND, timeout or 0.0)
-            os.close(self._pidfd)
-            self._pidfd = -1
-        return 0
+            out, err = process.communicate(timeout=timeout)
+        except BaseException:
+            process.kill()
+            raise
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
 
 
 class Laboratories:
     """In the place of the module `subprocess` where simulators are started."""
 
-    PIPE, TimeoutExpired, run = subprocess.PIPE, subprocess.TimeoutExpired, staticmethod(subprocess.run)
+    PIPE, TimeoutExpired = subprocess.PIPE, subprocess.TimeoutExpired
+    Popen, run = staticmethod(popen), staticmethod(subprocess.run)
+
+
+class _Forked(subprocess.Popen[Any]):
+    """A program forked by another process, which says on a line of its own how it has ended."""
+
+    def __init__(self, command: Sequence[str], **options: Any) -> None:
+        self._wanted = {
+            "words": list(command[2:]),
+            "env": dict(options.get("env") or os.environ),
+            "folder": os.fspath(options.get("cwd") or os.getcwd()),
+            "processors": sorted(os.sched_getaffinity(0)),
+            "is_leader": bool(options.get("start_new_session")),
+        }
+        super().__init__(command, **options)
+
+    def _get_handles(self, *streams: Any) -> Any:
+        self._ends = super()._get_handles(*streams)  # type: ignore[misc]
+        return self._ends
+
+    def _execute_child(self, *_: Any) -> None:
+        stdin, self_in, self_out, stdout, self_err, stderr = self._ends
+        given = [usual if end < 0 else end for usual, end in enumerate((stdin, stdout, stderr))]
+        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._line.connect(_address)
+        socket.send_fds(self._line, [json.dumps(self._wanted).encode()], given)
+        self.pid = int(self._line.recv(64))
+        self._child_created = True
+        kept = {-1, self_in, self_out, self_err}
+        for end in {stdin, stdout, stderr} - kept:
+            os.close(end)
+
+    def _try_wait(self, wait_flags: int) -> tuple[int, int]:
+        if not select([self._line], [], [], 0 if wait_flags & os.WNOHANG else None)[0]:
+            return 0, 0
+        status = int(self._line.recv(64) or signal.SIGKILL)
+        self._line.close()
+        return self.pid, status
+
+    def _internal_poll(self, _deadstate: Any = None, **_: Any) -> int | None:
+        if self.returncode is None and self._waitpid_lock.acquire(False):  # type: ignore[attr-defined]
+            try:
+                if self.returncode is None:
+                    pid, status = self._try_wait(os.WNOHANG)
+                    if pid == self.pid:
+                        self._handle_exitstatus(status)  # type: ignore[attr-defined]
+            finally:
+                self._waitpid_lock.release()  # type: ignore[attr-defined]
+        return self.returncode
+
+
+class Forks:
+    """The process that forks, from here on for all programs of these tests; it ends with this one, or `close`."""
 
     def __init__(self) -> None:
-        self._lock = Lock()
-        self._path = os.environ.get("PYTHONPATH")
-        self._line: socket.socket | None = None
-        self._server: subprocess.Popen[bytes] | None = None
-
-    def Popen(self, command: Sequence[str], env: dict[str, str], **others: Any) -> Any:
-        assert list(command) == _COMMAND
-        if env.get("PYTHONPATH") != self._path:  # a program whose modules are not the loaded ones
-            return subprocess.Popen(command, env=env, **others)
-        child_ends, own_ends = [], []
-        for is_read_by_child in (True, False, False):
-            reads, writes = os.pipe()
-            child_ends.append(reads if is_read_by_child else writes)
-            own_ends.append(writes if is_read_by_child else reads)
-        wanted = {"env": env, "folder": os.getcwd(), "processors": sorted(os.sched_getaffinity(0))}
-        with self._lock:
-            line = self._line or self._begin()
-            socket.send_fds(line, [json.dumps(wanted).encode()], child_ends)
-            pid = int(line.recv(64))
-        for end in child_ends:
-            os.close(end)
-        return Forked(pid, own_ends)
-
-    def _begin(self) -> socket.socket:
-        """A line to the process that forks, which ends with it."""
-        self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with other:
-            environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-            command = [sys.executable, "-m", "tests.forked", str(other.fileno())]
-            folder = Path(__file__).parents[1]
-            self._server = subprocess.Popen(command, pass_fds=[other.fileno()], env=environment, cwd=folder)
-        return self._line
+        global _address
+        self._folder = tempfile.TemporaryDirectory(prefix="forks-")
+        _address = f"{self._folder.name}/line"
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        listener.bind(_address)
+        listener.listen(64)
+        command = [sys.executable, "-m", "tests.forked", str(listener.fileno()), _address]
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        self._server = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            pass_fds=[listener.fileno()],
+            env=environment,
+            cwd=Path(__file__).parents[1],
+        )
+        listener.close()
 
     def close(self) -> None:
-        if self._line is not None and self._server is not None:
-            self._line.close()
-            self._server.wait()
+        global _address
+        _address = ""
+        self._server.communicate()
+        self._folder.cleanup()
 
 
-def _serve(line: socket.socket) -> None:
-    import drivers.sim.__main__  # all that forks have loaded
+class _Server:
+    def __init__(self, listener: socket.socket) -> None:
+        self._listener, self._lines = listener, dict[int, socket.socket]()
+        self._woken, waking = os.pipe()
+        os.set_blocking(waking, False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # is for the programs
+        signal.set_wakeup_fd(waking, warn_on_full_buffer=False)
 
-    assert drivers.sim.__main__.main
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # which also lets the ended go
-    gc.freeze()
-    while True:
+    def wanted(self) -> dict[str, Any]:
+        """Return in each program that is to run, once; nothing at the end."""
+        with selectors.DefaultSelector() as ready:
+            for file in (0, self._woken, self._listener):
+                ready.register(file, selectors.EVENT_READ)
+            while True:
+                files = [key.fileobj for key, _ in ready.select()]
+                if self._woken in files:
+                    os.read(self._woken, 4096)
+                    self._reap()
+                if self._listener in files and (wanted := self._fork()):
+                    return wanted
+                if 0 in files:
+                    os._exit(0)
+
+    def _fork(self) -> dict[str, Any] | None:
+        line, _ = self._listener.accept()
         message, ends, _, _ = socket.recv_fds(line, _MESSAGE_BYTES, 3)
-        if not message:
-            return
+        wanted: dict[str, Any] = json.loads(message)
+        with suppress(Exception):  # the program itself says why it cannot begin
+            _load(wanted["words"][0])
         pid = os.fork()
         if not pid:
-            line.close()
-            _become(json.loads(message), ends)
+            for number, end in enumerate(ends):
+                os.dup2(end, number)
+            return wanted
         for end in ends:
             os.close(end)
+        self._lines[pid] = line
         line.send(str(pid).encode())
+        return None
+
+    def _reap(self) -> None:
+        with suppress(ChildProcessError):
+            while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                with self._lines.pop(ended[0]) as line, suppress(OSError):
+                    line.send(str(ended[1]).encode())
 
 
-def _become(wanted: dict[str, Any], ends: Sequence[int]) -> NoReturn:
-    from drivers.sim.__main__ import main
+def _load(module: str) -> Callable[[], Any]:
+    """What runs the program."""
+    for each in _LOADED.get(module, ()):
+        if each not in sys.modules:
+            importlib.import_module(each)
+            gc.freeze()
+    home, _, entry = _ENTRIES.get(module, f"{module}:main").partition(":")
+    return getattr(importlib.import_module(home), entry)
 
-    code = 1
-    try:
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+
+def _become(wanted: Mapping[str, Any]) -> Callable[[], Any]:
+    """This process is as one that was started so; return what runs."""
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if wanted["is_leader"]:
         os.setsid()
-        os.sched_setaffinity(0, wanted["processors"])
-        os.chdir(wanted["folder"])
-        os.environ.clear()
-        os.environ.update(wanted["env"])
-        for number, end in enumerate(ends):
-            os.dup2(end, number)
-            os.close(end)
-        sys.argv = ["drivers.sim"]
-        code = main()
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except BaseException:  # noqa: BLE001 - nothing of it is the server's
-        traceback.print_exc()
-    finally:
-        os._exit(code)
+    os.sched_setaffinity(0, wanted["processors"])
+    os.chdir(wanted["folder"])
+    os.environ.clear()
+    os.environ.update(wanted["env"])
+    time.tzset()
+    sys.stdin, sys.stdout = os.fdopen(0, closefd=False), os.fdopen(1, "w", closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
+    module, *arguments = wanted["words"]
+    runs = _load(module)
+    sys.argv = [str(sys.modules[runs.__module__].__file__), *arguments]
+    if simulator := sys.modules.get("stand.simulator"):
+        setattr(simulator, "subprocess", Laboratories)  # noqa: B010
+    return runs
+
+
+def _serve(listener: socket.socket) -> Callable[[], Any]:
+    server = _Server(listener)
+    wanted = server.wanted()
+    os.closerange(3, 4096)
+    return _become(wanted)
 
 
 if __name__ == "__main__":
-    _serve(socket.socket(fileno=int(sys.argv[1])))
+    _address = sys.argv[2]
+    _runs = _serve(socket.socket(fileno=int(sys.argv[1])))
+    sys.exit(_runs())

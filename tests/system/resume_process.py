@@ -17,6 +17,7 @@ from foundation.items import StepMark, StepState
 from foundation.readings import Frame
 from stand.running.resume import interruption
 from stand.running.run import resume, run_virtual
+from tests import forked
 
 DOWNTIME_S = 45.0
 
@@ -54,7 +55,7 @@ class Daemon:
     """A running daemon; the frames at `acknowledged` (ns) are on the disk."""
 
     def __init__(self, order, place: Path):
-        self._process = subprocess.Popen(
+        self._process = forked.popen(
             [sys.executable, "-m", "tests.system.resume_process"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
         self._process.stdin.write(pickle.dumps((order, place)))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from recording.reading.session import Session
+from tests import forked
 from tests.system.conftest import require_aravis
 
 PROMPTED = """
@@ -19,7 +20,7 @@ STAND = [sys.executable, "-m", "stand.cli"]
 
 def attended(*arguments: object) -> subprocess.Popen[str]:
     command = [*STAND, *map(str, arguments), "--attended"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def asked(daemon: subprocess.Popen[str]) -> None:
@@ -45,7 +46,7 @@ def test_an_attended_run_waits_at_its_prompt_also_when_it_is_resumed(tmp_path: P
     with attended("resume", directory) as daemon:
         asked(daemon)
         continued = [*STAND, "continue", str(directory)]
-        while subprocess.run(continued, capture_output=True, check=False, timeout=30).returncode:
+        while forked.run(continued, capture_output=True, timeout=30).returncode:
             assert daemon.poll() is None  # its socket comes with its first step
         assert daemon.wait(60) == 0
     session = Session.open(directory)

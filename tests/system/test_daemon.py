@@ -29,6 +29,7 @@ from stand.daemon.serve import serve as serve_stand
 from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
 from stand.serving.desk import Conflict, RunRequest, StandState, Who
+from tests import forked
 from tests.system.test_real_time import BRIEF as CYCLE
 from tests.system.test_two_runs import Laboratory
 
@@ -46,7 +47,7 @@ class Served:
     def __init__(self, config_file: Path, out: Path) -> None:
         self.out = out
         command = [sys.executable, "-m", "stand.cli", "serve", str(config_file), "--out", str(out), "--no-reports"]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     @property
     def server(self) -> Server:
@@ -276,7 +277,7 @@ def run_command(config_file: Path, recipe: str, *options: str) -> "subprocess.Po
     recipe_file = config_file.with_name("recipe.yaml")
     recipe_file.write_text(recipe)
     command = [sys.executable, "-m", "stand.cli", "run", str(recipe_file), "--config", str(config_file), *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_stand_run_goes_through_the_daemon_that_has_the_stand(serve: Callable[[], Served], laboratory: Path):

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from tests import forked
 from tests.stand.browser import a_page, browser, needs_chromium
 from tests.stand.page_desk import free_port
 from tests.system.test_daemon import Served
@@ -33,7 +34,7 @@ class ServedPage(Served):
         self.out = out
         arguments = ["serve", str(config_file), "--out", str(out), "--port", str(port)]
         command = [sys.executable, "-m", "stand.cli", *arguments]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 @pytest.fixture

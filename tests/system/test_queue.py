@@ -13,6 +13,7 @@ from stand.estimating.learned import load_learned
 from stand.queueing import queue
 from stand.queueing.queue_work import MOST_FRUITLESS_STARTS
 from stand.running.order import load_order
+from tests import forked
 from tests.system.conftest import require_aravis
 
 RECIPE = """
@@ -30,8 +31,9 @@ experiments:
 
 COMMAND = [
     sys.executable,
-    "-c",
-    "from stand.commands.queue_cli import app; app()",
+    "-m",
+    "stand.cli",
+    "queue",
     "start",
     "--virtual-time",
     "--out",
@@ -40,7 +42,7 @@ COMMAND = [
 
 def kill_under_way(directory: Path) -> None:
     """Start the queue and kill it when its first run tells that at least a third of it is done."""
-    with subprocess.Popen([*COMMAND, str(directory)], stderr=subprocess.PIPE, text=True) as daemon:
+    with forked.popen([*COMMAND, str(directory)], stderr=subprocess.PIPE, text=True) as daemon:
         assert daemon.stderr is not None
         shares = (int(line[4:].split("%")[0]) for line in daemon.stderr if line.startswith("run:"))
         assert any(share >= 33 for share in shares)
@@ -50,7 +52,7 @@ def kill_under_way(directory: Path) -> None:
 
 def kill_at_once(directory: Path) -> None:
     """Start the queue and kill it when it has told that its run goes on."""
-    with subprocess.Popen([*COMMAND, str(directory)], stderr=subprocess.PIPE, text=True) as daemon:
+    with forked.popen([*COMMAND, str(directory)], stderr=subprocess.PIPE, text=True) as daemon:
         assert daemon.stderr is not None
         assert "is resumed in" in daemon.stderr.readline()
         daemon.kill()
@@ -71,7 +73,7 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
     assert (first.state, second.state) == ("interrupted", "waiting")
     assert first.session.endswith("-queued")
 
-    ended = subprocess.run([*COMMAND, str(out), "--report"], capture_output=True, text=True, check=False, timeout=300)
+    ended = forked.run([*COMMAND, str(out), "--report"], capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     assert f"run 1 (queued) is resumed in {first.session}" in ended.stderr
     entries = queue.queued(out).entries
@@ -99,12 +101,12 @@ def test_a_run_that_dies_whenever_it_goes_on_makes_way_for_the_next(tmp_path: Pa
     kill_under_way(out)
     for _ in range(MOST_FRUITLESS_STARTS):
         kill_at_once(out)
-    ended = subprocess.run([*COMMAND, str(out)], capture_output=True, text=True, check=False, timeout=300)
+    ended = forked.run([*COMMAND, str(out)], capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     first, second = queue.queued(out).entries
     assert (first.state, second.state) == ("failed", "done")
     assert first.reason.startswith("its daemon was killed 3 times in a row before one more step was done")
     assert Session.open(out / second.session).frame_count == 4
     resumed = [sys.executable, "-m", "stand.cli", "resume", str(out / first.session)]
-    assert subprocess.run(resumed, capture_output=True, check=False, timeout=300).returncode == 0
+    assert forked.run(resumed, capture_output=True, timeout=300).returncode == 0
     assert Session.open(out / first.session).frame_count == 4

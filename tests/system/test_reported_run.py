@@ -19,6 +19,7 @@ from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.running.order import load_order
 from stand.running.session_report import MODEL_NAME, REPORT_NAME
+from tests import forked
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 EVERY_SEQUENCE = """
@@ -94,9 +95,7 @@ def run_reported(recipe: str, config_text: str, out: Path, timeout_s: float) -> 
     command = [sys.executable, "-m", "stand.cli", "run", recipe, "--config", str(config), "--out", str(out)]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     options = ["--virtual-time", "--report"]
-    return subprocess.run(
-        [*command, *options], capture_output=True, text=True, env=environment, check=False, timeout=timeout_s
-    )
+    return forked.run([*command, *options], capture_output=True, text=True, env=environment, timeout=timeout_s)
 
 
 def run_here(recipe: str, config_text: str, out: Path) -> Result:

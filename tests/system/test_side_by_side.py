@@ -8,6 +8,7 @@ import pytest
 
 from recording.reading.session import Session
 from stand.config.stand_config import packaged
+from tests import forked
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_run import digests
 
@@ -28,7 +29,7 @@ def _aravis() -> None:
 
 def begun(tmp_path: Path, name: str, *arguments: str) -> subprocess.Popen[str]:
     command = [*STAND, *arguments, "--virtual-time", "--out", str(tmp_path / name)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def ended(run: subprocess.Popen[str]) -> Path:
@@ -61,9 +62,7 @@ def test_a_virtual_run_goes_on_and_a_new_one_begins_while_the_laboratory_of_a_ki
     killed.kill()
     killed.communicate()
     (session,) = (tmp_path / "killed").iterdir()
-    resumed = subprocess.Popen(
-        [*STAND, "resume", str(session)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    resumed = forked.popen([*STAND, "resume", str(session)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     new = begun(tmp_path, "new", "run", str(recipe))
     assert ended(resumed) == session
     assert Session.open(session).frame_count == Session.open(ended(new)).frame_count == 2

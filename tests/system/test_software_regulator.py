@@ -16,6 +16,7 @@ from drivers.devices.software_regulator import SoftwareRegulator
 from foundation.errors import DeviceFault, Occupied, Refused
 from stand.daemon.by_hand import ByHand
 from stand.simulator import ControlSocket, Simulator, laboratory_of
+from tests import forked
 from tests.system.regulator_steps import steps_of, tuned_in
 from tests.system.virtual_stand import VirtualStand, bare_config, virtual_stand
 
@@ -199,7 +200,7 @@ async def test_a_process_that_is_stopped_gives_no_heat_after_its_last_pulse(tmp_
     (tmp_path / "stand.yaml").write_text(yaml.safe_dump(data))
     (tmp_path / "recipe.yaml").write_text(RECIPE)
     run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "stand.yaml", "--out", tmp_path / "out"]
-    process = subprocess.Popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
+    process = forked.popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
     try:
         async with asyncio.timeout(LIMIT_S):
             while await plant("heater_W") == 0:

@@ -13,6 +13,7 @@ import yaml
 
 from recording.reading.session import Session
 from stand.running.order import Order
+from tests import forked
 from tests.system.conftest import FAST, require_aravis
 from tests.system.gateway import gateway
 from tests.system.test_unrecorded_heat import SOAK, heater_is, plant
@@ -45,7 +46,7 @@ async def test_after_a_stop_heat_waits_for_readings_taken_since(
         config["bus"]["address"] = through.config.bus.address
         (tmp_path / "through.yaml").write_text(yaml.safe_dump(config))
         run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "through.yaml", "--out", tmp_path / "out"]
-        process = subprocess.Popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
+        process = forked.popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
         asked, answered = list[bytes](), list[bytes]()
 
         def loses(request: bytes) -> bool:

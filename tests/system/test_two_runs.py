@@ -17,6 +17,7 @@ from stand.config.stand_config import load_config
 from stand.running.order import Order
 from stand.serving.client import ask_status, running_sessions
 from stand.simulator import ControlSocket
+from tests import forked
 from tests.stand.test_listening import connected
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF
@@ -33,7 +34,7 @@ def stand(tmp_path: Path) -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
 
     def start(*arguments: str | Path) -> "subprocess.Popen[str]":
         command = [sys.executable, "-m", "stand.cli", *arguments]
-        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        started.append(forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         return started[-1]
 
     yield start
