@@ -1,6 +1,7 @@
 """A run as a table: for every state and everything that may happen in it, what is done next."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -50,7 +51,10 @@ from stand.running.entries import (
     Cooled,
     Due,
     Dwell,
+    Edited,
     Ended,
+    Entry,
+    Extended,
     Gap,
     Held,
     Readying,
@@ -130,7 +134,8 @@ def held_for(begin_s: float, end_s: float, reason: str = OPERATOR) -> list[Held]
     return [Held(int(begin_s * S), reason, True), Held(int(end_s * S), reason, False)]
 
 
-# By name: what happens (its entries), and what of the surroundings is then another. `{}` of a step is the first to do.
+# By name: what happens (its entries), and what of the surroundings is then another. `{}` of a step is the first to do;
+# -1 of an edit is the first step that was not begun.
 EVENTS = {
     "nothing": ([], {}),
     "held": ([Held(10 * S, OPERATOR, True)], {"held": True}),
@@ -146,30 +151,32 @@ EVENTS = {
     "camera back": ([Cooled(10 * S), Restored(15 * S, 1)], {"lost_equilibrium": True}),
     "killed": ([Gap(10 * S, 15 * S)], {"flap_open": False}),
     "left out": ([Skipped(10 * S, "{}")], {}),
+    "longer": ([Extended(10 * S, "{}", 60.0)], {}),
+    "the rest left out": ([Edited(10 * S, -1, [])], {}),
 }
 
 # What is done next: a row for each state, a column for each event, both in the order above.
 NEXT = """
-                 no  he  tr  h5  fs  re  h7  in  cl  rs  co  cb  ki  lo
-fresh            Be  Wa  Wa  Be  Be  Be  Be  Wa  Re  Be  Re  Be  Re  Be
-begun            Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Pe
-soak begun       Ea  Wa  Wa  Ea  Ea  Ea  Ea  Wa  Re  Ea  Re  Ea  Re  Be
-half soaked      Ea  Wa  Wa  Ea  Ea  Ea  Ea  Wa  Re  Ea  Re  Ea  Re  Be
-soaked           Co  Wa  Wa  Co  Co  Co  Co  Wa  Co  Co  Co  Co  Re  Be
-before opening   Be  Wa  Wa  Be  Be  Be  Be  Wa  Re  Be  Re  Eq  Re  Be
-opened           Be  Wa  Wa  Be  OA  Be  Be  Wa  Re  OA  Re  Eq  Re  Be
-capture begun    Ai  Wa  Wa  Ai  OA  Ai  Ai  Wa  Re  OA  Re  Eq  Re  Be
-next is due      TF  Wa  Wa  TF  OA  Ai  TF  Wa  Re  OA  Re  Eq  Re  Be
-next is ahead    Sl  Sl  Sl  Sl  Sl  Ai  TA  Sl  Sl  Sl  Sl  Sl  Re  Be
-one frame        TF  Wa  Wa  TF  OA  Ai  TA  Wa  Re  OA  Re  Eq  Re  Be
-one was lost     Ai  Wa  Wa  Ai  OA  Ai  Ai  Wa  Re  OA  Re  Eq  Re  Be
-all frames       Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Re  Be
-camera off       Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Be
-asked            Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Be
-camera on        Be  Wa  Wa  Be  Be  Be  Be  Wa  SC  Be  SC  Eq  SC  Be
-warming up       TF  Wa  Wa  TF  SC  Ai  SC  Wa  SC  TF  SC  Eq  SC  Be
-checking         Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Pe
-complete         --  --  --  --  --  --  --  --  --  --  --  --  --  --
+                 no  he  tr  h5  fs  re  h7  in  cl  rs  co  cb  ki  lo  lg  ed
+fresh            Be  Wa  Wa  Be  Be  Be  Be  Wa  Re  Be  Re  Be  Re  Be  Be  --
+begun            Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Pe  Pe  Pe
+soak begun       Ea  Wa  Wa  Ea  Ea  Ea  Ea  Wa  Re  Ea  Re  Ea  Re  Be  Ea  Ea
+half soaked      Ea  Wa  Wa  Ea  Ea  Ea  Ea  Wa  Re  Ea  Re  Ea  Re  Be  Ea  Ea
+soaked           Co  Wa  Wa  Co  Co  Co  Co  Wa  Co  Co  Co  Co  Re  Be  Ea  Co
+before opening   Be  Wa  Wa  Be  Be  Be  Be  Wa  Re  Be  Re  Eq  Re  Be  Be  --
+opened           Be  Wa  Wa  Be  OA  Be  Be  Wa  Re  OA  Re  Eq  Re  Be  Be  --
+capture begun    Ai  Wa  Wa  Ai  OA  Ai  Ai  Wa  Re  OA  Re  Eq  Re  Be  Ai  Ai
+next is due      TF  Wa  Wa  TF  OA  Ai  TF  Wa  Re  OA  Re  Eq  Re  Be  TF  TF
+next is ahead    Sl  Sl  Sl  Sl  Sl  Ai  TA  Sl  Sl  Sl  Sl  Sl  Re  Be  Sl  Sl
+one frame        TF  Wa  Wa  TF  OA  Ai  TA  Wa  Re  OA  Re  Eq  Re  Be  TF  TF
+one was lost     Ai  Wa  Wa  Ai  OA  Ai  Ai  Wa  Re  OA  Re  Eq  Re  Be  Ai  Ai
+all frames       Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Co  Re  Be  Co  Co
+camera off       Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Be  Pe  Pe
+asked            Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Be  Pe  Pe
+camera on        Be  Wa  Wa  Be  Be  Be  Be  Wa  SC  Be  SC  Eq  SC  Be  Be  --
+warming up       TF  Wa  Wa  TF  SC  Ai  SC  Wa  SC  TF  SC  Eq  SC  Be  TF  TF
+checking         Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Pe  Pe  Pe
+complete         --  --  --  --  --  --  --  --  --  --  --  --  --  --  --  --
 """
 CODES = {
     "Ai": Aim,
@@ -200,7 +207,14 @@ def met(state: str, event: str) -> tuple[RunState, Surroundings]:
     entries, around = EVENTS[event]
     before = fold(PLAN, STATES[state])
     current = before.plan[before.index].step_id if before.index < len(PLAN) else ""
-    now = [Skipped(entry.time_ns, current) if isinstance(entry, Skipped) else entry for entry in entries]
+    used = [planned.index for planned in PLAN if planned.step_id in before.done | before.begun]
+
+    def placed(entry: Entry) -> Entry:
+        if isinstance(entry, Skipped | Extended):
+            return replace(entry, step_id=current)
+        return replace(entry, from_index=max(used, default=-1) + 1) if isinstance(entry, Edited) else entry
+
+    now = [placed(entry) for entry in entries]
     found = {"now_ns": 20 * S, "flap_open": state in FLAP_OPEN, **around}
     return fold(PLAN, [*STATES[state], *now]), Surroundings(**found)
 
