@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 
 from drivers.sim.laboratory import Laboratory
 from drivers.sim.laboratory_fault import Fault, number, number_or_none
-from drivers.sim.ximc import FakeAxis
-from drivers.sim.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
+from drivers.sim.motion.ximc import FakeAxis
+from drivers.sim.motion.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
 
 AXES = ("linear", "rotary")
 

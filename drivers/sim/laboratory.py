@@ -11,29 +11,29 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.adam_4015 import FakeAdam4015
-from drivers.sim.camera import FakeCamera
-from drivers.sim.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
 from drivers.sim.faults import LinkFaults
-from drivers.sim.flap import FakeFlap
-from drivers.sim.genicam_file import read_genicam
-from drivers.sim.heat_module import FakeHeatModule
+from drivers.sim.gige.camera import FakeCamera
+from drivers.sim.gige.genicam_file import read_genicam
+from drivers.sim.gige.switch import Switch
 from drivers.sim.laboratory_spec import CameraSpec, ChamberUnitSpec, LaboratorySpec
 from drivers.sim.link_faults import Link
-from drivers.sim.modbus import RtuEngine, TcpEngine, Unit
-from drivers.sim.optics import true_centres_px
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.probes import FakeProbe
-from drivers.sim.regulator import FakeRegulator
-from drivers.sim.relays import FakeRelays
-from drivers.sim.rtd_sensors import CHANNELS
-from drivers.sim.scene import Scene, SceneSpec, still
-from drivers.sim.switch import Switch
-from drivers.sim.thermal_imager import FakeThermalImager
-from drivers.sim.thermometers import FakeThermometers
+from drivers.sim.motion.flap import FakeFlap
+from drivers.sim.motion.ximc import FakeAxis
+from drivers.sim.physics.optics import true_centres_px
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.physics.scene import Scene, SceneSpec, still
+from drivers.sim.units.adam_4015 import FakeAdam4015
+from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
+from drivers.sim.units.heat_module import FakeHeatModule
+from drivers.sim.units.modbus import RtuEngine, TcpEngine, Unit
+from drivers.sim.units.probes import FakeProbe
+from drivers.sim.units.regulator import FakeRegulator
+from drivers.sim.units.relays import FakeRelays
+from drivers.sim.units.rtd_sensors import CHANNELS
+from drivers.sim.units.thermal_imager import FakeThermalImager
+from drivers.sim.units.thermometers import FakeThermometers
 from drivers.sim.usb import UsbServer
 from drivers.sim.wire import Engine, PtyWire, TcpWire
-from drivers.sim.ximc import FakeAxis
 from foundation.addresses import tcp_place
 from foundation.clock import FollowedClock, WallClock
 from foundation.errors import ConfigError

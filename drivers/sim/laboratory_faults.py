@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator
 from pydantic import TypeAdapter
 
 from drivers.sim.axis_faults import AXES, axis_faults
-from drivers.sim.flap import ERROR_FEEDBACK_DISCONNECT, ERROR_HARD_OVER_CURRENT, ERROR_NO_POWER
 from drivers.sim.laboratory import Laboratory
 from drivers.sim.laboratory_fault import Fault, Setter, number, number_or_none, once, to
 from drivers.sim.link_faults import LINK_FAULTS, set_link_fault
-from drivers.sim.thermal_imager import SERIAL_NUMBER
+from drivers.sim.motion.flap import ERROR_FEEDBACK_DISCONNECT, ERROR_HARD_OVER_CURRENT, ERROR_NO_POWER
+from drivers.sim.units.thermal_imager import SERIAL_NUMBER
 from foundation.clock import seconds_ns
 
 _AIR = "air"

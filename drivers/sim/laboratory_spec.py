@@ -8,9 +8,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from drivers.sim.optics import CameraKind
-from drivers.sim.probes import ProbeKind
-from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151, Profile
+from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151, Profile
+from drivers.sim.physics.optics import CameraKind
+from drivers.sim.units.probes import ProbeKind
 from foundation.documents import Document
 
 PROFILES = {"8MT160-300": LINEAR_8MT160_300, "8MR151": ROTARY_8MR151}

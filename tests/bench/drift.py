@@ -16,7 +16,7 @@ from compensation.drift.choosing import FORMS, fit
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
-from drivers.sim.optics import CameraKind
+from drivers.sim.physics.optics import CameraKind
 from experiments.steps import Role
 from tests.bench import drift_beyond, drift_bumps, drift_drawn, drift_few, drift_moving
 from tests.bench.figures import Figure, at_most, progress, side_by_side

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.camera import FakeCamera, HEIGHT_px, WIDTH_px
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import RtuEngine, TcpEngine
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.regulator import FakeRegulator
+from drivers.sim.gige.camera import FakeCamera, HEIGHT_px, WIDTH_px
+from drivers.sim.motion.ximc import FakeAxis
+from drivers.sim.motion.ximc_table import LINEAR_8MT160_300
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.modbus import RtuEngine, TcpEngine
+from drivers.sim.units.regulator import FakeRegulator
 from drivers.sim.wire import PtyWire, TcpWire
-from drivers.sim.ximc import FakeAxis
-from drivers.sim.ximc_table import LINEAR_8MT160_300
 from foundation.clock import WallClock
 
 Close = Callable[[], None]

@@ -18,8 +18,8 @@ import numpy as np
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.scene import Scene, SceneSpec
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.physics.scene import Scene, SceneSpec
 from foundation.clock import NS_PER_S
 from foundation.readings import Frame
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.sim.plant import Plant, PlantSpec, STEP_ns
-from drivers.sim.regulator import FakeRegulator
-from drivers.sim.relays import FakeRelays
-from drivers.sim.scene import Scene, SceneSpec
+from drivers.sim.physics.plant import Plant, PlantSpec, STEP_ns
+from drivers.sim.physics.scene import Scene, SceneSpec
+from drivers.sim.units.regulator import FakeRegulator
+from drivers.sim.units.relays import FakeRelays
 from foundation.clock import NS_PER_S, FollowedClock
 from tests.bench.figures import Figure, absolute, milliseconds, progress
 

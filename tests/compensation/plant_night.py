@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from compensation.history.thermal_history import History, refined
 from compensation.observations import Observations, SessionFacts
-from drivers.sim.optics import CameraKind, true_centres_px
-from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.physics.optics import CameraKind, true_centres_px
+from drivers.sim.physics.plant import Plant, PlantSpec
 
 from .synthetic import SIZE, TARGET
 

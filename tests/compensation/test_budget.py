@@ -19,7 +19,7 @@ from compensation.budget.correction import displacement_px, granite_mm, post_mm,
 from compensation.budget.geometry import Geometry, StandState, load_geometry
 from compensation.budget.repeatability import home_residuals
 from compensation.budget.session_temperatures import mean_state
-from drivers.sim import optics
+from drivers.sim.physics import optics
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.errors import ConfigError
 from foundation.hub import Hub

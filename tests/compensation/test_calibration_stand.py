@@ -11,7 +11,7 @@ from compensation.calibration.model_scores import rays_of
 from compensation.calibration.pose import find_pose
 from compensation.calibration.session_centres import Positions
 from compensation.calibration.stage_geometry import TableSigma
-from drivers.sim.optics import Nodes, Optics, Placement, optics_at, true_centres_px
+from drivers.sim.physics.optics import Nodes, Optics, Placement, optics_at, true_centres_px
 from markers.target import load_target
 from stand.config.stand_config import packaged
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import struct
 from contextlib import suppress
 
-from drivers.sim import gvcp, gvsp
-from drivers.sim.camera_registers import Registers
-from drivers.sim.genicam import features
-from drivers.sim.gvcp_device import ControlChannel
+from drivers.sim.gige import gvcp, gvsp
+from drivers.sim.gige.camera_registers import Registers
+from drivers.sim.gige.genicam import features
+from drivers.sim.gige.gvcp_device import ControlChannel
 from tests.drivers.canned_line import Feed, Parser
 
 _MEMORY, _MEMORY_SIZE = 0x10000, 0x400  # of the features

@@ -6,7 +6,7 @@ import numpy as np
 
 from drivers.devices.radiometric_jpeg import NotRadiometric, is_whole, parse
 from drivers.devices.radiometry import temperatures_degC
-from drivers.sim.radiometric import Shot, counts_of, jpeg_of
+from drivers.sim.units.radiometric import Shot, counts_of, jpeg_of
 from tests.drivers.canned_line import Feed, Parser
 
 _SCENE_DEGC = np.linspace(10.0, 50.0, 64).reshape(8, 8)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.sim.modbus import ILLEGAL_ADDRESS, Refusal, Timeline, answer, reads_words, writes_one, writes_words
+from drivers.sim.units.modbus import ILLEGAL_ADDRESS, Refusal, Timeline, answer, reads_words, writes_one, writes_words
 from foundation.clock import NS_PER_S, Now
 
 BAND_K = 5.0

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.devices.camera_gige import Camera
-from drivers.sim.camera import FakeCamera
-from drivers.sim.genicam_file import GenicamFile, read_genicam
+from drivers.sim.gige.camera import FakeCamera
+from drivers.sim.gige.genicam_file import GenicamFile, read_genicam
 from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
 from foundation.errors import ConfigError, Refused

@@ -14,9 +14,9 @@ from drivers.devices.chamber_ascii2 import number, parse
 from drivers.devices.chamber_cts import framed, unframed
 from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
 from drivers.devices.climate_chamber import ClimateChamber
-from drivers.sim.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
 from drivers.sim.faults import LinkFaults
-from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
 from drivers.sim.wire import PtyWire, TcpWire
 from foundation.clock import FollowedClock, WallClock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable

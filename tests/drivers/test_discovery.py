@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from drivers.sim.camera_registers import Registers
-from drivers.sim.genicam import features
-from drivers.sim.gvcp import Command, Request
-from drivers.sim.gvcp_device import ControlChannel
+from drivers.sim.gige.camera_registers import Registers
+from drivers.sim.gige.genicam import features
+from drivers.sim.gige.gvcp import Command, Request
+from drivers.sim.gige.gvcp_device import ControlChannel
 from drivers.wires.discovery import GVCP_PORT, FoundCamera, cameras_at, decode_answer, usb_devices
 from stand.commands.command_table import app
 

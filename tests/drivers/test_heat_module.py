@@ -11,9 +11,9 @@ from pydantic import ValidationError
 
 from drivers.devices.heat_module import HeatModule, HeatModuleSettings
 from drivers.sim.faults import LinkFaults
-from drivers.sim.heat_module import FakeHeatModule
-from drivers.sim.modbus import RtuEngine, TcpEngine, crc16
-from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.heat_module import FakeHeatModule
+from drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
 from drivers.sim.wire import TcpWire
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.modbus_unit import ModbusUnit

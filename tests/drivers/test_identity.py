@@ -11,10 +11,10 @@ from drivers.devices.relays import Relays
 from drivers.devices.thermometers import Thermometers, ThermometerSettings
 from drivers.settings import Identity, same_device
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import TcpEngine
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.relays import FakeRelays
-from drivers.sim.thermometers import FakeThermometers
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.modbus import TcpEngine
+from drivers.sim.units.relays import FakeRelays
+from drivers.sim.units.thermometers import FakeThermometers
 from drivers.sim.wire import TcpWire
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import load_register_map

@@ -10,11 +10,11 @@ import pytest
 
 from drivers.devices.probes import Probe, ProbeSettings
 from drivers.devices.thermometers import Calibration, Thermometers, ThermometerSettings
-from drivers.sim.adam_4015 import FakeAdam4015
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import TcpEngine
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.probes import FakeProbe
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.adam_4015 import FakeAdam4015
+from drivers.sim.units.modbus import TcpEngine
+from drivers.sim.units.probes import FakeProbe
 from drivers.sim.wire import PtyWire, TcpWire
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import load_register_map

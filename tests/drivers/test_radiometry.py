@@ -13,7 +13,7 @@ import pytest
 
 from drivers.devices.radiometric_jpeg import NotRadiometric, is_whole, parse
 from drivers.devices.radiometry import Air, temperatures_degC
-from drivers.sim.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 
 SCENE_DEGC = np.linspace(-15.0, 75.0, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
 SPOTS = {"lens": (80, 60), "housing": (40, 30), "back": (120, 90)}

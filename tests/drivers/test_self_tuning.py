@@ -6,9 +6,9 @@ import pytest
 
 from drivers.devices.regulator import Regulator
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import TcpEngine
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.regulator import FakeRegulator
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.modbus import TcpEngine
+from drivers.sim.units.regulator import FakeRegulator
 from drivers.sim.wire import TcpWire
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import load_register_map

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.devices.thermal_imager import SpotSettings, ThermalImager, ThermalImagerSettings
-from drivers.sim.thermal_imager import FakeThermalImager
+from drivers.sim.units.thermal_imager import FakeThermalImager
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.items import Event, Item, Original
 from foundation.readings import Quality, Reading

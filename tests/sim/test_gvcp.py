@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.sim import gvcp
-from drivers.sim.gvcp import Ack, Command, Malformed, Nack, Request, Resend, Status
+from drivers.sim.gige import gvcp
+from drivers.sim.gige.gvcp import Ack, Command, Malformed, Nack, Request, Resend, Status
 
 # One line per datagram: the bytes, and what they mean. The same table serves encoder and decoder.
 REQUESTS = [

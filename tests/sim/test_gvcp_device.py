@@ -1,10 +1,10 @@
 import pytest
 
-from drivers.sim import gvcp
-from drivers.sim.camera_registers import Registers
-from drivers.sim.genicam import features
-from drivers.sim.gvcp import Ack, Command, Nack, Request, Resend, Status
-from drivers.sim.gvcp_device import CCP, ControlChannel
+from drivers.sim.gige import gvcp
+from drivers.sim.gige.camera_registers import Registers
+from drivers.sim.gige.genicam import features
+from drivers.sim.gige.gvcp import Ack, Command, Nack, Request, Resend, Status
+from drivers.sim.gige.gvcp_device import CCP, ControlChannel
 
 ALICE, BOB = ("127.0.0.1", 40001), ("127.0.0.1", 40002)
 PACKET_SIZE = 0x0D04

@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.sim import gvsp
-from drivers.sim.gvsp import Block, Kind, Leader, Malformed, Packet, PixelFormat
+from drivers.sim.gige import gvsp
+from drivers.sim.gige.gvsp import Block, Kind, Leader, Malformed, Packet, PixelFormat
 
 PACKETS = [
     ("0000 0001 01000000", Packet(Kind.LEADER, 1, 0)),

@@ -21,8 +21,8 @@ from pathlib import Path
 from foundation.clock import WallClock
 from drivers.sim.faults import LinkFaults
 from drivers.sim.wire import PtyWire, TcpWire
-from drivers.sim.ximc import FakeAxis
-from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from drivers.sim.motion.ximc import FakeAxis
+from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 
 class Laboratory:
     lock = threading.RLock()

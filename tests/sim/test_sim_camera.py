@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.sim import gvcp, gvsp
-from drivers.sim.camera import FakeCamera
-from drivers.sim.genicam import features
-from drivers.sim.gvcp import Ack, Command, Request, Resend, Status
-from drivers.sim.gvsp import Kind, Packet
-from drivers.sim.gvsp_sender import CameraFaults
+from drivers.sim.gige import gvcp, gvsp
+from drivers.sim.gige.camera import FakeCamera
+from drivers.sim.gige.genicam import features
+from drivers.sim.gige.gvcp import Ack, Command, Request, Resend, Status
+from drivers.sim.gige.gvsp import Kind, Packet
+from drivers.sim.gige.gvsp_sender import CameraFaults
 from foundation.clock import FollowedClock, seconds_ns
 from tests.addresses import camera_address
 

@@ -7,14 +7,14 @@ from typing import cast
 
 import pytest
 
-from drivers.sim.flap import (
+from drivers.sim.motion.flap import (
     ERROR_AWAITING_COMMAND,
     ERROR_FEEDBACK_DISCONNECT,
     ERROR_NO_POWER,
     ERROR_SOFT_OVER_CURRENT,
     FakeFlap,
 )
-from drivers.sim.plant import Plant
+from drivers.sim.physics.plant import Plant
 from drivers.sim.usb import Stall, TimedOut
 from foundation.clock import FollowedClock, seconds_ns
 

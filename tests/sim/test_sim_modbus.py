@@ -14,7 +14,7 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import (
+from drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     Refusal,
     RtuEngine,

@@ -9,9 +9,9 @@ from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import RtuEngine
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.relays import FakeRelays
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.modbus import RtuEngine
+from drivers.sim.units.relays import FakeRelays
 from drivers.sim.wire import PtyWire
 from foundation.clock import FollowedClock, seconds_ns
 

@@ -9,9 +9,9 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import RtuEngine, TcpEngine, crc16
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.thermometers import FakeThermometers
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
+from drivers.sim.units.thermometers import FakeThermometers
 from drivers.sim.wire import TcpWire
 from foundation.clock import FollowedClock, seconds_ns
 

@@ -7,9 +7,9 @@ from typing import Literal, NamedTuple, cast
 
 import pytest
 
-from drivers.sim.plant import Plant
-from drivers.sim.ximc import FakeAxis
-from drivers.sim.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from drivers.sim.motion.ximc import FakeAxis
+from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from drivers.sim.physics.plant import Plant
 from drivers.wires.ximc import Damage, decode, encode
 from foundation.clock import FollowedClock, seconds_ns
 

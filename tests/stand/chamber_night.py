@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.regulator import FakeRegulator
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.regulator import FakeRegulator
 from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from drivers.sim.plant import Plant, PlantSpec
-from drivers.sim.regulator import FakeRegulator
-from drivers.sim.thermometers import FakeThermometers
+from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units.regulator import FakeRegulator
+from drivers.sim.units.thermometers import FakeThermometers
 from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch

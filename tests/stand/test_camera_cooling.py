@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import pytest
 
-from drivers.sim.plant import Plant, PlantSpec
+from drivers.sim.physics.plant import Plant, PlantSpec
 from experiments.steps import CoolDown, estimate_s
 from experiments.warm_up import WarmUp
 from foundation.clock import VirtualClock, seconds_ns

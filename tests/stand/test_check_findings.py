@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.devices.thermal_imager import ThermalImagerSettings
-from drivers.sim.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 from stand.commissioning.camera_line_check import packet_finding
 from stand.commissioning.imager import imager_finding
 

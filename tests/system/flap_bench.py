@@ -11,8 +11,8 @@ from typing import cast
 from usb.core import USBError
 
 from drivers.devices.flap import Flap, FlapSettings
-from drivers.sim.flap import MAX_DUTY_FORWARD, FakeFlap
-from drivers.sim.plant import Plant
+from drivers.sim.motion.flap import MAX_DUTY_FORWARD, FakeFlap
+from drivers.sim.physics.plant import Plant
 from drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer
 from foundation.clock import FollowedClock, VirtualClock, seconds_ns
 from foundation.readings import Quality, Reading

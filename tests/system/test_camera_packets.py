@@ -7,8 +7,8 @@ from collections.abc import AsyncGenerator
 import pytest
 
 from drivers.devices.camera_gige import Camera
-from drivers.sim.camera import FakeCamera
-from drivers.sim.gvsp_sender import StreamSender
+from drivers.sim.gige.camera import FakeCamera
+from drivers.sim.gige.gvsp_sender import StreamSender
 from drivers.wires import camera_connection
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.errors import Unreachable

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.devices.camera_gige import Camera
-from drivers.sim.camera import FakeCamera
+from drivers.sim.gige.camera import FakeCamera
 from drivers.wires.aravis_library import library
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns

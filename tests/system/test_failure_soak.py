@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from drivers.sim.faults import LinkFaults
-from drivers.sim.modbus import Handler, RtuEngine, TcpEngine, answer, reads_bits, reads_words
+from drivers.sim.units.modbus import Handler, RtuEngine, TcpEngine, answer, reads_bits, reads_words
 from drivers.sim.wire import PtyWire, TcpWire
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import Space

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from drivers.devices.flap import Flap
-from drivers.sim.flap import (
+from drivers.sim.motion.flap import (
     ERROR_FEEDBACK_DISCONNECT,
     ERROR_HARD_OVER_CURRENT,
     ERROR_NO_POWER,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sim.switch import Switch
+from drivers.sim.gige.switch import Switch
 from foundation.clock import WallClock
 from foundation.hub import Hub
 from stand.assembly import assemble

@@ -11,7 +11,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
-from drivers.sim.kinematics import Pace, Path, path_onward, path_to, path_to_halt, rest
+from drivers.sim.motion.kinematics import Pace, Path, path_onward, path_to, path_to_halt, rest
 from foundation.clock import NS_PER_S, seconds_ns
 
 LEFT, RIGHT = -1, 1

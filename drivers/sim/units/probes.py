@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from typing import Literal
 
-from drivers.sim.plant import Plant
+from drivers.sim.physics.plant import Plant
 from foundation.clock import Now
 
 ProbeKind = Literal["hart", "vaisala"]

@@ -14,16 +14,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim import gvcp, gvsp
-from drivers.sim.camera_registers import Registers
-from drivers.sim.camera_schedule import Schedule, Shot
-from drivers.sim.dressed_registers import DressedRegisters
-from drivers.sim.genicam import TICKS_PER_S, features
-from drivers.sim.genicam_file import GenicamFile
-from drivers.sim.gvcp import Nack, Resend, Status
-from drivers.sim.gvcp_device import ControlChannel, Peer
-from drivers.sim.gvsp_pixels import binned, encoded
-from drivers.sim.gvsp_sender import CameraFaults, StreamCounts, StreamSender
+from drivers.sim.gige import gvcp, gvsp
+from drivers.sim.gige.camera_registers import Registers
+from drivers.sim.gige.camera_schedule import Schedule, Shot
+from drivers.sim.gige.dressed_registers import DressedRegisters
+from drivers.sim.gige.genicam import TICKS_PER_S, features
+from drivers.sim.gige.genicam_file import GenicamFile
+from drivers.sim.gige.gvcp import Nack, Resend, Status
+from drivers.sim.gige.gvcp_device import ControlChannel, Peer
+from drivers.sim.gige.gvsp_pixels import binned, encoded
+from drivers.sim.gige.gvsp_sender import CameraFaults, StreamCounts, StreamSender
 from foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 
 Render = Callable[[int, float, float, int], NDArray[np.uint8]]
@@ -38,7 +38,7 @@ _TIMING = ("ExposureTime", "AcquisitionFrameRate", "AcquisitionFrameRateEnable",
 
 
 class CameraPlant(Protocol):
-    """What the camera needs of drivers.sim.plant.Plant."""
+    """What the camera needs of drivers.sim.physics.plant.Plant."""
 
     sensor_degC: float
     body_degC: float

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator
 
-from drivers.sim.genicam_memory import Evaluated
+from drivers.sim.gige.genicam_memory import Evaluated
 from drivers.wires.aravis_library import AravisError
 
 # What a camera of these wants is there: enumerations with the entries that matter, from the GenICam files of 12 makes.

@@ -17,9 +17,9 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.sim.bouc_wen import BoucWen
-from drivers.sim.chamber_spec import ChamberSpec, drawn
-from drivers.sim.optics import CameraKind, Nodes, Optics, Placement, optics_at
+from drivers.sim.physics.bouc_wen import BoucWen
+from drivers.sim.physics.chamber_spec import ChamberSpec, drawn
+from drivers.sim.physics.optics import CameraKind, Nodes, Optics, Placement, optics_at
 
 NS_PER_S = 1_000_000_000
 STEP_s = 0.5

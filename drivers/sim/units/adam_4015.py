@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.sim.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, Refusal, reads_words, writes_one
-from drivers.sim.rtd_sensors import CHANNELS, Places, RtdModule, check_span
+from drivers.sim.units.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, Refusal, reads_words, writes_one
+from drivers.sim.units.rtd_sensors import CHANNELS, Places, RtdModule, check_span
 from foundation.clock import Now
 
 VALUES, TYPE_CODES, NAME = 0, 200, 210  # 40001, 40201, 40211

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.modbus import Timeline
-from drivers.sim.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from drivers.sim.units.modbus import Timeline
+from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 from foundation.clock import NS_PER_S, seconds_ns
 
 SERIAL_NUMBER = "49001234"

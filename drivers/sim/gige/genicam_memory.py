@@ -11,7 +11,7 @@ import functools
 from contextlib import suppress
 from typing import Any
 
-from drivers.sim.genicam_file import GenicamFile
+from drivers.sim.gige.genicam_file import GenicamFile
 from drivers.wires.aravis_library import AravisError, library
 
 _PAGE_bytes = 4096

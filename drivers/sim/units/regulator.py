@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from enum import IntEnum
 from typing import Protocol
 
-from drivers.sim import self_tuning
-from drivers.sim.modbus import (
+from drivers.sim.units import self_tuning
+from drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
     OPERATION_ERROR,
@@ -24,8 +24,8 @@ from drivers.sim.modbus import (
     writes_one,
     writes_words,
 )
-from drivers.sim.pid import OFF, Gains, Outputs, PidState, Side, on_time_ns, resume, start, step
-from drivers.sim.regulator_table import (
+from drivers.sim.units.pid import OFF, Gains, Outputs, PidState, Side, on_time_ns, resume, start, step
+from drivers.sim.units.regulator_table import (
     COOL_BAND,
     COOL_DERIVATIVE,
     COOL_INTEGRAL,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import struct
 
-from drivers.sim import ximc_table as table
-from drivers.sim.kinematics import Pace
-from drivers.sim.stepper import LEFT, RIGHT, Leg, Run, Shift, Stops
+from drivers.sim.motion import ximc_table as table
+from drivers.sim.motion.kinematics import Pace
+from drivers.sim.motion.stepper import LEFT, RIGHT, Leg, Run, Shift, Stops
 from foundation.clock import seconds_ns
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.sim.modbus import Timeline
+from drivers.sim.units.modbus import Timeline
 from foundation.clock import NS_PER_S, Now
 
 BAND_K = 3.0

@@ -10,12 +10,12 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 
-from drivers.sim.camera_registers import Registers
-from drivers.sim.genicam import Feature
-from drivers.sim.genicam_file import GenicamFile
-from drivers.sim.genicam_memory import Evaluated
-from drivers.sim.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
-from drivers.sim.gvsp import PixelFormat
+from drivers.sim.gige.camera_registers import Registers
+from drivers.sim.gige.genicam import Feature
+from drivers.sim.gige.genicam_file import GenicamFile
+from drivers.sim.gige.genicam_memory import Evaluated
+from drivers.sim.gige.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
+from drivers.sim.gige.gvsp import PixelFormat
 from drivers.wires.aravis_library import AravisError
 
 XML_ADDRESS = 0x7E000000  # no register of the makes known lies there

@@ -14,7 +14,7 @@ from drivers.sim.usb import Stall, TimedOut
 from foundation.clock import NS_PER_S, Now
 
 if TYPE_CHECKING:
-    from drivers.sim.plant import Plant
+    from drivers.sim.physics.plant import Plant
 
 VENDOR_ID, PRODUCT_ID_21V3 = 0x1FFB, 0x00C5
 FULL_SCALE = 4095

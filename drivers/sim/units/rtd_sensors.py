@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.sim.modbus import ILLEGAL_ADDRESS, Handler, Refusal, Timeline, answer
+from drivers.sim.units.modbus import ILLEGAL_ADDRESS, Handler, Refusal, Timeline, answer
 from foundation.clock import Now
 
 CHANNELS = 6

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.sim.modbus import (
+from drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
@@ -17,7 +17,7 @@ from drivers.sim.modbus import (
     reads_words,
     writes_one,
 )
-from drivers.sim.rtd_sensors import CHANNELS, Places, RtdModule, check_span
+from drivers.sim.units.rtd_sensors import CHANNELS, Places, RtdModule, check_span
 from foundation.clock import Now
 
 FAULT_BITS = 0x80

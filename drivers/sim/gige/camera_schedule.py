@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.sim.camera_registers import Registers
-from drivers.sim.genicam import MAX_RATE_Hz
+from drivers.sim.gige.camera_registers import Registers
+from drivers.sim.gige.genicam import MAX_RATE_Hz
 from foundation.clock import NS_PER_S
 
 _IDLE_ns = NS_PER_S

@@ -1,0 +1,1 @@
+"""Simulated motion: stages with their XIMC controllers, and the flap with its USB controller."""
