@@ -75,11 +75,12 @@ def gather(
     Saturated ones get the share 0 (glare), unless they are a quarter of the ground or of the disc: then the picture
     is overexposed, and clipping shifts the outline but not the centre.
     """
-    height, width, size = image.shape
-    table, count = pixels.table, pixels.counts
+    height, width, _ = image.shape
+    count = pixels.counts
     count[:] = 0
     seen, cut = 0, False
     burnt, side = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    levels = (limits.core_out**2, 1.0, limits.core_in**2)
     reach = limits.ground * scale * math.sqrt(shape[0] / (shape[0] * shape[2] - shape[1] * shape[1]))
     for row in range(math.ceil(centre[1] - reach), math.floor(centre[1] + reach) + 1):
         y = (row - centre[1]) / scale
@@ -92,29 +93,50 @@ def gather(
         if row < 0 or row >= height:
             continue
         for begin, end in ((first, min(last, hole_first - 1)), (max(first, hole_last + 1), last)):
-            for column in range(max(begin, 0), min(end, width - 1) + 1):
-                x = (column - centre[0]) / scale
-                q = shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y
-                region = GROUND if q > limits.core_out**2 else DISC if q < limits.core_in**2 else CORE
-                slot = count[region]
-                if slot == table.shape[2]:
+            begin, end = max(begin, 0), min(end, width - 1) + 1
+            while begin < end:
+                depth = _depth(begin, centre[0], shape, scale, y, levels)
+                behind = begin + 1
+                while behind < end and _depth(behind, centre[0], shape, scale, y, levels) == depth:
+                    behind += 1
+                region = GROUND if depth == 0 else DISC if depth == 3 else CORE
+                if count[region] + behind - begin > pixels.table.shape[2]:
                     return Gathered(-1, -1, cut)
-                count[region] += 1
-                table[region, U, slot] = column
-                table[region, V, slot] = row
-                value = int(image[row, column, 0])
-                if size == 2:
-                    value += int(image[row, column, 1]) << 8
-                table[region, VALUE, slot] = value
-                table[region, SHARE, slot] = 1.0
-                outside = 1 if q > 1 else 0
-                seen += 1
-                side[outside] += 1
-                burnt[outside] += value >= ceiling
+                outside = 1 if depth < 2 else 0
+                seen += behind - begin
+                side[outside] += behind - begin
+                burnt[outside] += _copy_run(image, row, begin, behind, ceiling, pixels.table[region], count[region])
+                count[region] += behind - begin
+                begin = behind
     if burnt[0] + burnt[1] > 0:
         clipped = burnt[0] > CLIPPED_PART * side[0], burnt[1] > CLIPPED_PART * side[1]
         _set_burnt_aside(pixels, centre, shape, scale, ceiling, clipped)
     return Gathered(seen, burnt[0] + burnt[1], cut)
+
+
+@compiled
+def _depth(column: int, cx: float, shape: Float, scale: float, y: float, levels: tuple[float, float, float]) -> int:
+    """How many of the levels, F squared, a pixel is inside of."""
+    x = (column - cx) / scale
+    q = shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y
+    return (q <= levels[0]) + (q <= levels[1]) + (q <= levels[2])
+
+
+@compiled
+def _copy_run(image: Bytes, row: int, begin: int, end: int, ceiling: int, table: Float, slot: int) -> int:
+    """Write the pixels of a row into the table from `slot` on; how many of them are saturated."""
+    burnt, two_bytes, at = 0, image.shape[2] == 2, np.uint64(slot)
+    for column in range(np.uint64(begin), np.uint64(end)):  # unsigned: an index that may be negative is looked at twice
+        value = np.int64(image[row, column, 0])
+        if two_bytes:
+            value |= np.int64(image[row, column, 1]) << 8
+        table[U, at] = column
+        table[V, at] = row
+        table[VALUE, at] = value
+        table[SHARE, at] = 1.0
+        at += np.uint64(1)
+        burnt += value >= ceiling
+    return int(burnt)
 
 
 @compiled

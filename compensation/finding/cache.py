@@ -1,8 +1,9 @@
 """Markers found once are kept, by the content they were found in: a copied or renamed session finds them, too.
 
-The key is the SHA-256 of the segment's bytes, the range of time, the target, the noise, and the program text that
-finds markers: a changed program searches again. Files are in $XDG_CACHE_HOME/thermostand/markers, or ~/.cache; delete
-them at will.
+The key is made of the frames' instants, lengths and CRCs, as the heads of their chunks say them, the target, the noise,
+and the program text that finds markers: a changed program searches again. The frames themselves were compared with
+their CRCs when their markers were found, and are not read again. Files are in $XDG_CACHE_HOME/thermostand/markers, or
+~/.cache; delete them at will.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import hashlib
 import os
 import tempfile
 import zipfile
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields
 from functools import cache
@@ -22,8 +24,7 @@ import numpy as np
 import markers
 import markers.target
 from compensation.finding.piece import FoundMarkers, Piece
-
-_BLOCK_BYTES = 1 << 20
+from recording.format.records import FramePlace, frame_crcs
 
 
 def cache_folder() -> Path:
@@ -32,19 +33,14 @@ def cache_folder() -> Path:
     return Path(home) / "thermostand" / "markers"
 
 
-def key_of(piece: Piece, content: str) -> str:
-    """The name under which the piece's markers are kept; `content` is its segment's (content_of)."""
-    parts = (content, piece.begin_ns, piece.end_ns, piece.target.model_dump_json(), piece.noise, _program())
+def key_of(piece: Piece, places: Sequence[FramePlace]) -> str:
+    """The name under which the piece's markers are kept; `places` are the frames of its segment. SessionError when it
+    cannot be read."""
+    own = piece.places_of(places)
+    crcs = frame_crcs(piece.segment, own)
+    frames = [(place.time_ns, place.chunk.length, crc) for place, crc in zip(own, crcs, strict=True)]
+    parts = (frames, piece.target.model_dump_json(), piece.noise, _program())
     return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-def content_of(segment: Path) -> str:
-    """SHA-256 of the file; OSError."""
-    digest = hashlib.sha256()
-    with segment.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def kept(folder: Path, key: str) -> FoundMarkers | None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from compensation.finding.cache import cache_folder, content_of, keep, kept, key_of
-from compensation.finding.piece import FoundMarkers, Piece
+from compensation.finding.cache import cache_folder, keep, kept, key_of
+from compensation.finding.piece import FoundMarkers, Piece, frames_in_order
 from compensation.finding.workers import Work, in_processes, in_turn, on_cluster
 from foundation.errors import ConfigError
 
@@ -22,8 +22,8 @@ class Finder:
 
     def __call__(self, pieces: Sequence[Piece], report: Callable[[int], None]) -> list[FoundMarkers]:
         """The markers of each piece; `report` gets the number of frames done."""
-        content = cache(content_of)
-        keys = ["" if self.folder is None else key_of(piece, content(piece.segment)) for piece in pieces]
+        places_in = cache(frames_in_order)
+        keys = ["" if self.folder is None else key_of(piece, places_in(piece.segment)) for piece in pieces]
         results = [None if self.folder is None else kept(self.folder, key) for key in keys]
         missing = [index for index, result in enumerate(results) if result is None]
         done = sum(piece.frames for piece, result in zip(pieces, results, strict=True) if result is not None)

@@ -7,10 +7,11 @@ machine, and after any other piece.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -47,6 +48,14 @@ class Piece:
     noise: Noise | None
     others_ns: frozenset[int] = frozenset()
 
+    def places_of(self, places: Sequence[FramePlace]) -> list[FramePlace]:
+        """Its own among the segment's frames."""
+        return [
+            place
+            for place in places
+            if self.begin_ns <= place.time_ns <= self.end_ns and place.time_ns not in self.others_ns
+        ]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundMarkers:
@@ -73,7 +82,7 @@ def pieces_of(
     pieces: list[Piece] = []
     others = others_ns(session)
     for segment in session.frame_segments:
-        places = [place for place in _in_order(segment) if place.time_ns not in others]
+        places = [place for place in frames_in_order(segment) if place.time_ns not in others]
         for first in range(0, len(places), frames_per_piece):
             part = places[first : first + frames_per_piece]
             begin_ns, end_ns = part[0].time_ns, part[-1].time_ns
@@ -120,25 +129,28 @@ def joined(parts: list[FoundMarkers]) -> FoundMarkers:
 
 
 def _images(piece: Piece) -> Iterator[tuple[Message, ImageArray]]:
-    for place in _in_order(piece.segment):
-        if piece.begin_ns <= place.time_ns <= piece.end_ns and place.time_ns not in piece.others_ns:
-            try:
-                message = read_frame(place)
-                with naming(place.path):
-                    image = _decoded(place.schema, message.data)
-            except SessionError as error:
-                raise SessionError(f"{error}; this was the frame of {utc_text(place.time_ns)}") from error
-            yield message, image
+    """Each frame as it is recorded, and its image, which is gone when the next one is asked for."""
+    room: NDArray[np.uint8] | None = None
+    for place in piece.places_of(frames_in_order(piece.segment)):
+        try:
+            message = read_frame(place)
+            with naming(place.path):
+                image = _decoded(place.schema, message.data, room)
+        except SessionError as error:
+            raise SessionError(f"{error}; this was the frame of {utc_text(place.time_ns)}") from error
+        room = cast(NDArray[np.uint8], image) if image.dtype == np.uint8 and image.flags.writeable else None
+        yield message, image
 
 
-def _decoded(schema: str, data: bytes) -> ImageArray:
+def _decoded(schema: str, data: bytes, room: NDArray[np.uint8] | None) -> ImageArray:
     if schema != CompressedImage.DESCRIPTOR.full_name:
         return decode_image(schema, data).pixels
     try:
-        return decode_rows(CompressedImage.FromString(data).data)
+        return decode_rows(CompressedImage.FromString(data).data, room)
     except DecodeError as error:
         raise SessionError(f"an image message cannot be read ({error})") from error
 
 
-def _in_order(segment: Path) -> list[FramePlace]:
+def frames_in_order(segment: Path) -> list[FramePlace]:
+    """The segment's frames in order of time, of all cameras."""
     return sorted(frame_places(segment), key=attrgetter("time_ns"))

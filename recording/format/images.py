@@ -21,6 +21,7 @@ import zlib
 from collections.abc import Iterator
 from typing import Literal, NamedTuple, cast
 
+import deflate
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -60,6 +61,8 @@ MOST_WINDOWS = 10_000
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 HEADER = struct.Struct(">IIBBBBB")  # width, height, bit depth, colour type, compression, filter, interlace
+_CHUNK_HEAD = struct.Struct(">I4s")  # length of the contents, kind
+_CHUNK_CRC = struct.Struct(">I")
 HEADER_END = len(SIGNATURE) + 8 + HEADER.size + 4
 GREATEST_DEFLATION = 1032  # deflate cannot make less than 1 byte of so many
 WINDOWS_TEXT = re.compile(rb"\d{1,9},\d{1,9},\d{1,9},\d{1,9}(;\d{1,9},\d{1,9},\d{1,9},\d{1,9})*", re.ASCII)
@@ -259,11 +262,11 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, memoryview]]:
     while kind != b"IEND":
         if begin + 12 > len(data):
             raise SessionError("a recorded image is cut off")
-        size = int.from_bytes(view[begin : begin + 4], "big")
-        kind, end = bytes(view[begin + 4 : begin + 8]), begin + 12 + size
+        size, kind = _CHUNK_HEAD.unpack_from(data, begin)
+        end = begin + 12 + size
         if end > len(data):
             raise SessionError("a recorded image is cut off")
-        if zlib.crc32(view[begin + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+        if deflate.crc32(view[begin + 4 : end - 4]) != _CHUNK_CRC.unpack_from(data, end - 4)[0]:
             raise SessionError("a recorded image is damaged: a checksum is wrong")
         yield kind, view[begin + 8 : end - 4], view[begin:end]
         begin = end

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -35,6 +35,7 @@ from recording.format.mcap_bytes import (
 from recording.format.messages import CLASSES
 from recording.format.summary import ChunkPlace, Summary, read_summary
 
+_CHUNK_HEAD_BYTES = 64
 _FRAME_HEAD_BYTES = 1 << 14  # schema, channel and what precedes the image; 3 KiB in the first chunk, 90 bytes in others
 SCHEMAS = {
     CAMERA_IMAGE: {image.DESCRIPTOR.full_name for image in IMAGE_CLASS.values()},
@@ -239,6 +240,23 @@ def frame_places(path: Path) -> list[FramePlace]:
         return places
 
 
+def frame_crcs(path: Path, places: Sequence[FramePlace]) -> list[int]:
+    """The CRCs that frames of one segment are said to have, by the heads of their chunks; no frame is read."""
+    with reading(path), path.open("rb", buffering=0) as file:
+        return [_frame_chunk(file, place.chunk, _CHUNK_HEAD_BYTES)[1].crc for place in places]
+
+
+def _frame_chunk(file: BinaryIO, chunk: ChunkPlace, size: int) -> tuple[bytes, ChunkHead]:
+    """The first bytes of a frame's chunk, and its head."""
+    data = _read(file, chunk.offset, min(chunk.length, size))
+    _check_place(data, chunk)
+    head = chunk_head(memoryview(data)[RECORD.size :], chunk.length - RECORD.size)
+    _check_times(head, chunk)
+    if head.compression:
+        raise ValueError("a frame's chunk is compressed")
+    return data, head
+
+
 def read_frame(place: FramePlace) -> Message:
     """The image message at its place: the last record of its chunk, behind at most its schema and channel.
 
@@ -246,12 +264,7 @@ def read_frame(place: FramePlace) -> Message:
     """
     chunk = place.chunk
     with reading(place.path), place.path.open("rb", buffering=0) as file:
-        data = _read(file, chunk.offset, min(chunk.length, _FRAME_HEAD_BYTES))
-        _check_place(data, chunk)
-        head = chunk_head(memoryview(data)[RECORD.size :], chunk.length - RECORD.size)
-        _check_times(head, chunk)
-        if head.compression:
-            raise ValueError("a frame's chunk is compressed")
+        data, head = _frame_chunk(file, chunk, _FRAME_HEAD_BYTES)
         content_begin = RECORD.size + head.begin
         begin = _image_record(data, content_begin)
         _, length, number = _MESSAGE_START.unpack_from(data, begin)

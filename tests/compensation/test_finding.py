@@ -22,9 +22,14 @@ from compensation.finding.workers import in_processes, in_turn, on_cluster
 from compensation.observations import session_target
 from foundation.errors import ConfigError, SessionError
 from markers.noise import Noise
+from recording.format.mcap_bytes import RECORD
+from recording.format.records import frame_places
 from recording.reading.session import Session
 
 from .conftest import Recorded
+
+CRC_AT = 24  # in a chunk's record, behind two instants and a size
+HEAD_BYTES = 64
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +174,9 @@ def test_what_was_found_is_kept_also_for_a_copy_elsewhere(
 def test_another_content_target_noise_or_range_is_found_anew(pieces: list[Piece], tmp_path: Path):
     Finder(in_turn, tmp_path / "kept")(pieces[:1], lambda done: None)
     changed = tmp_path / "changed.mcap"
-    changed.write_bytes(pieces[0].segment.read_bytes() + b" ")
+    content = bytearray(pieces[0].segment.read_bytes())
+    content[frame_places(pieces[0].segment)[2].chunk.offset + RECORD.size + CRC_AT] ^= 1
+    changed.write_bytes(content)
     others = [
         replace(pieces[0], segment=changed),
         replace(pieces[0], target=pieces[0].target.model_copy(update={"pitch_mm": 31.0})),
@@ -180,6 +187,22 @@ def test_another_content_target_noise_or_range_is_found_anew(pieces: list[Piece]
         with pytest.raises(AssertionError, match="1 pieces are not kept"):
             Finder(nobody, tmp_path / "kept")([other], lambda done: None)
     Finder(nobody, tmp_path / "kept")(pieces[:1], lambda done: None)
+
+
+def test_frames_whose_markers_are_kept_are_not_read_again(
+    pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
+):
+    pieces = [piece for piece in pieces if piece.segment == pieces[0].segment]
+    Finder(in_turn, tmp_path / "kept")(pieces, lambda done: None)
+    content = bytearray(pieces[0].segment.read_bytes())
+    for place in frame_places(pieces[0].segment):
+        begin, end = place.chunk.offset + HEAD_BYTES, place.chunk.offset + place.chunk.length
+        content[begin:end] = bytes(end - begin)
+    emptied = tmp_path / "emptied.mcap"
+    emptied.write_bytes(content)
+    again = Finder(nobody, tmp_path / "kept")([replace(piece, segment=emptied) for piece in pieces], lambda done: None)
+    for found, expected in zip(again, serial, strict=False):
+        assert_same(found, expected)
 
 
 def test_what_is_kept_but_damaged_is_found_anew(pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path):
