@@ -54,7 +54,8 @@ class SensorsConfig(Document):
     warning, one above trip_K for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A
     thermometer that is exactly constant for stuck_after_s is a warning; the regulator's value constant for
     pv_stuck_after_s while the air goes air_moves_K is a fault. A thermometer that goes more than jump_K within
-    jump_within_s from one reading to the next is a warning: a contact, a cable, not a temperature.
+    jump_within_s from one reading to the next is a warning: a contact, a cable, not a temperature. drift_K: a change of
+    the difference of two in the same air, at a set-point that is held again, is a warning.
     """
 
     warn_K: float = Field(default=3.0, gt=0, le=20)
@@ -66,6 +67,7 @@ class SensorsConfig(Document):
     air_moves_K: float = Field(default=1.0, gt=0, le=20)
     jump_K: float = Field(default=2.0, gt=0, le=50)
     jump_within_s: float = Field(default=15.0, gt=0, le=600)
+    drift_K: float = Field(default=0.1, gt=0, le=5)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

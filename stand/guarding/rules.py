@@ -12,6 +12,7 @@ from stand.config.dew import dew_point_degC
 from stand.config.stand_config import StandConfig
 from stand.fault import Action, Readings, value_of
 from stand.gate import OPERATOR
+from stand.guarding.drifting import drifting
 from stand.guarding.felt_air import camera_feels, granite_feels
 from stand.guarding.first_heat import first_heat
 from stand.guarding.frozen import frozen, stale_by_air
@@ -55,7 +56,8 @@ PV, AIR, GRANITE, LABORATORY = (
     "thermometers.laboratory",
 )
 RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
-FLAP = "flap.position"
+FLAP, SET_POINT = "flap.position", "regulator.sp"
+_PV_K = 0.1  # that a regulator shows
 _CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
 _DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
 
@@ -103,6 +105,7 @@ def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
         *_temperatures(config),
         *_heat(config),
         *_sensors(config),
+        *_drifts(config),
         *_independent(config),
         *_operations(config, announced),
         *_contacts(config),
@@ -154,6 +157,18 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
             Watch(jumped(f"thermometers.{name}", limits.jump_K, limits.jump_within_s), action="warn")
             for name in config.sensors
         ),
+    )
+
+
+def _drifts(config: StandConfig) -> tuple[Watch, ...]:
+    """The air's thermometer against others in that air: `safety` ones, and the regulator's probe, which shows 0.1 K and
+    sits beside the heater, where it has one."""
+    same, limit_K = (FLAP, "relays.camera_power"), config.guard.sensors.drift_K
+    others = dict.fromkeys(safety_thermometers(config), limit_K)
+    if config.regulator_unit is not None:
+        others[PV] = limit_K + _PV_K
+    return tuple(
+        Watch(drifting(AIR, other, SET_POINT, same, most_K), action="warn") for other, most_K in others.items()
     )
 
 
