@@ -42,8 +42,9 @@ class ThermalState:
     """The thermal state of one camera, followed from sample to sample.
 
     It begins, and begins again after a gap, in equilibrium: lags of temperatures at these temperatures, lags of the
-    power at the part of its self-heating that the camera shows. Unless the camera is as cold as the air, that is a
-    guess, which is forgotten after about three of the time constants. camera_degC, air_degC: the last ones.
+    power at the part of its self-heating that the camera shows. Unless the camera is as cold as the air when it is
+    first seen, or when it is switched on after it was unpowered until then, that is a guess, which is forgotten after
+    about three of the time constants. camera_degC, air_degC: the last ones.
     ambient_lag, power_lag, camera_lag: the 10 min lag, then one for each of taus_s. plays: one for each of plays_K.
     settled_s: how long ago the state was a guess. on_s: since the camera was switched on. begun: False in a gap.
     """
@@ -55,7 +56,7 @@ class ThermalState:
         self._radii_K = np.array(plays_K, float)
         self._self_heating_K = self_heating_K
         self._dt_s = self._gained = math.nan
-        self.begun = False
+        self.begun = self._unseen = False
         self.settled_s = self.on_s = self.air_degC = self.camera_degC = math.nan
         self.ambient_lag = self.power_lag = self.camera_lag = np.full(len(self._taus_s), math.nan)
         self.plays = np.full(len(self._radii_K), math.nan)
@@ -84,6 +85,9 @@ class ThermalState:
         self.camera_lag = self.camera_lag + ((before_degC + self.camera_degC) / 2 - self.camera_lag) * gained
         lowest, highest = self.camera_degC - self._radii_K, self.camera_degC + self._radii_K
         self.plays = np.minimum(np.maximum(self.plays, lowest), highest)
+        if self._unseen and not math.isnan(camera_degC):
+            self._unseen = False
+            self.settled_s = math.inf if abs(camera_degC - ambient_degC) < COLD_K else self.settled_s
         self.settled_s += dt_s
         self.on_s = self.on_s + dt_s if power_on == 1 else dt_s * power_on
 
@@ -97,6 +101,7 @@ class ThermalState:
         cold = abs(excess_K) < COLD_K and not math.isnan(camera_degC)
         warmed = 0.0 if cold else min(max(excess_K / self._self_heating_K, 0.0), 1.0)
         self.begun = True
+        self._unseen = power_on == 0 and math.isnan(camera_degC)
         self.settled_s = math.inf if cold else 0.0
         self.on_s = 0.0 if cold or power_on == 0 else math.inf
         self.air_degC, self.camera_degC = ambient_degC, ambient_degC + excess_K
@@ -228,6 +233,8 @@ class Drift:
                     "camera": lambda: own,
                     "camera squared": lambda: own**2,
                     "ambient lag": lambda at=at: (state.ambient_lag[at] - air_degC) / SPAN_K,
+                    "ambient lag squared": lambda at=at: ((state.ambient_lag[at] - air_degC) / SPAN_K) ** 2,
+                    "ambient lag cubed": lambda at=at: ((state.ambient_lag[at] - air_degC) / SPAN_K) ** 3,
                     "power lag": lambda at=at: state.power_lag[at] - 1,
                     "camera lag": lambda at=at: (state.camera_lag[at] - camera_degC) / SPAN_K,
                     "camera lag squared": lambda at=at: ((state.camera_lag[at] - camera_degC) / SPAN_K) ** 2,
@@ -264,8 +271,11 @@ class Drift:
         return found | _beyond(self._state.settled_s, (self.memory_s, math.inf), HISTORY)
 
     def limits(self, name):
-        """A calibrated range (low, high) with its margin; the paper's form has none."""
+        """A calibrated range (low, high) with its margin; the paper's form has none. How fast the air may change is
+        part of the state, in models that know its leverage."""
         low, high = self._model[name]
+        if name == "rate_range_K_per_h" and self._model.get("leverage") is not None:
+            return -math.inf, math.inf
         least = 1.0 if name == "rate_range_K_per_h" else 0.0
         margin = 0.0 if self._model["form"] == "paper" else max(_MARGIN * (high - low), least)
         return low - margin, high + margin

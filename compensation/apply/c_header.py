@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from compensation import drift_runtime
 from compensation.apply.runtime_export import runtime_model
 from compensation.drift.drift_model import DriftModel
+from compensation.drift.terms import Kind, power_of
 from foundation.errors import ConfigError
 from foundation.files import write_whole
 
@@ -138,11 +139,11 @@ def _thermal(model: Mapping[str, Any]) -> tuple[list[_CTerm], Float, int]:
     span = drift_runtime.SPAN_K
     terms: list[_CTerm] = []
     for (kind, parameter), reference in zip(model["terms"], model["reference_features"], strict=True):
-        base, squared = kind.removesuffix(" squared"), kind.endswith(" squared")
+        base = kind.removesuffix(" squared").removesuffix(" cubed")
         at = 1 + taus_s.index(parameter) if parameter in taus_s else 0
         at = plays_K.index(parameter) if base == "play" else at
         origin = {"constant": 0.0, "ambient lag": air, "power lag": 1.0}.get(base, camera)
-        power = 0 if base == "constant" else 2 if squared else 1
+        power = 0 if base == "constant" else power_of(Kind(kind))
         terms.append(_CTerm(base, at, power, origin, 1.0 if base == "power lag" else span, reference))
     right, down, xx, xy, yx, yy, bend_x, bend_y = np.array(model["coefficients_px"])
     zero = np.zeros_like(right)

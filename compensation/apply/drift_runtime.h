@@ -23,7 +23,8 @@ enum {
 };
 
 typedef struct drift_state {
-    int begun; /* 0 in a gap */
+    int begun;  /* 0 in a gap */
+    int unseen; /* 1 from a begin without power or temperature, until the camera tells one */
     double air_degC, camera_degC, settled_s, on_s;
     double ambient_lag[DRIFT_LAGS], power_lag[DRIFT_LAGS], camera_lag[DRIFT_LAGS];
     double plays[DRIFT_PLAYS + 1];
@@ -109,20 +110,22 @@ static inline void drift_update(drift_state *state) {
 /* Before the first sample. */
 static inline void drift_init(drift_state *state) {
     int k;
-    state->begun = 0;
+    state->begun = state->unseen = 0;
     state->air_degC = state->camera_degC = state->settled_s = state->on_s = NAN;
     for (k = 0; k < DRIFT_LAGS; ++k) state->ambient_lag[k] = state->power_lag[k] = state->camera_lag[k] = NAN;
     for (k = 0; k <= DRIFT_PLAYS; ++k) state->plays[k] = NAN;
     drift_update(state);
 }
 
-/* In equilibrium, with the part of its self-heating that the camera shows: a guess, unless it is as cold as the air. */
+/* In equilibrium, with the part of its self-heating that the camera shows: a guess, unless it is as cold as the air
+ * now, or, without power until then, when it is switched on. */
 static inline void drift_begin(drift_state *state, double ambient_degC, double power_on, double camera_degC) {
     const int known = drift_is_temperature(camera_degC);
     const double excess_K = known ? camera_degC - ambient_degC : 0.0;
     const int cold = known && fabs(excess_K) < DRIFT_COLD_K;
     int k;
     state->begun = 1;
+    state->unseen = power_on == 0.0 && !known;
     state->settled_s = cold ? HUGE_VAL : 0.0;
     state->on_s = cold || power_on == 0.0 ? 0.0 : HUGE_VAL;
     state->air_degC = ambient_degC;
@@ -163,6 +166,10 @@ static inline unsigned drift_advance(drift_state *state, double dt_s, double amb
     for (k = 0; k < DRIFT_PLAYS; ++k) {
         state->plays[k] = drift_clip(state->plays[k], state->camera_degC - drift_plays_K[k],
                                      state->camera_degC + drift_plays_K[k]);
+    }
+    if (state->unseen && drift_is_temperature(camera_degC)) {
+        state->unseen = 0;
+        if (fabs(camera_degC - ambient_degC) < DRIFT_COLD_K) state->settled_s = HUGE_VAL;
     }
     state->settled_s += dt_s;
     state->on_s = power_on == 1.0 ? state->on_s + dt_s : dt_s * power_on;

@@ -1,7 +1,8 @@
 """Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null.
 
 A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form, those
-before version 4 know of no bumps, those before version 5 have correlations between the motions, which are dropped.
+before version 4 know of no bumps, those before version 5 have correlations between the motions, which are dropped,
+those before version 6 no powers of the air's lags.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from foundation.errors import SessionError
 from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 
 Positive = Annotated[int, Field(gt=0)]
 Rows = tuple[tuple[float, ...], ...]
@@ -39,7 +40,7 @@ class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Literal[2, 3, 4, 5] = SCHEMA_VERSION
+    schema_version: Literal[2, 3, 4, 5, 6] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from compensation.drift.bump import MOTIONS
 from compensation.drift.displacements import Displacements, anchors, displacements
-from compensation.drift.terms import POLYNOMIAL, Kind, Origin, Term, features, motions
+from compensation.drift.terms import Kind, Origin, Term, features, motions
 from compensation.drift.training import frame_states
 from compensation.history.states import Float, Memory
 from compensation.observations import Mask, Observations
@@ -22,7 +22,8 @@ _ROLES = (Role.WARM_UP, Role.REFERENCE, Role.FIT, Role.VALIDATION)
 _TAUS_S = (480.0, 1620.0, 6000.0, 18000.0)
 _PLAYS_K = (1.5, 3.0, 6.0, 10.0, 14.0)
 _TERMS = (
-    *POLYNOMIAL[1:],
+    Term(Kind.CAMERA),
+    Term(Kind.CAMERA_SQUARE),
     *(Term(Kind.AMBIENT_LAG, tau_s) for tau_s in _TAUS_S),
     *(Term(Kind.POWER_LAG, tau_s) for tau_s in _TAUS_S),
     Term(Kind.CAMERA_LAG, _TAUS_S[1]),

@@ -20,12 +20,15 @@ _SPAN_K = 20.0
 
 
 class Kind(StrEnum):
-    """What a term is made of. CAMERA_LAG: what follows the camera's own temperature, as a lens does."""
+    """What a term is made of. CAMERA_LAG: what follows the camera's own temperature, as a lens does. POWER_LAG,
+    CAMERA_LAG_SQUARE: in older models."""
 
     CONSTANT = "constant"
     CAMERA = "camera"
     CAMERA_SQUARE = "camera squared"
     AMBIENT_LAG = "ambient lag"
+    AMBIENT_LAG_SQUARE = "ambient lag squared"
+    AMBIENT_LAG_CUBE = "ambient lag cubed"
     POWER_LAG = "power lag"
     CAMERA_LAG = "camera lag"
     CAMERA_LAG_SQUARE = "camera lag squared"
@@ -40,23 +43,34 @@ class Term:
     parameter: float = 0.0
 
 
-POLYNOMIAL = (Term(Kind.CONSTANT), Term(Kind.CAMERA), Term(Kind.CAMERA_SQUARE))
-"""1, T, T^2: what the camera's own temperature explains."""
-
 TAUS_S = tuple(60.0 * minutes for minutes in (4, 8, 15, 27, 50, 100, 210, 450))
 """The slowest are for what creeps, and for a night that begins before all is warm; lags between two of these are sums
 of them."""
 
+SLOW_S = 12600.0
+"""Lags from here on are slower than a camera warms: of what creeps, which most cameras have little of."""
+
+_BENT, _BENT_S = (Kind.AMBIENT_LAG_SQUARE, Kind.AMBIENT_LAG_CUBE), (480.0, 1620.0, 6000.0)
+
 PLAYS_K = (3.0, 6.0, 10.0, 14.0)
 
-
 TERMS = (
-    *POLYNOMIAL,
+    Term(Kind.CONSTANT),
+    Term(Kind.CAMERA),
+    Term(Kind.CAMERA_SQUARE),
     *(Term(kind, tau_s) for kind in (Kind.AMBIENT_LAG, Kind.CAMERA_LAG) for tau_s in TAUS_S),
+    *(Term(kind, tau_s) for kind in _BENT for tau_s in _BENT_S),
     *(Term(Kind.PLAY, radius_K) for radius_K in PLAYS_K),
 )
-"""What a camera may be moved by. Its own temperature brings its self-heating with it: with lags of the supply, or of
-the square of its temperature, a warm-up in other air is predicted worse. Older models have them."""
+"""What a camera may be moved by. Its own temperature brings its self-heating with it: with lags of the supply, a
+warm-up in other air is predicted worse. Higher powers follow the air: a camera that is switched on cold is at
+temperatures of its own that a warm one reaches in much colder air only, and powers of these would extrapolate there."""
+
+
+def width_group(term: Term) -> tuple[Kind, bool]:
+    """Terms of one group have coefficients of one size: those of a kind, slow lags by themselves, and what bends."""
+    slow = term.kind in (Kind.AMBIENT_LAG, Kind.CAMERA_LAG) and term.parameter >= SLOW_S
+    return _BENT[0] if term.kind in _BENT else term.kind, slow
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +89,11 @@ def memory_of(terms: tuple[Term, ...], self_heating_K: float) -> Memory:
     return Memory(tuple(sorted(taus)), tuple(sorted(plays)), self_heating_K)
 
 
+def power_of(kind: Kind) -> int:
+    """Of a lag or temperature in a term."""
+    return 2 if kind.endswith(" squared") else 3 if kind.endswith(" cubed") else 1
+
+
 def features(states: States, terms: tuple[Term, ...], origin: Origin) -> Float:
     """(F, H) of F instants and H terms; all but the constant are near 0 in equilibrium at the reference."""
     return np.stack([_feature(states, term, origin) for term in terms], axis=1)
@@ -90,14 +109,14 @@ def _feature(states: States, term: Term, origin: Origin) -> Float:
             return own
         case Kind.CAMERA_SQUARE:
             return own**2
-        case Kind.AMBIENT_LAG:
+        case Kind.AMBIENT_LAG | Kind.AMBIENT_LAG_SQUARE | Kind.AMBIENT_LAG_CUBE:
             lag = states.ambient_lag_degC[:, memory.taus_s.index(term.parameter)]
-            return (lag - origin.ambient_degC) / _SPAN_K
+            return ((lag - origin.ambient_degC) / _SPAN_K) ** power_of(term.kind)
         case Kind.POWER_LAG:
             return states.power_lag[:, memory.taus_s.index(term.parameter)] - 1
         case Kind.CAMERA_LAG | Kind.CAMERA_LAG_SQUARE:
             lag = states.camera_lag_degC[:, memory.taus_s.index(term.parameter)]
-            return ((lag - origin.camera_degC) / _SPAN_K) ** (1 if term.kind is Kind.CAMERA_LAG else 2)
+            return ((lag - origin.camera_degC) / _SPAN_K) ** power_of(term.kind)
         case Kind.PLAY:
             play = states.play_degC[:, memory.plays_K.index(term.parameter)]
             return (play - origin.camera_degC) / _SPAN_K

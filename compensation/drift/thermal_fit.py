@@ -1,6 +1,6 @@
 """What instants teach of the terms' coefficients, each motion by itself.
 
-amount = features . c + wander + noise. The coefficients c of each kind of term are Gaussian about 0, as wide as makes
+amount = features . c + wander + noise. The coefficients c of each group of terms are Gaussian about 0, as wide as makes
 the night most likely (its evidence: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.1
 and 5.4): a camera that no play moves gets coefficients of plays near 0, and a state unlike those of the night an
 uncertain answer. The wander (Ornstein-Uhlenbeck) is of fixings that slip or settle anew; without it a hundred frames of
@@ -19,13 +19,16 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from compensation.drift.condensed import Index, Instants
-from compensation.drift.terms import MOTIONS, Kind, Term
+from compensation.drift.terms import MOTIONS, Term, width_group
 from compensation.history.states import Float
 
 _WANDERS, _WANDER_TAUS_S = (1.0, 2.0, 4.0), (1800.0, 7200.0)
 """Standard deviation of the wander over that of an instant's noise."""
 _USUAL, _UNSURE = math.log(20.0), 3.0
 """A coefficient is expected to be 20 times the noise, within a factor of e^3: a weak prior on the widths."""
+_UNSAID = 1.25
+"""One night shows states in one order only, and its most likely widths and terms are taken for the true ones: on other
+nights answers are off by this much more than their posterior says (24 drawn cameras, docs/decisions.md)."""
 _WIDTHS, _NOISES = (math.log(1e-3), math.log(1e4)), (0.0, math.log(1e4))
 _ROUNDS = 60
 
@@ -84,20 +87,20 @@ class Learned:
 
 def learn(instants: Instants, terms: Sequence[Term]) -> Learned:
     """The most likely prior and noise of each motion, and what they make of these instants."""
-    kinds = list(Kind)
-    kind = np.array([kinds.index(term.kind) for term in terms])
+    groups = list(dict.fromkeys(width_group(term) for term in terms))
+    group = np.array([groups.index(width_group(term)) for term in terms])
     scale_px = np.sqrt(np.median(instants.variance_px2, axis=0))
     amounts = instants.amounts_px / scale_px
     best: list[tuple[float, Float, _Weighting] | None] = [None] * MOTIONS
     for weighting in _weightings(instants, (instants.variance_px2 / scale_px**2).mean(axis=1)):
         known = _equations(instants.features, amounts, weighting)
         for motion, before in enumerate(best):
-            start = np.append(np.full(len(kinds), _USUAL), 0.0) if before is None else before[1]
-            value, found = _most_likely(known, motion, kind, start)
+            start = np.append(np.full(len(groups), _USUAL), 0.0) if before is None else before[1]
+            value, found = _most_likely(known, motion, group, start)
             if before is None or value < before[0]:
                 best[motion] = value, found, weighting
     believed = tuple(
-        _Believed(weighting, np.exp(found[kind]), math.exp(found[-1])) for _, found, weighting in filter(None, best)
+        _Believed(weighting, np.exp(found[group]), math.exp(found[-1])) for _, found, weighting in filter(None, best)
     )
     solved = [
         _solved(_equations(instants.features, amounts, own.weighting), motion, own)
@@ -106,7 +109,7 @@ def learn(instants: Instants, terms: Sequence[Term]) -> Learned:
     return Learned(
         instants,
         np.array([coefficients for coefficients, _ in solved]) * scale_px[:, None],
-        np.array([covariance for _, covariance in solved]) * scale_px[:, None, None] ** 2,
+        np.array([covariance for _, covariance in solved]) * (_UNSAID * scale_px[:, None, None]) ** 2,
         np.array([(own.noise * own.weighting.wander) ** 2 for own in believed]) * scale_px**2,
         scale_px,
         believed,
@@ -142,14 +145,14 @@ def _solved(known: _Equations, motion: int, own: _Believed) -> tuple[Float, Floa
     return own.widths * coefficients, own.widths[:, None] * inverse * own.widths
 
 
-def _most_likely(known: _Equations, motion: int, kind: Index, start: Float) -> tuple[float, Float]:
-    """The least negative log evidence, and the logarithms of widths of each kind and noise that have it."""
-    moment, square, kinds = known.moment[:, motion], float(known.square[motion]), len(start) - 1
+def _most_likely(known: _Equations, motion: int, group: Index, start: Float) -> tuple[float, Float]:
+    """The least negative log evidence, and the logarithms of widths of each group and noise that have it."""
+    moment, square, groups = known.moment[:, motion], float(known.square[motion]), len(start) - 1
 
     def negative(logs: Float) -> tuple[float, Float]:
-        widths, per_noise = np.exp(logs[kind]), math.exp(-2 * logs[-1])
+        widths, per_noise = np.exp(logs[group]), math.exp(-2 * logs[-1])
         explained = widths[:, None] * known.gram * widths * per_noise
-        inverse = np.linalg.inv(explained + np.eye(len(kind)))
+        inverse = np.linalg.inv(explained + np.eye(len(group)))
         told = widths * moment * per_noise
         found = inverse @ told
         free = np.diagonal(inverse)
@@ -160,10 +163,10 @@ def _most_likely(known: _Equations, motion: int, kind: Index, start: Float) -> t
             + known.count * float(logs[-1])
             + 0.5 * (known.log_determinant + float(beyond @ beyond))
         )
-        of_widths = np.bincount(kind, 1 - free - found**2, kinds) + beyond / _UNSURE
+        of_widths = np.bincount(group, 1 - free - found**2, groups) + beyond / _UNSURE
         left = square * per_noise - 2 * told @ found + found @ explained @ found
-        return value, np.append(of_widths, known.count - left - (len(kind) - free.sum()))
+        return value, np.append(of_widths, known.count - left - (len(group) - free.sum()))
 
-    limits = [_WIDTHS] * kinds + [_NOISES]
+    limits = [_WIDTHS] * groups + [_NOISES]
     result = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": _ROUNDS})
     return float(result.fun), np.asarray(result.x, np.float64)

@@ -37,8 +37,8 @@ _MARGIN = 0.02
 class ThermalRange:
     """What the calibration covered besides the camera's temperature: the quickest lag of the ambient, how fast the
     ambient changed, K/h, and the shortest time since the camera was switched on, s. leverage: the largest of a training
-    state, inf in models that do not know it. history_s: how long a state must have been followed after a guess until
-    what is left of it does not matter; None: three of the longest time constants."""
+    state, inf in models that do not know it, which go by the rate instead. history_s: how long a state must have been
+    followed after a guess until what is left of it does not matter; None: three of the longest time constants."""
 
     ambient_degC: Pair
     rate_K_per_h: Pair
@@ -143,7 +143,8 @@ class ThermalModel:
     def _state_flags(self, states: States) -> Flags:
         valid = self.valid
         found = range_flags(states.camera_degC, _widened(self.facts.camera_range_degC), Outside.CAMERA)
-        found |= range_flags(states.rate_K_per_h, _widened(valid.rate_K_per_h, 1.0), Outside.AMBIENT)
+        if math.isinf(valid.leverage):
+            found |= range_flags(states.rate_K_per_h, _widened(valid.rate_K_per_h, 1.0), Outside.AMBIENT)
         found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
         if self.memory.taus_s:
             found |= range_flags(states.ambient_lag_degC[:, 0], _widened(valid.ambient_degC), Outside.AMBIENT)
@@ -159,8 +160,9 @@ def _widened(limits: Pair, least: float = 0.0) -> Pair:
 
 def form_name(terms: tuple[Term, ...]) -> str:
     """`homography x (1, T, T^2), ambient lag 4 to 450 min, plays 3 to 14 K`."""
-    parts = ["homography x (1, T, T^2)"]
-    for kind in (Kind.AMBIENT_LAG, Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE):
+    of_camera = {Kind.CONSTANT: "1", Kind.CAMERA: "T", Kind.CAMERA_SQUARE: "T^2"}
+    parts = [f"homography x ({', '.join(of_camera[term.kind] for term in terms if term.kind in of_camera)})"]
+    for kind in (kind for kind in Kind if kind not in (*of_camera, Kind.PLAY)):
         taus = [term.parameter / 60 for term in terms if term.kind is kind]
         parts += [f"{kind} {_extent(taus)} min"] if taus else []
     radii = [term.parameter for term in terms if term.kind is Kind.PLAY]

@@ -66,6 +66,8 @@ def _feature(term: Term) -> str:
         Kind.CAMERA: "T",
         Kind.CAMERA_SQUARE: "T²",
         Kind.AMBIENT_LAG: f"air({minutes})",
+        Kind.AMBIENT_LAG_SQUARE: f"air({minutes})²",
+        Kind.AMBIENT_LAG_CUBE: f"air({minutes})³",
         Kind.POWER_LAG: f"power({minutes})",
         Kind.CAMERA_LAG: f"camera({minutes})",
         Kind.CAMERA_LAG_SQUARE: f"camera({minutes})²",

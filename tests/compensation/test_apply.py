@@ -69,6 +69,7 @@ def thermal(*, warmed: bool = True) -> ThermalModel:
     terms = (
         *(Term(kind) for kind in (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE)),
         *(Term(Kind.AMBIENT_LAG, tau_s) for tau_s in (600.0, 3600.0)),
+        *(Term(kind, 3600.0) for kind in (Kind.AMBIENT_LAG_SQUARE, Kind.AMBIENT_LAG_CUBE)),
         *(Term(kind, 600.0) for kind in (Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE)),
         Term(Kind.PLAY, 6.0),
         Term(Kind.PLAY, 3.0),
@@ -92,7 +93,8 @@ def thermal(*, warmed: bool = True) -> ThermalModel:
 MODELS = [pytest.param(paper(1), id="P1"), pytest.param(paper(4), id="P4"), pytest.param(thermal(), id="thermal"),
           pytest.param(thermal(warmed=False), id="never switched on")]  # fmt: skip
 POINTS = np.random.default_rng(3).uniform((0, 0), SIZE, (40, 2))
-# dt_s, air, power, camera: a cold start, a ramp, a minute without power, a silent camera, a gap, a warm start.
+# dt_s, air, power, camera: a cold start, a ramp, a minute without power, a silent camera, a gap, a warm start; a gap,
+# and a camera that is switched on cold.
 LIFE = [
     *((10.0, 15.0, 1.0, 15.0 + 17 * (1 - np.exp(-k / 60))) for k in range(200)),
     *((10.0, 15.0 + 0.1 * k, 1.0, 32.0 + 0.09 * k) for k in range(300)),
@@ -101,6 +103,9 @@ LIFE = [
     *((10.0, 40.0, 1.0, 55.0) for _ in range(30)),
     (5.0, np.nan, 1.0, 50.0),
     *((10.0, 24.0, 1.0, 44.0) for _ in range(1200)),
+    (5.0, np.nan, 1.0, 44.0),
+    *((10.0, 24.0, 0.0, np.nan) for _ in range(30)),
+    *((10.0, 24.0, 1.0, 24.0 + 17 * (1 - np.exp(-k / 60))) for k in range(200)),
 ]
 
 

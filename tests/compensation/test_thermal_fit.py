@@ -97,7 +97,7 @@ def test_plays_help_a_camera_with_play_and_are_not_taken_for_one_without(thermal
 
 def test_the_95_percent_interval_holds_95_percent_at_held_out_temperatures(night: Seen, thermal: ThermalModel):
     for part in evaluate(thermal, night[0]).coverage_95:
-        assert 0.92 <= part <= 0.985  # the markers' own noise is most of it
+        assert 0.92 <= part <= 0.99  # the markers' own noise is most of it
 
 
 def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(night: Seen, thermal: ThermalModel):
@@ -118,7 +118,7 @@ def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
     assert not any(thermal.flags(point, states.where(np.array([k])))[0] for k in np.flatnonzero(inside))
     usual = states.where(np.flatnonzero(inside)[-1:])
     assert thermal.flags(np.array([[20.0, 1000.0]]), usual)[0] == Outside.PLACE
-    for column, value, flag in ((0, 90.0, Outside.CAMERA), (1, 500.0, Outside.AMBIENT), (2, 0.0, Outside.SWITCHED_ON)):
+    for column, value, flag in ((0, 90.0, Outside.CAMERA), (4, 90.0, Outside.AMBIENT), (2, 0.0, Outside.SWITCHED_ON)):
         rows = usual.rows.copy()
         rows[0, column] = value
         found = thermal.flags(point, States.from_rows(usual.memory, rows))[0]
@@ -164,7 +164,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
         np.testing.assert_equal(getattr(loaded.facts, name), getattr(thermal.facts, name), err_msg=name)
     assert loaded.valid.__repr__() == thermal.valid.__repr__()
     data = json.loads((tmp_path / "model.json").read_text())
-    assert (data["form"], data["schema_version"]) == ("thermal", 5)
+    assert (data["form"], data["schema_version"]) == ("thermal", 6)
     (tmp_path / "model.json").write_text(json.dumps({**data, "reference_features": [0.0]}))
     with pytest.raises(SessionError, match="reference_features: shape"):
         load_model(tmp_path / "model.json")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,25 @@ def test_a_warm_start_is_a_guess_and_a_cold_one_is_known():
     np.testing.assert_allclose(cold.power_lag[0], -np.expm1(-1800 / np.array(MEMORY.taus_s)), rtol=1e-9)
     half = at(history(camera_excess_K=10.0), 0 + 10, camera_degC=34.0)
     np.testing.assert_allclose(half.power_lag[0], 0.5, atol=0.02)
+
+
+@pytest.mark.parametrize(("told_degC", "known"), [(21.0, True), (27.0, False)])
+def test_a_camera_that_is_as_cold_as_the_air_when_it_is_switched_on_was_in_equilibrium(told_degC: float, known: bool):
+    state = ThermalState(MEMORY.taus_s, MEMORY.plays_K, MEMORY.self_heating_K)
+    for _ in range(100):
+        state.advance(10.0, 20.0, 0.0, math.nan)
+    assert state.settled_s == 1000.0
+    state.advance(10.0, 20.0, 1.0, told_degC)
+    assert state.settled_s == (math.inf if known else 1010.0)
+
+
+def test_a_camera_that_was_on_before_and_is_cold_after_a_pause_is_known_no_better():
+    state = ThermalState(MEMORY.taus_s, MEMORY.plays_K, MEMORY.self_heating_K)
+    state.advance(10.0, 20.0, 1.0, 40.0)
+    for _ in range(600):
+        state.advance(10.0, 20.0, 0.0, math.nan)
+    state.advance(10.0, 20.0, 1.0, 20.5)
+    assert state.settled_s == 6020.0
 
 
 def test_power_counts_from_the_instant_it_came_on():
