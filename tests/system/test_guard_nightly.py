@@ -31,7 +31,8 @@ experiments:
       interval_s: 0.5
 """
 LIMIT_S = 240.0
-HANGS_S, GONE_S = 95.0, 10.0
+# A reading is up to 5 s old when the bus goes, and trips at 15 s.
+HANGS_S, GONE_S = 95.0, 5.0
 CLIENTS, BUSY = 64, 2
 
 
@@ -113,7 +114,7 @@ async def test_the_guard_looks_on_and_a_stop_leaves_while_everything_hangs(
                     process.send_signal(signal.SIGTERM)
                     await heater_is(ordered, 0)
                     safe_ns = clock.now_ns()
-                    assert await asyncio.to_thread(process.wait, LIMIT_S) == 130
+                    status = await asyncio.to_thread(process.wait, LIMIT_S)
                     left_ns = clock.now_ns()
                 finally:
                     run("fsfreeze", "-u", disk)
@@ -122,6 +123,7 @@ async def test_the_guard_looks_on_and_a_stop_leaves_while_everything_hangs(
             process.kill()
             process.wait(LIMIT_S)
             process.stderr.close()
+    assert status == 130, said
     assert "stopped by the operator; the stand is safe" in said
     assert "is not on the disk yet, limit 60 s" in said
     assert "the guard has not looked for" not in said  # what is told when two looks are more than two periods apart
