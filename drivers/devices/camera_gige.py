@@ -35,7 +35,8 @@ class Camera:
         self._lane: Lane | None = None
         self._connection: Connection | None = None
         self._lost = ""
-        self._heard_ns: int | None = None  # since it was made, or closed
+        self._has_opened = False  # since it was made, or closed
+        self._heard_ns: int | None = None  # since then, too
         self.restarted = ""  # why it has, or may have, restarted between the last open and the one before; "" if not
         self._frames = FrameCount()
         self._counts: Counter[str] = Counter()
@@ -76,6 +77,7 @@ class Camera:
         if self._lane is None:
             self._lane = Lane(self._name, self._clock)
         await self._call(self._connect)
+        self._has_opened = True
         self.restarted = self._why_restarted(self._usable().clock_began_ns)
         self._heard_ns = self._clock.now_ns()
 
@@ -90,6 +92,7 @@ class Camera:
         lane.close()
         if self._lane is lane:
             self._lane = self._heard_ns = None
+            self._has_opened = False
 
     async def start(self) -> None:
         """Start acquisition, always on a new stream."""
@@ -129,9 +132,10 @@ class Camera:
 
     async def read(self) -> tuple[Reading, ...]:
         """(Reading("camera.temperature", 41.5, "degC", ...),), BAD with the reason when the camera has none, it cannot
-        be read, or the camera is closed (it is switched off before a warm-up); Unreachable when it was lost."""
+        be read, or the camera is closed (it is switched off before a warm-up) or being opened; Unreachable when it
+        was lost."""
         channel = f"{self._name}.temperature"
-        if self._lane is None:
+        if not self._has_opened:
             return (bad_reading(channel, "degC", self._clock.now_ns(), "the camera is closed"),)
         value_degC, reason, cause = await self._call(self._usable().temperature)
         self._usable()

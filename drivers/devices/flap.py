@@ -239,8 +239,10 @@ class Flap:
             return chosen
         if denied is not None:  # it may be ours
             raise self._error(denied, "serial number") from denied
-        text = f"no Jrk G2 with serial number {self._settings.serial_number}"
-        raise Unreachable(self.name, f"{text}, only {', '.join(sorted(present)) or 'none'}")
+        others = f"only {', '.join(sorted(present))}" if present else "and no other"
+        raise Unreachable(
+            self.name, f"no Jrk G2 with serial number {self._settings.serial_number} is connected, {others}"
+        )
 
     def _identity_of(self, device: _UsbDevice) -> Identity:
         """Its serial number is what it was found by; the version is that of its firmware, binary coded decimal."""

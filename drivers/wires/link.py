@@ -72,7 +72,7 @@ class _SerialLink:
                 exclusive=True,
             )
         except (OSError, termios.error) as error:
-            raise Unreachable(device, f"cannot open {path}: {_why_closed(error)}") from error
+            raise Unreachable(device, f"cannot open {path}: {why_closed(error)}") from error
 
     def write(self, data: bytes) -> None:
         try:
@@ -93,8 +93,8 @@ class _SerialLink:
             self._port.close()
 
 
-def _why_closed(error: Exception) -> str:
-    """pyserial's reason in one clause."""
+def why_closed(error: Exception) -> str:
+    """Why a port cannot be opened, in one clause: the words of pyserial have its name twice."""
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EAGAIN, errno.EBUSY):
         return "another program has it open"

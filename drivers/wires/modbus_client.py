@@ -35,6 +35,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
+from drivers.wires.link import why_closed
 from drivers.wires.registers import Space
 from foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of
 from foundation.documents import Document
@@ -206,7 +207,8 @@ class ModbusClient:
             client.connect()
         except (OSError, termios.error) as error:
             client.close()
-            raise WireFault(FaultKind.LINE_DOWN, f"cannot open {self._settings.address}: {error}") from error
+            text = f"cannot open {self._settings.address}: {why_closed(error)}"
+            raise WireFault(FaultKind.LINE_DOWN, text) from error
         self._client = client
 
     def _make(self) -> _SerialClient | _TcpClient:

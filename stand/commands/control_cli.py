@@ -212,7 +212,7 @@ def idle_lines(name: str, state: StandState) -> Iterator[str]:
         yield _row("fault", f"{state.fault.rule}: {state.fault.text}")
     for channel, reading in state.readings.items():
         if reading.unit == "degC":
-            known = "BAD" if reading.value is None else f"{reading.value:.2f} degC"
+            known = f"no reading: {reading.reason}" if reading.value is None else f"{reading.value:.2f} degC"
             is_idle = channel == SET_POINT and state.setpoint_degC is None
             yield _row("temperatures", f"{channel} {'none' if is_idle else known}")
     waiting = sum(run.state in ("waiting", "interrupted") for run in state.queue)

@@ -21,7 +21,7 @@ from foundation.output import output, say, show
 from foundation.usage import one_line, tell
 from recording.repair.salvage import salvage_line
 from stand.commands.checked_cli import warn_unchecked
-from stand.commands.submitted import daemon_of, follow, submit
+from stand.commands.submitted import daemon_of, follow, submit, submit_resumed
 from stand.config.checked import load_checked
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.learned import learn
@@ -131,6 +131,7 @@ def resume_run(
     """Resume a run that was killed or interrupted, in its session: what is done is not done again.
 
     Recipe, seed, target and camera settings are the session's; programs, files, addresses and limits are this stand's.
+    Where `stand serve` has the stand, it resumes the run, and this follows; Ctrl-C stops it.
 
     Example: stand resume sessions/20260101T180000Z-thermal-cycle --config laboratory.yaml
     """
@@ -148,6 +149,10 @@ def resume_run(
             before.release()
             raise
         is_virtual = is_of_virtual_time(before)
+        if not is_virtual and (server := daemon_of(order.config)) is not None:
+            before.release()
+            _resume_there(server, directory, attended=attended, report=report)
+            return
         with followed(order, night, directory, is_virtual=is_virtual, before=before) as watch:
             session = asyncio.run(resume(before, watch))
         _finished(session, order.config, report=report)
@@ -160,6 +165,14 @@ def _run_there(server: Server, order: Order, out: Path | None, *, detach: bool, 
         show({"id": submitted.id}, [f"run {submitted.id} is queued; `stand status` follows it"])
         return
     session = follow(server, submitted)
+    _show_session(session, session, str(session), report=report)
+
+
+def _resume_there(server: Server, directory: Path, *, attended: bool, report: bool) -> None:
+    """By the daemon that has the stand."""
+    if attended:
+        raise ConfigError("--attended: `stand serve` has this stand, and resumes a run as it was queued; leave it out")
+    session = follow(server, submit_resumed(server, directory))
     _show_session(session, session, str(session), report=report)
 
 

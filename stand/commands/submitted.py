@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import quote
 
 from pydantic import ValidationError
 
@@ -55,6 +56,18 @@ def submit(server: Server, order: Order, out: Path | None) -> QueuedRun:
     return _queued(server, {"recipe_text": order.recipe_text, "attended": order.attended, "key": uuid.uuid4().hex})
 
 
+def submit_resumed(server: Server, session: Path) -> QueuedRun:
+    """The run of a session in its folder, which is the next one there; SessionError when the stand refuses it."""
+    session = session.resolve()
+    if session.parent != Path(server.name).resolve():
+        raise ConfigError(f"{session}: `stand serve` has this stand, and resumes what is in {server.name}")
+    server.request("POST", f"{API}/sessions/{quote(session.name)}/resume", None, _QUEUE_LIMIT_S)
+    found = [run for run in server.state().queue if run.session == session.name]
+    if not found:
+        raise SessionError(f"{session}: its run was taken out of the queue of `stand serve` meanwhile")
+    return found[-1]
+
+
 def _queued(server: Server, body: Mapping[str, object]) -> QueuedRun:
     try:
         return QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, _QUEUE_LIMIT_S))
@@ -83,6 +96,7 @@ class _Follower:
         self._server = server
         self._run = run
         self._there = There(server)
+        self._to_come = {"waiting", run.state} - {"running"}  # one that is resumed is `interrupted` until it begins
 
     def until_ended(self, shown: View) -> QueuedRun:
         """A daemon that is busy, or restarts, may not answer for a while."""
@@ -103,15 +117,17 @@ class _Follower:
                 run = next((each for each in state.queue if each.id == self._run.id), None)
                 if run is None:
                     raise SessionError(f"run {self._run.id} was taken out of the queue")
-                if run.state not in ("waiting", "running"):
+                if run.state == "running":
+                    self._to_come = {"waiting"}
+                elif run.state not in self._to_come:
                     return run
-                shown.show(self._waiting(state, moment) if run.state == "waiting" else moment)
+                shown.show(moment if run.state == "running" else self._waiting(state, moment))
             threading.Event().wait(_LOOK_S)
 
     def stop(self) -> None:
         """End it when it is running, else take it out of the queue."""
         state = self._server.state()
-        waits = any(run.id == self._run.id and run.state == "waiting" for run in state.queue)
+        waits = any(run.id == self._run.id and run.state in self._to_come for run in state.queue)
         if waits:
             self._server.request("DELETE", f"{API}/queue/{self._run.id}")
             raise Interrupted(f"run {self._run.id} was taken out of the queue; nothing was started")

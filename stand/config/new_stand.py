@@ -35,6 +35,17 @@ class Connected:
     axes: Sequence[Axis] = ()
 
 
+_README = """\
+In this order:
+
+    stand check --config stand.yaml                 # does each device answer, and is it the right one?
+    stand plan recipe.yaml --config stand.yaml      # what a night takes; nothing moves
+    stand run recipe.yaml --config stand.yaml --virtual-time        # a rehearsal in a simulated laboratory
+    stand serve stand.yaml --port 8080              # the stand for days; its page is http://127.0.0.1:8080/
+    stand run recipe.yaml --config stand.yaml       # one night, from the command line
+"""
+
+
 def new_stand(name: str, connected: Connected | None) -> dict[str, str]:
     """The files of a stand's folder by name; the simulated stand's without `connected`."""
     own = {"name": _quoted(name), "target": "target.yaml"}
@@ -48,8 +59,7 @@ def new_stand(name: str, connected: Connected | None) -> dict[str, str]:
         "stand.yaml": text,
         "recipe.yaml": _text("recipes", recipe),
         "target.yaml": _text("targets", "paper-9x6"),
-        "README.md": f"# {name}\n\nA night: `stand run recipe.yaml --config stand.yaml`; what it takes: "
-        "`stand plan recipe.yaml --config stand.yaml`.\n",
+        "README.md": f"# {name}\n\n{_README}",
     }
 
 

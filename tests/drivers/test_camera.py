@@ -4,6 +4,8 @@ That camera has no temperature, no gain in dB, no time stamp latch and no resend
 diagonal ramp: pixel = (x + y + frame) mod 255 at 10 ms of exposure.
 """
 
+import asyncio
+
 import numpy as np
 import pytest
 
@@ -236,7 +238,11 @@ async def test_a_closed_camera_is_unreachable_until_it_is_opened_again():
     await camera.close()
     with pytest.raises(Unreachable, match="not open"):
         await camera.grab()
-    await camera.open()
+    opening = asyncio.create_task(camera.open())
+    await asyncio.sleep(0)  # a poll comes meanwhile
+    (reading,) = await camera.read()
+    assert (reading.quality, reading.reason) == (Quality.BAD, "the camera is closed")
+    await opening
     await camera.open()
     await camera.grab()
     await camera.close()

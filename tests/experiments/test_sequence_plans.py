@@ -47,6 +47,7 @@ RECIPES = [
     "ramps",
     "thermal-cycle",
     "thermal-cycle-settled",
+    "trial",
     "validation",
     "warm-up",
 ]

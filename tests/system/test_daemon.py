@@ -215,10 +215,15 @@ def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
     assert not offered.heater_permitted
     assert offered.readings["relays.heater_enable"].value == 0
     session = offered.queue[0].session
-    again.post(f"sessions/{session}/resume")
+    command = [sys.executable, "-m", "stand.cli", "resume", str(again.out / session), "--config", str(laboratory)]
+    follower = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     again.until(lambda state: state.run is not None)
+    with pytest.raises(subprocess.TimeoutExpired):
+        follower.wait(1.0)  # it looks twice a second
     again.process.send_signal(signal.SIGTERM)
     told = again.told()
+    follower.kill()
+    follower.communicate()
     assert again.process.returncode == 0, told
     kinds = [event.kind for event in Session.open(again.out / session).events()]
     assert "run.resume" in kinds

@@ -40,7 +40,7 @@ async def test_unplugged_and_plugged_in_again_it_is_found_by_its_serial_number(
     for _ in range(2):
         with pytest.raises(Unreachable, match=r"^flap: "):
             await flap.read()
-    with pytest.raises(Unreachable, match=f"^flap: no Jrk G2 with serial number {OURS}, only {OTHER}$"):
+    with pytest.raises(Unreachable, match=f"^flap: no Jrk G2 with serial number {OURS} is connected, only {OTHER}$"):
         await flap.make_safe()
     await bench.wait(1.0)  # the motor obeys its last target all the same
     bench.fake.unplugged = False
@@ -67,7 +67,7 @@ async def test_a_replug_before_a_move_costs_nothing(bench: Bench, flap: Flap) ->
 
 async def test_without_any_controller_it_says_none(bench: Bench) -> None:
     bench.fake.unplugged = bench.other.unplugged = True
-    with pytest.raises(Unreachable, match=f"serial number {OURS}, only none$"):
+    with pytest.raises(Unreachable, match=f"serial number {OURS} is connected, and no other$"):
         await bench.flap.open()
 
 

@@ -77,7 +77,8 @@ export class Devices {
       }
       rows.forEach((channel, index) => {
         const reading = state.readings[channel];
-        say(values.children[2 * index + 1], reading.value === null ? `no reading: ${reading.reason}` : value_of(channel, reading));
+        const is_idle = channel === "regulator.sp" && state.setpoint_degC === null; // what the regulator remembers is nobody's wish
+        say(values.children[2 * index + 1], is_idle ? "none" : reading.value === null ? `no reading: ${reading.reason}` : value_of(channel, reading));
       });
     }
     const counters = Object.entries(state.counters);
