@@ -11,6 +11,15 @@ from foundation.errors import ConfigError
 from stand.config.stand_config import Folder, packaged
 
 _SCHEMA = re.compile(r"\$schema=\S+/([a-z-]+\.json)")
+_README = """\
+In this order:
+
+    stand check --config stand.yaml                 # does each device answer, and is it the right one?
+    stand plan recipe.yaml --config stand.yaml      # what a night takes; nothing moves
+    stand run recipe.yaml --config stand.yaml --virtual-time        # a rehearsal in a simulated laboratory
+    stand serve stand.yaml --port 8080              # the stand for days; its page is http://127.0.0.1:8080/
+    stand run recipe.yaml --config stand.yaml       # one night, from the command line
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +42,6 @@ class Connected:
     camera: str = ""
     camera_serial: str = ""
     axes: Sequence[Axis] = ()
-
-
-_README = """\
-In this order:
-
-    stand check --config stand.yaml                 # does each device answer, and is it the right one?
-    stand plan recipe.yaml --config stand.yaml      # what a night takes; nothing moves
-    stand run recipe.yaml --config stand.yaml --virtual-time        # a rehearsal in a simulated laboratory
-    stand serve stand.yaml --port 8080              # the stand for days; its page is http://127.0.0.1:8080/
-    stand run recipe.yaml --config stand.yaml       # one night, from the command line
-"""
 
 
 def new_stand(name: str, connected: Connected | None) -> dict[str, str]:
