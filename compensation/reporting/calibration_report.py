@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from compensation.calibration.calibrate import Calibration
 from compensation.calibration.camera_file import CameraFile
-from compensation.reporting import calibration_figures as figures
-from compensation.reporting.figures import as_svg
+from compensation.reporting.drawing import calibration_figures as figures
+from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Table, page
 
 _FIGURES = (

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from compensation.drift.candidates import Candidate
 from compensation.drift.evaluation import Evaluation
 from compensation.observations import Observations
-from compensation.reporting import fit_figures as figures
-from compensation.reporting.figures import as_svg
+from compensation.reporting.drawing import fit_figures as figures
+from compensation.reporting.drawing.figures import as_svg
+from compensation.reporting.drawing.path_figures import EXAGGERATION
 from compensation.reporting.numbers import FormulaNumbers, ModelNumbers, Numbers, ScoreNumbers, compact, percent
 from compensation.reporting.page import Drawing, Facts, Heading, Listing, Paragraph, Part, Table
-from compensation.reporting.path_figures import EXAGGERATION
 
 _FORMS = {
     "paper": "displacement to the reference = P(I, J, T), one polynomial per coordinate; T is the camera's temperature",

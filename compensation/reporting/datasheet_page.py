@@ -11,9 +11,9 @@ from itertools import groupby
 
 from compensation.datasheet.datasheet import Datasheet
 from compensation.datasheet.quantity import COVERAGE, Quantity
-from compensation.reporting import datasheet_figures as figures
+from compensation.reporting.drawing import datasheet_figures as figures
+from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.equipment import Line, stated
-from compensation.reporting.figures import as_svg
 from compensation.reporting.numbers import measured, percent
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 

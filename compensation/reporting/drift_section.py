@@ -8,11 +8,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from compensation.observations import Observations
-from compensation.reporting import drift_figures as figures
-from compensation.reporting.figures import as_svg
+from compensation.reporting.drawing import drift_figures as figures
+from compensation.reporting.drawing.figures import as_svg
+from compensation.reporting.drawing.path_figures import EXAGGERATION, Paths, trajectories
 from compensation.reporting.numbers import HysteresisNumbers, Numbers, percent
 from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
-from compensation.reporting.path_figures import EXAGGERATION, Paths, trajectories
 from compensation.reporting.result_section import ours
 from compensation.reporting.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
 from experiments.steps import Role

@@ -17,10 +17,10 @@ from compensation.drift.model_file import save_model
 from compensation.observations import Observations, Progress, observe
 from compensation.reporting.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.reporting.data_section import data_section, utc
+from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.drift_section import drift_section
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
-from compensation.reporting.figures import as_svg
 from compensation.reporting.gather import numbers_of
 from compensation.reporting.numbers import Numbers, as_json
 from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table, page

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compensation.calibration.visits import visits_for
-from compensation.reporting.figures import FULL_WIDTH_IN, GREY, J_COLOUR, legend_above, new_figure, style
+from compensation.reporting.drawing.figures import FULL_WIDTH_IN, GREY, J_COLOUR, legend_above, new_figure, style
 from experiments.steps import Role
 from foundation.items import StepMark
 from markers.target import Target

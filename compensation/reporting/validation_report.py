@@ -10,8 +10,8 @@ import numpy as np
 from compensation.drift.drift_model import Outside
 from compensation.drift.evaluation import improvement_percent
 from compensation.observations import Float
-from compensation.reporting import validation_figures as figures
-from compensation.reporting.figures import as_svg
+from compensation.reporting.drawing import validation_figures as figures
+from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.numbers import percent
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm

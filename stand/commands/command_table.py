@@ -43,7 +43,7 @@ app = lazy_app(
         "alert": Lazy("stand.commands.alert_cli", "Alerts to people elsewhere: test them."),
         "token": Lazy("stand.commands.token_cli", "Tokens for the network: add, list, remove, login."),
         "session": Lazy(
-            "stand.commands.session_commands",
+            "stand.commands.sessions.session_commands",
             "Recorded sessions: list, look at, verify, salvage, replay, export, trim.",
         ),
     },

@@ -20,7 +20,7 @@ from foundation.instants import duration, local_text
 from foundation.output import output, show
 from foundation.usage import one_line
 from stand.commands.reached import on_stand
-from stand.commands.session_text import size
+from stand.commands.sessions.session_text import size
 from stand.gate import INTERLOCK, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import RunStatus, StandState

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.reporting import figures
+from compensation.reporting.drawing import figures
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.documents import parse_document
 from foundation.hub import Hub

@@ -20,8 +20,8 @@ from compensation.drift.paper_model import PaperModel
 from compensation.history.states import States
 from compensation.observations import Observations
 from compensation.reporting.compensation_section import uncertainty_section
+from compensation.reporting.drawing.fit_figures import enlarged, measured_against_model
 from compensation.reporting.extras import Extras
-from compensation.reporting.fit_figures import enlarged, measured_against_model
 from compensation.reporting.formula import formula_of
 from compensation.reporting.gather import numbers_of
 from compensation.reporting.numbers import Numbers, as_json

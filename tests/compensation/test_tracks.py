@@ -9,9 +9,9 @@ import pytest
 
 from compensation.history.thermal_history import History
 from compensation.observations import Observations, concatenate
-from compensation.reporting import drift_figures
-from compensation.reporting.figures import as_svg
-from compensation.reporting.path_figures import Paths, trajectories
+from compensation.reporting.drawing import drift_figures
+from compensation.reporting.drawing.figures import as_svg
+from compensation.reporting.drawing.path_figures import Paths, trajectories
 from compensation.reporting.tracks import cycle, moved_px, thinned, visits, warm_ups
 from experiments.steps import Role
 

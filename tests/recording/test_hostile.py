@@ -16,7 +16,7 @@ from foundation.documents import yaml_data
 from foundation.errors import ConfigError
 from recording.exporting.tables import Column, CsvTable
 from recording.repair.salvage import salvage_unfinished
-from stand.commands.session_commands import app
+from stand.commands.sessions.session_commands import app
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.learned import learn
 

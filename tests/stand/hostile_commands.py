@@ -71,7 +71,7 @@ def answer(words: list[str]) -> dict[str, object]:
 
 def main() -> None:
     import compensation.commands.fit_cli  # noqa: F401 - once for all
-    import stand.commands.session_cli  # noqa: F401 - once for all
+    import stand.commands.sessions.session_cli  # noqa: F401 - once for all
 
     answers = os.fdopen(os.dup(1), "w")
     for line in sys.stdin:

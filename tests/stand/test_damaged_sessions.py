@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from recording.reading.session import Session
-from stand.commands.session_commands import app
+from stand.commands.sessions.session_commands import app
 from tests.recording.runs import SECONDS, ended, entries, half_done, record_run, remove, write_journal
 
 runner = CliRunner()

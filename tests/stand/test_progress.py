@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from foundation.progress import late_progress
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.repair.salvage import salvage_session
-from stand.commands.session_commands import app
+from stand.commands.sessions.session_commands import app
 from tests.recording.damage import write_segment
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from stand.commands.session_commands import app
+from stand.commands.sessions.session_commands import app
 from tests.recording.runs import killed, record_run
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from foundation.items import Event
 from recording.reading.session import Session
-from stand.commands.session_commands import app
+from stand.commands.sessions.session_commands import app
 from tests.recording.recorded import START_NS, half_second, item_key, record
 
 runner = CliRunner()
@@ -137,7 +137,7 @@ def test_a_session_that_is_being_recorded_takes_a_note(session: Path):
 def test_a_list_of_known_sessions_imports_nothing_that_takes_time(session: Path):
     ask("list", session.parent)
     code = (
-        "import sys\nfrom stand.commands.session_commands import app\n"
+        "import sys\nfrom stand.commands.sessions.session_commands import app\n"
         f"try: app(['list', {str(session.parent)!r}])\nexcept SystemExit as end: assert not end.code\n"
         "assert not {'numpy', 'google.protobuf', 'mcap', 'asyncio', 'rich.console'} & {*sys.modules}, sys.modules"
     )

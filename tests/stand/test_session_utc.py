@@ -14,7 +14,7 @@ from foundation.items import Event
 from recording.format.utc_offsets import CLOCK_STEP
 from recording.reading.session import Session
 from recording.repair.verify import verify
-from stand.commands.session_commands import app
+from stand.commands.sessions.session_commands import app
 from tests.recording.recorded import START_NS, half_second, record
 
 HOUR_NS = 3600 * NS_PER_S

@@ -23,7 +23,7 @@ from foundation.hub import Hub
 from foundation.items import Item, StepMark
 from recording.format.utc_offsets import CLOCK_STEP
 from recording.reading.session import Session
-from stand.commands.session_commands import app
+from stand.commands.sessions.session_commands import app
 from stand.config.stand_config import StandConfig
 from stand.running.order import Order
 from stand.running.run import run_real

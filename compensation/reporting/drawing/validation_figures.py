@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compensation.reporting.figures import I_COLOUR, J_COLOUR, new_figure, style
+from compensation.reporting.drawing.figures import I_COLOUR, J_COLOUR, new_figure, style
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
 from compensation.validation3d.validate import Validation

@@ -14,7 +14,7 @@ from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from compensation.observations import Float, Observations
-from compensation.reporting.figures import FULL_WIDTH_IN, new_figure, style
+from compensation.reporting.drawing.figures import FULL_WIDTH_IN, new_figure, style
 from compensation.reporting.tracks import thinned
 
 EXAGGERATION = 100

@@ -8,7 +8,15 @@ from matplotlib.figure import Figure
 
 from compensation.datasheet.datasheet import Datasheet
 from compensation.datasheet.motions import UNITS, Visits, Warming
-from compensation.reporting.figures import FULL_WIDTH_IN, GREY, I_COLOUR, J_COLOUR, legend_above, new_figure, style
+from compensation.reporting.drawing.figures import (
+    FULL_WIDTH_IN,
+    GREY,
+    I_COLOUR,
+    J_COLOUR,
+    legend_above,
+    new_figure,
+    style,
+)
 
 _LABELS = ("shift I (px)", "shift J (px)", "change of scale (ppm)", "turn (µrad)")
 _COLOURS = (I_COLOUR, J_COLOUR, "#009E73", "#CC79A7")

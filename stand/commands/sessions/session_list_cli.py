@@ -21,8 +21,8 @@ from foundation.usage import one_line
 from recording.format.inventory import inventory
 from recording.reading.catalogue import Entry, Report, catalogue, look_at
 from recording.reading.notes import add_note, add_tags, check_tag, read_notes
-from stand.commands.session_args import SessionArgument, check_folder, check_session
-from stand.commands.session_table import ON_THE_RIGHT, entry_json, lines, rows
+from stand.commands.sessions.session_args import SessionArgument, check_folder, check_session
+from stand.commands.sessions.session_table import ON_THE_RIGHT, entry_json, lines, rows
 
 app = App(no_args_is_help=True)
 _USUAL = {"run": ("complete", "running"), "files": ("sound",)}  # anything else is shown in another colour

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from compensation.drift.hysteresis import Gap
 from compensation.observations import Float, Observations
-from compensation.reporting.figures import (
+from compensation.reporting.drawing.figures import (
     CAMERA_COLOUR,
     COORDINATES,
     FULL_WIDTH_IN,

@@ -20,7 +20,7 @@ from recording.reading.catalogue import Entry, entry_of
 from recording.reading.glance import Glance
 from recording.reading.overview import Frames, Overview, Step, Temperature
 from recording.repair.verify import Verification
-from stand.commands.session_table import entry_json, size
+from stand.commands.sessions.session_table import entry_json, size
 
 WIDTH = 100
 _LABEL = 14

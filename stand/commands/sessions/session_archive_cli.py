@@ -21,9 +21,9 @@ from foundation.usage import one_line, tell
 from recording.exporting.archive import Rule, archive, delete, unfit
 from recording.format.inventory import inventory
 from recording.reading.catalogue import Entry, catalogue, look_at
-from stand.commands.session_args import check_folder
-from stand.commands.session_list_cli import user_name
-from stand.commands.session_table import size
+from stand.commands.sessions.session_args import check_folder
+from stand.commands.sessions.session_list_cli import user_name
+from stand.commands.sessions.session_table import size
 from stand.config.stand_config import load_config, packaged
 
 app = App(no_args_is_help=True)

@@ -34,14 +34,14 @@ from recording.reading.session import Session
 from recording.reading.using import check_whole
 from recording.repair.salvage import Salvaged, salvage_line, salvage_session
 from recording.repair.verify import verify
-from stand.commands.session_args import (
+from stand.commands.sessions.session_args import (
     IncompleteOption,
     OutOption,
     SessionArgument,
     check_folder,
     check_session,
 )
-from stand.commands.session_text import info_json, info_lines, verify_json, verify_lines
+from stand.commands.sessions.session_text import info_json, info_lines, verify_json, verify_lines
 
 app = App(
     no_args_is_help=True,

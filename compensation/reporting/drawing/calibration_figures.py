@@ -1,5 +1,5 @@
 """The figures of a calibration: what the fit leaves, how well the camera is known, and what board and table turned
-out to be. Same style as compensation/reporting/figures.py; blue is x (I), orange is y (J).
+out to be. Same style as compensation/reporting/drawing/figures.py; blue is x (I), orange is y (J).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.calibrate import Calibration
 from compensation.calibration.least_squares import Float
 from compensation.calibration.uncertainty import grid_pixels
-from compensation.reporting.figures import I_COLOUR, J_COLOUR, legend_above, new_figure, style
+from compensation.reporting.drawing.figures import I_COLOUR, J_COLOUR, legend_above, new_figure, style
 
 _GREY = "#6b6b6b"
 _LONGEST_ARROW = 0.06

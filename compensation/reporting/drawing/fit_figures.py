@@ -11,9 +11,9 @@ from matplotlib.ticker import StrMethodFormatter
 
 from compensation.drift.evaluation import Evaluation, improvement_percent
 from compensation.observations import Float, Observations
-from compensation.reporting.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
+from compensation.reporting.drawing.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
+from compensation.reporting.drawing.path_figures import Paths, trajectories
 from compensation.reporting.numbers import percent
-from compensation.reporting.path_figures import Paths, trajectories
 from compensation.reporting.tracks import thinned
 
 _SIGMA_95 = 1.959964

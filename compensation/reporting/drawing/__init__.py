@@ -1,0 +1,1 @@
+"""The figures of reports, one function each: numbers in, matplotlib figures out."""
