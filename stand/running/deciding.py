@@ -1,8 +1,8 @@
 """Asks for the decisions of a cycle that decides (experiments/known.py), as changes of the plan.
 
 The drift model is fitted in a process of its own, which runs behind everything else on the machine and reads what is
-on the disk. It is started for one decision and ended after it. One that is late, has ended or finds no answer leaves
-the fixed plan, and the change says so.
+on the disk. It is started for one decision and ended after it. One that is late, has ended twice or finds no answer
+leaves the fixed plan, and the change says so.
 """
 
 from __future__ import annotations
@@ -50,19 +50,28 @@ class Decider:
         self._module = module
 
     async def decide(self, decide: Decide) -> Decided:
-        """The decision, from what is on the disk; virtual time stands still meanwhile."""
+        """The decision, from what is on the disk; virtual time stands still meanwhile. A process that is killed (the
+        machine is short of memory) is started once more: the same frames give the same decision."""
+        try:
+            async with asyncio.timeout(decide.wait_s):
+                try:
+                    return await self._decided_by_process(decide)
+                except BrokenPipeError:
+                    return await self._decided_by_process(decide)
+        except TimeoutError:
+            return Decided(Undecided(), f"the drift model was not fitted within {decide.wait_s:g} s")
+        except (OSError, StandError, ValueError) as error:
+            return Decided(Undecided(), getattr(error, "strerror", None) or str(error))
+
+    async def _decided_by_process(self, decide: Decide) -> Decided:
+        """BrokenPipeError when the process has ended."""
         try:
             helper = Helper(self._module, (_LINE,), "the process that fits the drift model has ended")
         except OSError as error:
             return Decided(Undecided(), f"no process can be started that fits the drift model ({error.strerror})")
         lane = Lane("design", self._clock, patient=False)
         try:
-            async with asyncio.timeout(decide.wait_s):
-                return _decided(await lane.call(self._asked, helper, decide))
-        except TimeoutError:
-            return Decided(Undecided(), f"the drift model was not fitted within {decide.wait_s:g} s")
-        except (OSError, StandError, ValueError) as error:
-            return Decided(Undecided(), getattr(error, "strerror", None) or str(error))
+            return _decided(await lane.call(self._asked, helper, decide))
         finally:
             lane.abandon()
             helper.close()

@@ -3,6 +3,7 @@ number of visits; it notes what it was asked."""
 
 import json
 import os
+import signal
 import threading
 from pathlib import Path
 
@@ -15,7 +16,7 @@ def decided(session, asked):
         file.write(json.dumps(asked) + "\n")
     found = json.loads((Path(session) / ANSWERS).read_text())[len((Path(session) / ASKED).read_text().splitlines()) - 1]
     if found == "die":
-        os._exit(3)
+        os.kill(os.getpid(), signal.SIGKILL)
     if found == "hang":
         threading.Event().wait(60.0)
     return found

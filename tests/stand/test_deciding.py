@@ -102,8 +102,38 @@ def test_a_killed_night_decides_the_same_and_asks_for_nothing_twice(life: Callab
     assert asked_times(tmp_path) == len(answers)
 
 
+def test_a_fit_whose_process_is_killed_is_made_again(life: Callable[..., Life], tmp_path: Path):
+    here = life("die", visit(47.0, 120.0), visit(12.0, 60.0), "die", visit(33.0, 60.0), ENOUGH)
+    here.passes(1500.0)
+    assert here.run.done()
+    assert not [item for item in here.told if isinstance(item, Event) and item.kind == "undecided"]
+    assert [degC for degC, _ in captured(here.log.state.plan)] == [24.0, 47.0, 12.0, 33.0, 40.0]
+    asked = (tmp_path / ASKED).read_text().splitlines()
+    assert (asked[0], asked[3]) == (asked[1], asked[4])
+
+
+def test_a_daemon_that_is_killed_during_the_fit_asks_the_same_again(life: Callable[..., Life], tmp_path: Path):
+    first = life(*[visit(47.0, 120.0)] * 2, visit(12.0, 60.0), ENOUGH)
+    while not (tmp_path / ASKED).exists():
+        first.passes(0.5)
+    killed_ns = first.kill()
+    journal = tmp_path / JOURNAL_NAME
+    before = journal.read_bytes()
+    undecided = before[: before.rstrip(b"\n").rindex(b"\n") + 1]
+    assert isinstance(read_lines(before)[0][-1], Edited)
+    journal.write_bytes(undecided)  # the decision was not made when it was killed
+    assert not any(isinstance(entry, Edited) for entry in read_lines(undecided)[0])
+    second = life(start_ns=killed_ns + 5 * NS_PER_S)
+    second.passes(1500.0)
+    assert second.run.done()
+    assert [degC for degC, _ in captured(second.log.state.plan)] == [24.0, 47.0, 12.0, 40.0]
+    asked = (tmp_path / ASKED).read_text().splitlines()
+    assert asked[0] == asked[1]
+    assert len(asked) == 4
+
+
 def test_without_decisions_the_fixed_plan_goes_on_and_it_is_said(life: Callable[..., Life]):
-    here = life(visit(47.0, 120.0), "die", {"kind": "none", "reason": "too few frames"}, *["die"] * 8)
+    here = life(visit(47.0, 120.0), *["die"] * 2, *[{"kind": "none", "reason": "too few frames"}] * 8)
     here.passes(8 * 700.0)
     assert here.run.done()
     assert [degC for degC, _ in captured(here.log.state.plan)] == [24.0, 47.0, *CYCLE.set_points_degC]
