@@ -19,8 +19,12 @@ CHANGED = "camera_offset_changed"
 _TRANSIENT_ROLES = frozenset({"warm_up", "settling", "other"})  # of a camera that is not in equilibrium anyway
 
 
+class TwoEquilibria(SessionError):
+    """A session has frames of two equilibria of the camera."""
+
+
 def check_one_equilibrium(session: Session) -> None:
-    """SessionError when there are frames at settled set-points on both sides of such a gap."""
+    """TwoEquilibria when there are frames at settled set-points on both sides of such a gap."""
     times_ns: list[int] | None = None
     for event in session.events():
         gap_ns = event.data.get("gap_ns")
@@ -28,7 +32,7 @@ def check_one_equilibrium(session: Session) -> None:
             continue
         times_ns = _settled_frames_ns(session) if times_ns is None else times_ns
         if times_ns and min(times_ns) <= gap_ns < max(times_ns):
-            raise SessionError(
+            raise TwoEquilibria(
                 f"{session.path}: camera minus air was {_kelvin(event, 'before_K')} before the gap at "
                 f"{utc_text(gap_ns)} and {_kelvin(event, 'after_K')} after it; its frames are of two equilibria of the "
                 "camera, and are used together only with --across-gap"

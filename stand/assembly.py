@@ -165,7 +165,8 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     chamber = ChamberLimits(config.set_points_degC, permits, renew_s, state_file, config.set_point_K_per_min)
     boots_s = [camera.boot_s for camera in config.cameras.values()]
     equilibrium = config.camera.equilibrium if config.camera is not None else EquilibriumSettings()
-    supply = SupplyLimits(max(boots_s, default=0.0), config.guard.heater_hold_s, equilibrium)
+    channels: dict[str, int] = {} if config.relays is None else {**config.relays.channels}
+    supply = SupplyLimits(max(boots_s, default=0.0), config.guard.heater_hold_s, equilibrium, channels)
     stand = Stand(devices, chamber, supply, hub, clock)
     if isinstance(regulator, SoftwareRegulator):
         regulator.permitted = lambda: stand.chamber.permits.gives

@@ -28,11 +28,12 @@ _BOOT_LIMIT_S = 60.0
 @dataclass(frozen=True, slots=True)
 class SupplyLimits:
     """How long the camera takes to boot (s), for how long its relay is held at a time until it has answered (s), and
-    when it counts as being in equilibrium."""
+    when it counts as being in equilibrium. channels: of the relay board, for the sentence about exchanged ones."""
 
     boot_s: float
     hold_s: float
     equilibrium: EquilibriumSettings = field(default_factory=EquilibriumSettings)
+    channels: Mapping[str, int] = field(default_factory=dict[str, int])
 
 
 class CameraSupply:
@@ -142,15 +143,27 @@ class CameraSupply:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.boot_s))
             deadline_ns = self._clock.now_ns() + seconds_ns(_BOOT_LIMIT_S)
             await self.opening.until_open(self._interlock.check, deadline_ns, RETRY_S)
-        except BaseException:
+        except BaseException as error:
             if holding is not None:
                 await cancelled([holding])
                 await relays.switch(CAMERA_POWER, on=False)
+                if isinstance(error, Unreachable):
+                    raise Unreachable(error.device, f"{error.text}; {self._relay_in_doubt()}") from error
             raise
         if holding is not None:
             await cancelled([holding])
             self._interlock.check()
             await relays.switch(CAMERA_POWER, on=True)
+
+    def _relay_in_doubt(self) -> str:
+        """What to look at when the camera does not answer though its relay was switched on: it may be another one."""
+        channels = self._limits.channels
+        others = ", ".join(f"{name} is {number}" for name, number in channels.items() if name != CAMERA_POWER)
+        number = f" (number {channels[CAMERA_POWER]}; {others})" if CAMERA_POWER in channels else ""
+        return (
+            f"the relay {self.name}{number} was on meanwhile and is off again: see that it is the camera it switches, "
+            f"and correct {self._relays.name}.channels if it is not"
+        )
 
     async def _hold(self, hold_s: float) -> None:
         """Arm the supply again until cancelled; a lost command is made up for by the next one."""

@@ -68,6 +68,10 @@ class CameraEquilibrium:
         """The plan itself switches the camera: what follows in it is made for that."""
         self.is_lost = False
 
+    def soaked_s(self) -> float | None:
+        """For how long the camera has been soaked anew; None when it need not be."""
+        return (self._clock.now_ns() - self._since_ns) / NS_PER_S if self.is_lost else None
+
     async def regained(self, is_disturbed: Callable[[], bool]) -> None:
         """Return when the camera is in equilibrium, with the event `camera_equilibrium`, or when it is disturbed."""
         tell_ns = self._since_ns + self._longest_ns

@@ -201,7 +201,12 @@ class Guest:
         night = await lane.call(price_night, state.plan, self.job.order.config, recorder.directory.parent)
         gate, clock, house = assembly.stand.gate, assembly.clock, self._house
         name = self.job.order.recipe.name
-        board = StatusBoard(name, night, kept, gate, self.stop, lambda: house.latched, recorder, clock)
+        supply = assembly.stand.imaging.supply
+
+        def soaked_again_s() -> float | None:
+            return supply.equilibrium.soaked_s() if supply.is_on else None
+
+        board = StatusBoard(name, night, kept, gate, self.stop, lambda: house.latched, recorder, clock, soaked_again_s)
         assembly.hub.subscribe(board)
         leaving.callback(assembly.hub.unsubscribe, board)
         if not isinstance(clock, VirtualClock):  # there nobody waits for the end

@@ -45,6 +45,7 @@ def report_session(session: Path, folder: Path) -> Reported:
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
     from compensation.drift.evaluation import table
+    from compensation.one_equilibrium import TwoEquilibria
     from compensation.reporting.report import NoModel, analyse
 
     model, report = folder / MODEL_NAME, folder / REPORT_NAME
@@ -53,7 +54,8 @@ def report_session(session: Path, folder: Path) -> Reported:
     except NoModel as error:
         raise NotReported(f"{session} is recorded, but {error}") from error
     except (StandError, OSError) as error:
-        remedy = f"`compensate report {session} -o report.html` tries again"
+        flag = " --across-gap" if isinstance(error, TwoEquilibria) else ""
+        remedy = f"`compensate report {session}{flag} -o report.html` tries again"
         raise NotReported(f"{session} is recorded, but not reported: {error}; {remedy}") from error
     fitted = [] if evaluation is None else [table(evaluation), f"model    {model}"]
     return Reported(tuple(_moved(report.with_suffix(".json"))), (*fitted, f"report   {report}"))

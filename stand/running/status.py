@@ -32,7 +32,8 @@ STATES: dict[Phase, State] = {
 class StatusBoard:
     """A subscriber of the hub that remembers what an operator asks for. `held` gives why the guard holds the run.
 
-    priced_s: what each step was expected to take before the run, by its id.
+    priced_s: what each step was expected to take before the run, by its id. soaked_again_s: for how long a camera
+    that was off has been soaked again, None when it need not be.
     """
 
     def __init__(
@@ -45,9 +46,11 @@ class StatusBoard:
         held: Callable[[], Fault | None],
         recorder: Recorder,
         clock: Clock,
+        soaked_again_s: Callable[[], float | None] = lambda: None,
     ) -> None:
         self.priced_s = {step.planned.step_id: step.duration_s for step in night.steps}
         self._recipe = recipe
+        self._soaked_again_s = soaked_again_s
         self._eta = Eta(night.steps, state.done, state.earned_s, night.after_s)
         self._gate = gate
         self._stop = stop
@@ -91,7 +94,7 @@ class StatusBoard:
             recipe=self._recipe,
             step=self._step,
             steps=self._eta.count,
-            doing=self._doing,
+            doing=self._doing_now(),
             state=self._state,
             reasons=tuple(sorted(self._gate.reasons)),
             now_ns=now_ns,
@@ -112,6 +115,14 @@ class StatusBoard:
             fault_rule="" if fault is None else fault.rule,
             fault="" if fault is None else fault.text,
         )
+
+    def _doing_now(self) -> str:
+        """The step under way in words; before that a camera that was off comes to equilibrium."""
+        soaked_s = self._soaked_again_s()
+        if soaked_s is None:
+            return self._doing
+        soaking = f"the camera was or may have been off and soaks again, for {soaked_s / 60:.0f} min so far"
+        return f"{soaking}; then: {self._doing}" if self._doing else soaking
 
     def left_s(self, now_ns: int) -> float:
         """How long the run still takes, from now on."""

@@ -104,6 +104,17 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
     assert offsets_ns == (0, 3600 * NS_PER_S, 3540 * NS_PER_S)
 
 
+def test_the_board_says_that_a_camera_soaks_again_and_for_how_long():
+    recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
+    soaked: list[float | None] = [720.0, None]
+    clock = Host().clock()
+    board = StatusBoard(
+        "night", Night(()), RunState(()), Gate(), Stop(), lambda: None, recorder, clock, lambda: soaked.pop(0)
+    )
+    assert board.status().doing == "the camera was or may have been off and soaks again, for 12 min so far"
+    assert board.status().doing == ""
+
+
 async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_path: Path):
     path = session(tmp_path, "night")
     async with served(ADesk("interlock", run=STATUS), path) as desk:

@@ -6,8 +6,9 @@ import json
 
 import pytest
 
+from compensation.one_equilibrium import TwoEquilibria
 from compensation.reporting import report
-from stand.running.session_report import report_session
+from stand.running.session_report import NotReported, report_session
 
 MOVED = "the image moved by +30 (1) mpx along I and -40 (1) along J (standard uncertainty)"
 
@@ -27,3 +28,14 @@ def test_a_step_and_slips_are_said_when_the_night_is_reported(tmp_path, monkeypa
         "warning: a joint sticks and slips",
         f"report   {tmp_path / 'report.html'}",
     ]
+
+
+def test_a_session_across_a_gap_is_reported_by_hand_with_the_option_that_allows_it(
+    tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise TwoEquilibria("its frames are of two equilibria")
+
+    monkeypatch.setattr(report, "analyse", refused)
+    with pytest.raises(NotReported, match=r"night --across-gap -o report\.html` tries again$"):
+        report_session(tmp_path / "night", tmp_path)
