@@ -124,6 +124,7 @@ def _only(made: Observations, keep: Mask) -> Observations:
     return replace(made, reasons=tuple("" if kept else "left out" for kept in keep.tolist()))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_says_when_and_how_far(tmp_path: Path) -> None:
     made, model = bumped().observed, fitted()
     write_report(tmp_path / "report.html", made, model, evaluate(model, made))

@@ -47,6 +47,7 @@ def test_what_repeats_is_no_slip() -> None:
     assert "at most" in found.text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_says_so(tmp_path: Path) -> None:
     camera = replace(drawn_camera(2300, "stick_slip"), slip_K=4.0, slip_px_per_K=0.005 * DIRECTION)
     observed = night(camera, full_night(), 2300).observed

@@ -104,7 +104,7 @@ def test_frames_of_a_position_are_averaged(laboratory: Laboratory, camera: Camer
 
 
 def test_the_tables_repeatability_is_told_by_v0_seen_again(laboratory: Laboratory, camera: Camera):
-    many = (24.0,) * 30
+    many = (24.0,) * 18
     moving = undrifted(laboratory, camera, table_mm=(0.001, 0.0, 0.004), temperatures_degC=many)
     assert moving.table_um == pytest.approx([1, 0, 4], rel=0.25, abs=0.3)
     normalised = (moving.translation_um / moving.u_um)[1:]

@@ -36,13 +36,13 @@ experiments:
       equilibrium_s: 120
       set_points_degC: [30, 20, 26, 22]
       held_out_degC: [22]
-      dwell_s: 300
+      dwell_s: 120
       reference_frames: 2
   - validation:
       temperatures_degC: [24, 30]
       positions: [{linear_mm: 20, rotary_deg: 0}, {linear_mm: 25, rotary_deg: 4}]
       equilibrium_s: 120
-      dwell_s: 300
+      dwell_s: 120
       reference_frames: 1
       frames_per_position: 1
 """
