@@ -1,15 +1,17 @@
 """Three cameras that expose together in real time behind one simulated switch with a small buffer."""
 
 import asyncio
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.sim.gige.switch import Switch
-from foundation.clock import WallClock
+from foundation.clock import WallClock, seconds_ns
 from foundation.hub import Hub
+from foundation.readings import Frame
 from stand.assembly import assemble
 from stand.config.stand_config import StandConfig
 from stand.simulator import Simulator, laboratory_of, relocated
@@ -24,34 +26,60 @@ def test_what_a_switch_cannot_hold_is_lost():
     assert switch.lost == 1
 
 
-@pytest.fixture
-def three() -> Iterator[StandConfig]:
+@contextmanager
+def three_of(*, still: bool, **size_px: int) -> Generator[StandConfig]:
+    """Three cameras of a size, by default of the whole sensor; still: their pictures are rendered before."""
     require_aravis()
     data = simulated()
-    size = {"width_px": 1224, "height_px": 1024, "packet_size": 8000, "boot_s": 0.2, "poll_s": 5.0}
+    size = {"packet_size": 8000, "boot_s": 0.2, "poll_s": 5.0, **size_px}
     data["cameras"]["camera"] |= size
     for number, name in enumerate(["left", "right"]):
         data["cameras"][name] = {"address": f"127.0.0.{41 + number}", "serial_number": f"TS-{number}", **size}
     config = StandConfig.model_validate(data)
-    simulator = Simulator(laboratory_of(config, virtual=False, seed=None, is_anywhere=True))
-    yield relocated(config, simulator.addresses)
-    simulator.stop()
+    laboratory: dict[str, Any] = laboratory_of(config, virtual=False, seed=None, is_anywhere=True)
+    for camera in laboratory["cameras"].values():
+        camera["still"] = still
+    simulator = Simulator(laboratory)
+    try:
+        yield relocated(config, simulator.addresses)
+    finally:
+        simulator.stop()
 
 
-async def together(config: StandConfig, tmp_path: Path, frames: int) -> tuple[int, int]:
-    """Frames that came and frames that were lost, of three cameras."""
+@pytest.fixture
+def three() -> Iterator[StandConfig]:
+    with three_of(still=False, width_px=1224, height_px=1024) as config:
+        yield config
+
+
+async def together(config: StandConfig, frames: int, period_s: float = 0.0) -> tuple[int, int, float]:
+    """Frames that came and frames that were lost, of three cameras; by how much the last were late, s."""
     assembly = assemble(config, Hub(), WallClock())
     supply, cameras = assembly.stand.imaging.supply, assembly.devices.cameras
     await assembly.bus.open()
     await assembly.devices.relays.open()
     await supply.switch_on()
-    came = [await asyncio.gather(*(camera.grab() for camera in cameras.values())) for _ in range(frames)]
+    await asyncio.gather(*(camera.grab() for camera in cameras.values()))  # the first opens the stream
+    begin_ns, came = assembly.clock.now_ns(), list[list[Frame]]()
+    for number in range(1, frames + 1):
+        due_ns = begin_ns + number * seconds_ns(period_s)
+        came.append(await asyncio.gather(*(camera.grab(None, due_ns) for camera in cameras.values())))
+    late_s = max(frame.time_ns for frame in came[-1]) / 1e9 - (begin_ns / 1e9 + frames * period_s)
     await supply.switch_off()
     await assembly.bus.close()
     shots = [frame for each in came for frame in each]
-    assert all(np.asarray(frame.image).shape == (1024, 1224) for frame in shots)
-    return len(shots), sum(frame.dropped for frame in shots)
+    size = config.cameras["camera"].height_px or 2048, config.cameras["camera"].width_px or 2448
+    assert all(np.asarray(frame.image).shape == size for frame in shots)
+    return len(shots), sum(frame.dropped for frame in shots), late_s
 
 
-async def test_three_cameras_that_leave_room_for_each_other_lose_nothing(three: StandConfig, tmp_path: Path):
-    assert await together(three, tmp_path, frames=4) == (12, 0)
+async def test_three_cameras_that_leave_room_for_each_other_lose_nothing(three: StandConfig):
+    assert (await together(three, frames=4))[:2] == (12, 0)
+
+
+@pytest.mark.nightly
+async def test_three_cameras_of_5_MP_at_two_frames_a_second_lose_nothing_and_keep_the_time():
+    with three_of(still=True) as config:
+        came, lost, late_s = await together(config, frames=40, period_s=0.5)
+    assert (came, lost) == (120, 0)
+    assert late_s < 0.5
