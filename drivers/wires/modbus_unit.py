@@ -117,16 +117,20 @@ class ModbusUnit:
     async def command(self, command_name: str) -> None:
         """Send a command of the map, all its writes in order, and see it confirmed."""
         command = self.map.commands[command_name]
+        is_sent = False  # whole: what confirms it may be the effect of its first write alone
 
         async def send() -> None:
+            nonlocal is_sent
+            is_sent = len(command.steps) == 1
             for step in command.steps:
                 if self.map.transport.write_fc == 6:
                     await self._bus.write_register(self.name, self._unit, step.address, step.value)
                 else:
                     await self._bus.write_registers(self.name, self._unit, step.address, [step.value])
+            is_sent = True
 
         async def holds() -> bool:
-            for _ in range(CONFIRM_LOOKS):
+            for _ in range(CONFIRM_LOOKS if is_sent else 0):
                 if is_confirmed(command, await self.snapshot([command.confirm.point])):
                     return True
             return False

@@ -100,12 +100,15 @@ class _Regulator:
 
 class FakeEurotherm(_Regulator):
     """3200 series: integers in 0.1 degC. Powers up in automatic at its local set point (`local_degC`, EEPROM). A remote
-    set point that is not refreshed for 10 s is given up, with its bit in the status. Fault: sensor_break."""
+    set point that is not refreshed for 10 s is given up, with its bit in the status. Manual begins with the output that
+    automatic had. Faults: sensor_break; loop_break; lost (the next write to this register never arrives)."""
 
     def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
         super().__init__(plant, clock, unit)
         self.local_degC = 20.0
         self.sensor_break = False
+        self.loop_break = False
+        self.lost: int | None = None
         self.manual = False
         self._remote_degC = 0.0
         self._remote_since_ns: int | None = None
@@ -144,7 +147,14 @@ class FakeEurotherm(_Regulator):
 
     def _status(self) -> int:
         lost = self._remote_selected and not self._remote_lives
-        return self.manual << 4 | self.sensor_break << 5 | lost << 14
+        return self.manual << 4 | self.sensor_break << 5 | self.loop_break << 6 | lost << 14
+
+    def handle(self, pdu: bytes) -> bytes | None:
+        """None for a request that has not arrived."""
+        if self.lost is not None and pdu[0] == 0x06 and int.from_bytes(pdu[1:3], "big") == self.lost:
+            self.lost = None
+            return None
+        return super().handle(pdu)
 
     def _write_words(self, address: int, words: Sequence[int]) -> None:
         if len(words) != 1:

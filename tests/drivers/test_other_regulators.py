@@ -117,6 +117,32 @@ async def test_a_make_that_is_silent_says_what_to_look_at(make: str):
             await regulator.read()
 
 
+async def test_a_stop_of_which_the_second_write_is_lost_is_sent_again_whole():
+    """Manual is confirmed by its bit, and begins with the output that automatic had: that bit alone is no stop."""
+    bench = Bench("eurotherm-3200")
+    async with driven(bench, map_of("eurotherm-3200")) as regulator:
+        await regulator.open()
+        await regulator.set_temperature(60.0)
+        await regulator.run()
+        bench.wait(5.0)
+        assert by_name(await regulator.read())["mv_heat"].value == 100
+        assert isinstance(bench.fake, FakeEurotherm)
+        bench.fake.lost = 3
+        await regulator.stop()
+        bench.wait(5.0)
+        assert by_name(await regulator.read())["mv_heat"].value == 0
+        assert bench.plant.heater_on_fraction == 0
+
+
+async def test_a_loop_break_is_told():
+    bench = Bench("eurotherm-3200")
+    async with driven(bench, map_of("eurotherm-3200")) as regulator:
+        await regulator.open()
+        assert isinstance(bench.fake, FakeEurotherm)
+        bench.fake.loop_break = True
+        assert by_name(await regulator.read())["fault"].reason.startswith("loop_break")
+
+
 async def test_a_remote_set_point_that_is_not_refreshed_is_given_up_for_the_local_one():
     """What keeps the chamber safe when the computer dies; told by a bit while it lives."""
     bench = Bench("eurotherm-3200")
