@@ -30,7 +30,7 @@ def test_what_a_switch_cannot_hold_is_lost():
 def three_of(*, still: bool, **size_px: int) -> Generator[StandConfig]:
     """Three cameras of a size, by default of the whole sensor; still: their pictures are rendered before."""
     require_aravis()
-    data = simulated()
+    data: dict[str, Any] = simulated()
     size = {"packet_size": 8000, "boot_s": 0.2, "poll_s": 5.0, **size_px}
     data["cameras"]["camera"] |= size
     for number, name in enumerate(["left", "right"]):
