@@ -6,6 +6,7 @@ import platform
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
 
 import cv2
@@ -40,7 +41,7 @@ from tests.bench import (
     warp,
     ximc,
 )
-from tests.bench.figures import Figure, progress, table
+from tests.bench.figures import Figure, progress, skipped, table
 
 BENCHMARKS = {
     "virtual_time": virtual_time.figures,
@@ -75,19 +76,27 @@ BENCHMARKS = {
 
 
 def main() -> None:
-    """Run the benchmarks and print what there is, also when one fails or is interrupted."""
+    """Run the benchmarks and print what there is, also when interrupted; one that fails does not keep the others."""
     unknown = [name for name in sys.argv[1:] if name not in BENCHMARKS]
     if unknown:
         sys.exit(f"no benchmark {', '.join(unknown)}; there are {', '.join(BENCHMARKS)}")
     found: list[Figure] = []
+    failed: list[str] = []
     begin_s = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
             for name in sys.argv[1:] or BENCHMARKS:
                 progress(f"[{time.monotonic() - begin_s:4.0f} s] {name}")
-                found += BENCHMARKS[name](Path(folder))
+                try:
+                    found += BENCHMARKS[name](Path(folder))
+                except Exception as error:  # noqa: BLE001 - whatever it is, the others are wanted
+                    traceback.print_exc()
+                    found.append(skipped(name, f"failed: {error}"))
+                    failed.append(name)
     finally:
         sys.stdout.write(f"\n{_machine()}, {time.monotonic() - begin_s:.0f} s\n\n{table(found)}")
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}")
 
 
 def _machine() -> str:
