@@ -57,9 +57,9 @@ THIRD = RECIPE.format(points=UNSEEN, held_out=UNSEEN, dwell_s=5400, until="null"
 # Of the cycle's time. Measured: 0.28 and 0.42; steps of 3 and 4 K save more, steps of 14 K hardly anything.
 LEAST_SAVED = {"settled": 0.25, "hurried": 0.38}
 # The paper's form knows nothing of a lens that is still on its way, so shorter dwells cost it accuracy. Measured, true
-# RMS along I and J, mpx: 2.2 and 26.3 after fixed dwells, 2.1 and 29.3 settled, 2.7 and 36.8 hurried.
+# RMS along I and J, mpx: 2.2 and 26.2 after fixed dwells, 2.1 and 29.0 settled, 2.6 and 36.2 hurried.
 PAPER_MOST_WORSE = {"settled": 1.25, "hurried": 1.5}
-# The thermal form does. Measured: 1.2 and 3.9, 1.4 and 4.2, 1.8 and 6.1 (once 1.9 and 4.8).
+# The thermal form does. Measured: 1.4 and 4.5, 2.1 and 4.1, 2.8 and 6.2.
 THERMAL_MOST_WORSE_MPX = {"settled": 1.5, "hurried": 3.5}
 
 
