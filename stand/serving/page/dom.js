@@ -33,7 +33,9 @@ export function clock(utc_s, with_seconds = false) {
 export function day_clock(utc_s) {
   const date = new Date(utc_s * 1000);
   const is_today = Math.abs(utc_s - Date.now() / 1000) < 12 * 3600;
-  const day = date.toLocaleDateString([], { weekday: "short", day: "numeric", month: "short" });
+  const options = { weekday: "short", day: "numeric", month: "short" };
+  if (date.getFullYear() !== new Date().getFullYear()) options.year = "numeric";
+  const day = date.toLocaleDateString([], options);
   return is_today ? clock(utc_s) : `${day} ${clock(utc_s)}`;
 }
 

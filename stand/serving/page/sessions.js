@@ -17,7 +17,7 @@ export class Sessions {
     this.search = h("input", { type: "search", placeholder: "search", "aria-label": "Search sessions by name, recipe, operator or tag", oninput: () => this.show() });
     this.compare_button = h("button", { type: "button", disabled: true, onclick: () => this.compare() }, "Show");
     this.comparison = h("section", { class: "panel", hidden: true });
-    const head = ["", "session", "recipe", "began", "took", "frames", "size", "run", "files", ""].map((name) => h("th", { scope: "col" }, name || h("span", { class: "unseen" }, "actions")));
+    const head = ["", "session", "recipe", "began", "took", "frames", "size", "run", "files", ""].map((name) => h("th", { scope: "col", class: ["took", "frames", "size"].includes(name) ? "number" : undefined }, name || h("span", { class: "unseen" }, "actions")));
     fill(place, h("div", { class: "stack" },
       this.comparison,
       h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Sessions"), this.search, this.compare_button), this.answer,
@@ -40,7 +40,7 @@ export class Sessions {
     fill(this.rows, found.slice(0, MOST_ROWS).map((each) => this.row(each)));
     this.table.hidden = !found.length;
     const none = this.sessions?.length ? "no session matches the search" : "No session is recorded here yet. Each run makes one, and so does each day.";
-    tell(this.answer, found.length ? (found.length > MOST_ROWS ? `the latest ${MOST_ROWS} of ${found.length}` : "") : none);
+    tell(this.answer, found.length ? (found.length > MOST_ROWS ? `the latest ${MOST_ROWS} of ${found.length}; the search finds the others` : "") : none);
     this.choose();
   }
 
