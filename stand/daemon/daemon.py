@@ -126,7 +126,7 @@ class Daemon:
         if self.has_guest:
             return "a run has the stand; `stand stop` ends it"
         if self.house.latched is not None:
-            return f"the stand has tripped, and nobody has cleared it: {self.house.latched.text}"
+            return f"the stand has tripped: {self.house.latched.text}; `stand clear` once the cause is removed"
         reasons = self._assembly.stand.gate.reasons
         return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
 

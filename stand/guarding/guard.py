@@ -172,7 +172,7 @@ class Guard:
             return
         self._endings_ns.append(now_ns)
         self.held = None
-        text = f"what held the stand is over, and it goes on; it was: {fault.text}"
+        text = f"the stand is held no longer, and continues; it was held because {fault.text}"
         self.hub.publish(Event(now_ns, "warning", "hold_ended", text, data))
         self.release()
 

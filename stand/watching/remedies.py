@@ -16,12 +16,24 @@ _OF_REASON = {
     DISK_LOW: _ROOM,
     NOT_RECORDED: _DISK,
 }
+_CONNECTED = "`stand devices` shows what is connected"
+_SEE_DISK = "see that the disk has room and answers"
 _OF_KIND = {
+    "by_hand_failed": _CONNECTED,
+    "camera_not_opened": _CONNECTED,
+    "device_slow": _CONNECTED,
+    "flap_not_shut": "see what blocks the flap, or close it by hand",
+    "journal_not_saved": _DISK,
+    "readings_dropped": _DISK,
+    "compressor_not_kept": _SEE_DISK,
+    "daemon_not_kept": _SEE_DISK,
+    "house_not_recorded": _SEE_DISK,
+    "queue": "`stand queue list` shows the queue",
     "prompt": "`stand continue` when it is done",
     "hold_stays": _OF_REASON[INTERLOCK],
     "camera_lost": _OF_REASON[CAMERA_LOST],
-    "camera_supply_off": "`stand devices` shows what is connected",
-    "device_lost": "`stand devices` shows what is connected",
+    "camera_supply_off": _CONNECTED,
+    "device_lost": _CONNECTED,
     "frames_stopped": _ROOM,
     "telemetry_not_saved": _DISK,
     "disk_nearly_full": _ROOM,
