@@ -178,6 +178,17 @@ def test_the_page_states_what_was_stated_and_what_was_not(sheet: Datasheet, tmp_
         load_details(stated)
 
 
+def test_the_page_says_where_it_holds_what_measured_it_and_how_the_uncertainty_is_made(sheet: Datasheet):
+    page = datasheet_page(sheet)
+    low, high = sheet.air_degC
+    for text in ("Valid for", f"{low:.1f} to {high:.1f} °C", "Not covered", "Measured with", "Software", "numpy"):
+        assert text in page
+    for text in ("type A", "type B", "k = 2"):
+        assert text.lower() in page.lower()
+    for one in sheet.quantities:
+        assert one.name in page
+
+
 @pytest.mark.parametrize(
     ("value", "expanded", "texts"),
     [
