@@ -90,3 +90,20 @@ async def test_a_night_is_begun_watched_paused_and_stopped_in_a_browser(served_p
         await page.locator("#phase", has_text="Idle").wait_for()
         await page.goto(f"http://127.0.0.1:{port}/#now")
         await page.locator(".events", has_text="Roll the camera").wait_for()  # of before the restart
+
+
+async def test_a_run_begun_by_the_form_goes_on_without_a_browser(served_page):
+    served, port = served_page()
+    await until(served, lambda state: state.phase == "idle" and len(state.readings) > 10)
+    async with browser() as chromium:
+        async with a_page(chromium, port, "queue") as page:
+            page.set_default_timeout(120_000)
+            await page.locator("#recipe option", has_text="trial").wait_for(state="attached")
+            await page.locator("#recipe").select_option("trial")
+            await page.get_by_text("A quarter of an hour").wait_for()
+            await page.get_by_role("button", name="Add to the queue").click()
+            await page.get_by_text("is queued").wait_for()
+        await until(served, lambda state: state.run is not None and state.run.step > 1)
+        async with a_page(chromium, port, "sessions") as page:
+            page.set_default_timeout(120_000)
+            await page.locator(".sessions tr", has_text="running").filter(has_text="trial").wait_for()
