@@ -19,9 +19,9 @@ import math
 import numpy as np
 
 PLACE, CAMERA, AMBIENT, SWITCHED_ON, HISTORY, STATE = 1, 2, 4, 8, 16, 32
-"""Flags: the point is outside the markers' hull; the camera's temperature, the air's temperature or its rate of change
-are outside the calibrated range; the camera was switched on too recently; it has not been followed for long enough;
-each is in its range, but not in this combination."""
+"""Flags: the point is outside the markers' hull; the camera's temperature, or the air's (in older models also its
+rate of change), is outside the calibrated range; the camera was switched on too recently; it has not been followed for
+long enough; each is in its range, but not in this combination."""
 
 RATE_TAU_S = 600.0
 """The ambient's rate of change is that of its 10 min lag."""

@@ -16,7 +16,7 @@
 enum {
     DRIFT_PLACE = 1,        /* outside the markers' hull */
     DRIFT_CAMERA = 2,       /* the camera's temperature is outside the calibrated range */
-    DRIFT_AMBIENT = 4,      /* the air's temperature, or how fast it changes */
+    DRIFT_AMBIENT = 4,      /* the air's temperature, in older models also how fast it changes */
     DRIFT_SWITCHED_ON = 8,  /* the camera was switched on too recently */
     DRIFT_HISTORY = 16,     /* the camera has not been followed for long enough */
     DRIFT_STATE = 32        /* each is in its range, but not in this combination */
