@@ -23,6 +23,7 @@ MAP = load_register_map(Path(__file__).parents[2] / "configs" / "registers" / "o
 
 PV, STATUS_LOW, MV_HEAT, MV_COOL, SP = 0x2000, 0x2001, 0x2004, 0x2005, 0x2103
 STATUS_0, STATUS_16, DECIMAL_POINT, MV_AT_PV_ERROR = 0x2406, 0x2407, 0x2410, 0x2711
+MV_AT_STOP = 0x270F
 RAM_MODE, AUTOTUNE, STOPPED, WRITING, MANUAL = 1 << 4, 1 << 7, 1 << 8, 1 << 9, 1 << 10  # of STATUS_16
 AD_ERROR, SENSOR_BREAK = 1 << 2, 1 << 6  # of STATUS_LOW
 
@@ -32,7 +33,8 @@ class E5cc:
 
     def __init__(self) -> None:
         self.words = {0: 0, PV: 235, STATUS_LOW: 0, 0x2002: 250, 0x2003: 0, MV_HEAT: 425, MV_COOL: 0, SP: 250}
-        self.words |= {STATUS_0: 0, STATUS_16: STOPPED, DECIMAL_POINT: 1, MV_AT_PV_ERROR: 0, 0x2E06: 1, 0x2E07: 2}
+        self.words |= {STATUS_0: 0, STATUS_16: STOPPED, DECIMAL_POINT: 1, MV_AT_PV_ERROR: 0, MV_AT_STOP: 0}
+        self.words |= {0x2710: 0, 0x2E06: 1, 0x2E07: 2}
         self.commands: list[int] = []
         self.requests = 0
         self.eeprom_writes = 0
@@ -227,6 +229,7 @@ async def test_after_being_unreachable_the_start_up_runs_again_even_when_the_bit
     [
         (DECIMAL_POINT, 0, "decimal_point is 0 where the register map expects 1"),
         (MV_AT_PV_ERROR, 300, "mv_at_pv_error is 30 where"),
+        (MV_AT_STOP, 250, "mv_at_stop is 25 where"),
         (0x2E07, 1, "output_2 is 1 where"),
     ],
 )
