@@ -29,7 +29,8 @@ from tests.recording.damage import (
     write_segment,
 )
 
-TRIALS = 200
+TRIALS = [60, pytest.param(1000, marks=pytest.mark.nightly)]
+"""Places at which a file is damaged, by day and by night."""
 SERIES = [TELEMETRY, FRAMES]
 
 
@@ -79,11 +80,12 @@ def metadata_of(path, name):
         return next(record.metadata for record in make_reader(file).iter_metadata() if record.name == name)
 
 
+@pytest.mark.parametrize("trials", TRIALS)
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)
-def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, series, damage):
+def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, series, damage, trials):
     rng = random.Random(f"{series} {damage.__name__}")
-    for offset in rng.sample(range(len(night[1][series, "part"].data)), TRIALS):
+    for offset in rng.sample(range(len(night[1][series, "part"].data)), trials):
         folder, path, written = damaged(series, lambda data, at=offset: damage(data, at, rng))
         data = path.read_bytes()
         (done,) = salvage_session(folder.parent)
