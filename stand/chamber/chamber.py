@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from drivers.devices.climate_chamber import ClimateChamber
 from drivers.devices.protocols import Controller, Switches
 from drivers.devices.software_regulator import SoftwareRegulator
 from foundation.clock import Clock, boot_of, seconds_ns
-from foundation.errors import ConfigError, DeviceFault, Occupied
+from foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied
 from foundation.hub import Hub
 from foundation.items import Event
 from stand.chamber.compressor import restored
@@ -63,15 +64,24 @@ class Chamber:
         self.keeper = Keeper(self.permits, regulator, hub, clock, limits.renew_s, coils_read)
 
     async def start(self, setpoint_degC: float) -> None:
-        """Permit heating and cooling, set the set-point, run the regulator; done when the set-point is there."""
+        """Permit heating and cooling, set the set-point, run the regulator; done when the set-point is there. What fails
+        before the regulator runs leaves no permission."""
         way_degC = await self._way_to(setpoint_degC)
         asked = self._asked = object()
         await self._send(way_degC[0])
         self._interlock.check()  # after every wait: a fault may have closed it meanwhile
         self.permits.grant()
-        await self.keeper.beat()
-        self._interlock.check()
-        await self._regulator.run()
+        try:
+            await self.keeper.beat()
+            self._interlock.check()
+            await self._regulator.run()
+        except DeviceError:
+            with suppress(DeviceError):  # then the relays drop by themselves: they are not renewed
+                await self.permits.make_safe()
+            raise
+        except BaseException:
+            self.permits.revoke()
+            raise
         await self._walk(way_degC[1:], asked)
 
     async def set_temperature(self, setpoint_degC: float) -> None:
@@ -121,11 +131,13 @@ class Chamber:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_OCCUPIED_AGAIN_S))
 
     async def stop(self) -> None:
-        """Stop the regulator; heating and cooling lose their permission at once."""
+        """Stop the regulator; heating and cooling lose their permission at once, also when it does not stop."""
         self._asked = object()
         self.permits.revoke()
-        await self._regulator.stop()
-        await self.permits.make_safe()
+        try:
+            await self._regulator.stop()
+        finally:
+            await self.permits.make_safe()
 
     async def test_dead_man(self, *, is_timed: bool = False) -> None:
         """Test the relay board's timer on the heater's relay while the regulator is stopped, and the watchdog of a

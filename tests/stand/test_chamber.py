@@ -24,6 +24,26 @@ async def test_heat_is_permitted_after_the_set_point_and_before_the_regulator_ru
         assert not here.stand.chamber.permits.granted
 
 
+async def test_a_regulator_that_does_not_run_leaves_no_permission_to_heat():
+    async with rooms() as here:
+        starting = asyncio.create_task(here.stand.chamber.start(45.0))
+        await here.passes(1.5)
+        here.regulator.failures.append(DeviceFault("regulator", "heat_module: it gives 12.00 mA"))
+        with pytest.raises(DeviceFault, match="12.00 mA"):
+            await starting
+        assert here.relays.on == set()
+        assert not here.stand.chamber.permits.granted
+
+
+async def test_a_regulator_that_does_not_stop_does_not_keep_the_heaters_relay_on():
+    async with rooms() as here:
+        await here.stand.chamber.start(45.0)
+        here.regulator.failures.append(DeviceFault("regulator", "heat_module: it gives 12.00 mA"))
+        with pytest.raises(DeviceFault, match="12.00 mA"):
+            await here.stand.chamber.stop()
+        assert here.relays.on == set()
+
+
 @pytest.mark.parametrize("setpoint_degC", [-10.1, 60.1, float("nan")])
 async def test_a_set_point_outside_the_limits_reaches_no_device(setpoint_degC: float):
     async with rooms() as here:
