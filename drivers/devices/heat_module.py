@@ -20,6 +20,8 @@ from foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Un
 from foundation.readings import Reading
 
 _TOLERANCE_mA = 0.1  # of what reads back: the modules are good to 0.02 mA
+_TOLERANCE_s = 0.05  # of its watchdog's time, which it keeps in tenths
+_CHECKED_EVERY_S = 10.0  # that it would still end the heat by itself
 _TESTED = 1.5  # watchdog_s, for which it is left alone, and then written to
 _WATCHDOG, _TRIPPED, _TIME = "watchdog_on", "tripped", "watchdog_s"
 
@@ -70,6 +72,7 @@ class HeatModule:
         self._lock = asyncio.Lock()  # a write and what is read back stay together
         self._is_safe = False  # whether its safe value has been read back
         self._armed_ns: int | None = None  # when its watchdog was last refreshed; None: it is off
+        self._checked_ns = 0  # when its watchdog and safe value were last read
         self._left_mA: float | None = None  # by the last write that was confirmed
         self._trip = ""  # why it gives no heat until it is armed again
         self._last: tuple[Reading, ...] = ()
@@ -113,17 +116,20 @@ class HeatModule:
             await self._zero()
             if await self._is(_TRIPPED):
                 raise DeviceFault(self.name, "its host watchdog trips as soon as it is cleared")
-            self._armed_ns, self._trip = self._clock.now_ns(), ""
+            self._armed_ns = self._checked_ns = self._clock.now_ns()
+            self._trip = ""
 
     async def give(self, percent: float, *, at_once: bool = False) -> None:
         """The heat from now on; at_once has no meaning here. Also refreshes the watchdog. DeviceFault when it does not
-        give what it was left at, which ends with zero, or has tripped, which lasts until it is armed again."""
+        give what it was left at, which ends with zero, or when it has tripped, or somebody has changed what it does
+        without us, which lasts until it is armed again."""
         async with self._lock:
             if self._armed_ns is None:
                 raise DeviceFault(self.name, "gives no heat: it was not armed")
             if self._trip:
                 raise DeviceFault(self.name, self._trip)
             await self._compare()
+            await self._check_dead_man()
             settings = self._settings
             wanted_mA = settings.zero_mA + (settings.full_mA - settings.zero_mA) * min(100.0, max(0.0, percent)) / 100
             self._left_mA = None  # until the write is confirmed
@@ -202,6 +208,24 @@ class HeatModule:
             await self._zero()
             text = f"gave {given_mA:.2f} mA where it was left at {left_mA:.2f} mA; does something else write to it?"
             raise DeviceFault(self.name, text)
+
+    async def _check_dead_man(self) -> None:
+        """Now and then: would it still end the heat when this program dies, as when it was armed?"""
+        if self._clock.now_ns() - self._checked_ns < seconds_ns(_CHECKED_EVERY_S):
+            return
+        settings, found = self._settings, await self._unit.snapshot([_WATCHDOG, _TIME, self._safe])
+        safe_mA, watchdog_s = (found.samples[point].value for point in (self._safe, _TIME))
+        changes = [
+            (not found.bits[_WATCHDOG], "its host watchdog was switched off"),
+            (not abs(watchdog_s - settings.watchdog_s) <= _TOLERANCE_s, f"its {_TIME} is {watchdog_s:g}"),
+            (not abs(safe_mA - settings.tripped_mA) <= _TOLERANCE_mA, f"it gives {safe_mA:g} mA when it is left alone"),
+        ]
+        if changed := [text for is_so, text in changes if is_so]:
+            await self._zero()
+            text = "; somebody has changed that: it gives no heat until control is started again"
+            self._trip = f"{', '.join(changed)}{text}"
+            raise DeviceFault(self.name, self._trip)
+        self._checked_ns = self._clock.now_ns()
 
     async def _zero(self) -> None:
         """Confirmed by what it gives; a module that has tripped takes nothing, and gives its safe value."""

@@ -64,8 +64,8 @@ class Chamber:
         self.keeper = Keeper(self.permits, regulator, hub, clock, limits.renew_s, coils_read)
 
     async def start(self, setpoint_degC: float) -> None:
-        """Permit heating and cooling, set the set-point, run the regulator; done when the set-point is there. What fails
-        before the regulator runs leaves no permission."""
+        """Permit heating and cooling, set the set-point, run the regulator; done when the set-point is there. A
+        regulator that does not run leaves no permission."""
         way_degC = await self._way_to(setpoint_degC)
         asked = self._asked = object()
         await self._send(way_degC[0])

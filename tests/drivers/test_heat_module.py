@@ -198,6 +198,34 @@ async def test_what_another_master_writes_is_found_and_set_to_zero():
         assert bench.fake.output_mA() == 4.0
 
 
+CHANGED: list[tuple[Callable[[FakeHeatModule], object], str]] = [
+    (lambda fake: fake.safe_mA.__setitem__(1, 20.0), "it gives 20 mA when it is left alone"),
+    (lambda fake: fake.coils.update({260: False}), "its host watchdog was switched off"),
+    (lambda fake: setattr(fake, "timeout_tenths", 255), r"its watchdog_s is 25\.5"),
+]
+
+
+@pytest.mark.parametrize(("change", "text"), CHANGED, ids=["safe value", "watchdog off", "watchdog's time"])
+async def test_what_would_heat_on_without_us_since_somebody_changed_it_gives_no_heat(
+    change: Callable[[FakeHeatModule], object], text: str
+):
+    bench = Bench()
+    async with driven(bench) as module:
+        await module.arm()
+        await heating(bench, module, 50)
+        change(bench.fake)
+        with pytest.raises(DeviceFault, match=f"{text}; somebody has changed that"):
+            await heating(bench, module, 50, 14.0)
+        assert bench.fake.output_mA() == 4.0
+        with pytest.raises(DeviceFault, match=text):
+            await module.give(50)
+        assert bench.fake.output_mA() == 4.0
+        await module.arm()  # somebody starts control again: what was changed is set again
+        await heating(bench, module, 50)
+        assert (bench.fake.safe_mA[1], bench.fake.coils[260], bench.fake.timeout_tenths) == (4.0, True, 50)
+        assert bench.heater_W() > 0.0
+
+
 async def test_an_output_that_stays_on_is_not_confirmed_off():
     bench = Bench()
     async with driven(bench) as module:

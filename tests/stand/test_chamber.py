@@ -28,8 +28,8 @@ async def test_a_regulator_that_does_not_run_leaves_no_permission_to_heat():
     async with rooms() as here:
         starting = asyncio.create_task(here.stand.chamber.start(45.0))
         await here.passes(1.5)
-        here.regulator.failures.append(DeviceFault("regulator", "heat_module: it gives 12.00 mA"))
-        with pytest.raises(DeviceFault, match="12.00 mA"):
+        here.regulator.failures.append(DeviceFault("regulator", "it gives heat unasked"))
+        with pytest.raises(DeviceFault, match="it gives heat"):
             await starting
         assert here.relays.on == set()
         assert not here.stand.chamber.permits.granted
@@ -38,8 +38,8 @@ async def test_a_regulator_that_does_not_run_leaves_no_permission_to_heat():
 async def test_a_regulator_that_does_not_stop_does_not_keep_the_heaters_relay_on():
     async with rooms() as here:
         await here.stand.chamber.start(45.0)
-        here.regulator.failures.append(DeviceFault("regulator", "heat_module: it gives 12.00 mA"))
-        with pytest.raises(DeviceFault, match="12.00 mA"):
+        here.regulator.failures.append(DeviceFault("regulator", "it gives heat unasked"))
+        with pytest.raises(DeviceFault, match="it gives heat"):
             await here.stand.chamber.stop()
         assert here.relays.on == set()
 
