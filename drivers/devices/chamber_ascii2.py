@@ -106,7 +106,7 @@ class Language:
         fields = [values[field] for field in self._settings.write_fields]
         if degC is not None:
             self._way_degC = (fields[0], degC)
-        fields[0] = self._target_degC(fields[0])
+        fields[0] = self._target_degC(fields[0]) if degC is None else degC
         written = "".join(str(int(bits.get(index, digit == "1"))) for index, digit in enumerate(digits))
         request = self._bytes("E " + " ".join([*map(number, fields), written]))
         try:

@@ -51,8 +51,8 @@ def main() -> int:
         except ConfigError as error:
             print(f"{error}", file=sys.stderr)  # noqa: T201 - the laboratory stays as it is
         orphaned_s += _TICK_S * (os.getppid() != parent)
-    control.close()
     laboratory.close()
+    control.close()  # last: who finds it gone finds every other address free
     return 0
 
 

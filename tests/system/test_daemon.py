@@ -240,7 +240,7 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(serve
     assert tripped.fault is not None
     assert tripped.fault.rule == "folder_lost"
     served.until(lambda state: state.readings["relays.heater_enable"].value == 0)
-    with pytest.raises(SessionError, match="nobody has cleared"):
+    with pytest.raises(SessionError, match="the stand has tripped"):
         served.post("devices/regulator/set", arguments={"setpoint_degC": 30.0})
     served.submit(BRIEF)
     assert states_of(served.state()) == ["waiting"]

@@ -27,6 +27,7 @@ from stand.simulator import Simulator
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import telling
+from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, ignore
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
@@ -103,6 +104,7 @@ async def test_what_happened_before_the_recording_began_is_in_it(tmp_path: Path,
     daemon = Daemon(ordered, out)
     assert daemon.lives_for(1, "StepMark")
     daemon.kill()
+    await end_laboratory(ordered)
     (killed,) = out.iterdir()
     with pytest.raises(Interrupted):
         await run_virtual(order(SHORTER), out, None, at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT)))

@@ -175,7 +175,7 @@ def driven(seen: Seen, channel: str, read_ns: int) -> tuple[int, str]:
     if code == ERROR:
         return code, sentence
     if state.fault is not None:
-        return ERROR, f"the stand has tripped, and nobody has cleared it: {state.fault.text}"
+        return ERROR, f"the stand has tripped: {state.fault.text}; clear it once the cause is removed"
     if seen.drive.is_busy(read_ns):
         return BUSY, "under way"
     if code == IDLE and state.phase != "idle":
