@@ -44,6 +44,7 @@ _ENDS = Fault(STOPPED.rule, "the daemon was ended")
 _STOPPED_LOOK_S = 0.1  # whether the run has ended that was stopped
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
 _KEEP_EVERY_S, _READ_EVERY_S = 60.0, 5.0
+_ENDED_AGAIN_S = 5.0  # between two records that end by themselves
 
 
 class Daemon:
@@ -294,6 +295,8 @@ class Daemon:
                 if reading is None or reading.done():  # another program may have locked it
                     reading = self._beside(self._read_queue())
             may_begin = not (self.has_guest or self.orders.leaving)
+            if may_begin and self.house.disk is not None and (ended := self.house.disk.ended):
+                raise SessionError(f"{ended}; neither queue nor what the compressor did can be kept without it")
             if may_begin and self._is_midnight():
                 await self._turn_day()
             if may_begin and self._needs_record():
@@ -305,12 +308,12 @@ class Daemon:
                 self.note()
 
     def _needs_record(self) -> bool:
-        """A new one: when the last one has ended by itself and nobody has to look at that first; what the disk has
+        """A new one: when the last one has ended by itself, also while the stand is held for that; what the disk has
         refused is tried again after a while."""
-        recorder = self.record.recorder
+        recorder, waited_s = self.record.recorder, (self._clock.now_ns() - self._recorded_ns) / NS_PER_S
         if recorder is None:
-            return self._clock.now_ns() - self._recorded_ns >= _KEEP_EVERY_S * NS_PER_S
-        return bool(recorder.writer_ended) and self.house.latched is None
+            return waited_s >= _KEEP_EVERY_S
+        return bool(recorder.writer_ended) and waited_s >= _ENDED_AGAIN_S
 
     def _is_midnight(self) -> bool:
         """Whether the record is of yesterday; what the disk has refused is tried again after a while."""

@@ -6,18 +6,19 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from foundation.errors import SessionError
+from recording.writing.disk import MODULE
 from stand.running.order import Order
 from stand.serving.desk import StandState
 from tests.recording.disks import ext4, run
 from tests.system.conftest import FAST, require_aravis
-from tests.system.test_daemon import Served, is_idle
+from tests.system.test_daemon import LIMIT_S, Served, is_idle
 from tests.system.test_unrecorded_heat import SOAK
 
 LEAVES_WITHIN_S = 8.0  # 5 s on an idle machine; the waits take 3.6 s (tests/stand/test_leaving.py)
@@ -39,8 +40,51 @@ def served(tmp_path: Path, order: Callable[..., Order], simulator: Callable[...,
             served.process.communicate()
 
 
+def disk_processes(served: Served) -> list[int]:
+    """The daemon's own, which was started first, and that of the record between runs."""
+    tasks = Path(f"/proc/{served.process.pid}/task").iterdir()
+    children = {int(pid) for task in tasks for pid in (task / "children").read_text().split()}
+    return sorted(pid for pid in children if MODULE in Path(f"/proc/{pid}/cmdline").read_text().split("\0"))
+
+
+@pytest.fixture
+def begin(tmp_path: Path, laboratory: Path) -> Iterator[Callable[[], Served]]:
+    """Start daemons of this laboratory; whatever is left of them ends with the test."""
+    begun: list[Served] = []
+
+    def start() -> Served:
+        begun.append(Served(laboratory, tmp_path / "out"))
+        return begun[-1]
+
+    yield start
+    for each in begun:
+        each.process.kill()
+        each.process.communicate()
+
+
+def test_whichever_disk_process_is_killed_no_heat_goes_on_without_what_it_did(begin: Callable[[], Served]):
+    """That of the record between runs is replaced, and an operator may clear and heat again. Without its own the daemon
+    knows neither its queue nor keeps the compressor's rest: it ends, and the next one has both."""
+    served = begin()
+    served.until(is_idle)
+    served.post("devices/regulator/set", arguments={"setpoint_degC": 40.0})
+    served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
+    _, of_record = disk_processes(served)
+    os.kill(of_record, signal.SIGKILL)
+    served.until(lambda state: state.fault is not None and state.readings["relays.heater_enable"].value == 0)
+    served.until(lambda _: len(set(disk_processes(served)) - {of_record}) == 2)
+    served.until(lambda state: state.disk_free_bytes > 0)  # there is a record again
+    assert served.post("run/clear")["text"] == "cleared"
+    served.post("devices/regulator/set", arguments={"setpoint_degC": 40.0})
+    served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
+    os.kill(disk_processes(served)[0], signal.SIGKILL)
+    assert served.process.wait(LIMIT_S) == 1
+    assert "writes the session to the disk has ended (killed by SIGKILL); neither queue nor" in served.told()
+    assert begin().until(is_idle).readings["relays.heater_enable"].value == 0
+
+
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Generator[None]:
     path.parent.mkdir(exist_ok=True)
     with path.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
