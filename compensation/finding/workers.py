@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkstemp
 from typing import Any
 
 import cv2
@@ -37,9 +40,9 @@ def in_processes(workers: int) -> Work:
         left, tries = set(range(len(pieces))), 0
         while left:
             before = len(left)
-            with _pool(workers) as pool:
+            with TemporaryDirectory(prefix="thermostand-found-") as folder, _pool(workers) as pool:
                 try:
-                    for index, found in _finished(pool, pieces, sorted(left)):
+                    for index, found in _finished(pool, folder, pieces, sorted(left)):
                         left.discard(index)
                         yield index, found
                 except BrokenProcessPool as error:
@@ -54,23 +57,34 @@ def in_processes(workers: int) -> Work:
 
 
 def _finished(
-    pool: ProcessPoolExecutor, pieces: Sequence[Piece], indices: Iterable[int]
+    pool: ProcessPoolExecutor, folder: str, pieces: Sequence[Piece], indices: Iterable[int]
 ) -> Iterator[tuple[int, FoundMarkers]]:
     """As they are finished, also those that were when the pool broke."""
-    waiting: dict[Future[FoundMarkers], int] = {pool.submit(find_markers, pieces[index]): index for index in indices}
+    waiting: dict[Future[str], int] = {pool.submit(find_to_file, pieces[index], folder): index for index in indices}
     broken: BrokenProcessPool | None = None
     while waiting:
         done, _ = wait(waiting, return_when=FIRST_COMPLETED)
         for future in done:
             index = waiting.pop(future)
             try:
-                found = future.result()
+                path = Path(future.result())
             except BrokenProcessPool as error:
                 broken = error
             else:
+                found: FoundMarkers = pickle.loads(path.read_bytes())
+                path.unlink()
                 yield index, found
     if broken is not None:
         raise broken
+
+
+def find_to_file(piece: Piece, folder: str) -> str:
+    """The path of a file with the piece's markers. A pool's processes answer on one pipe: of one that is killed in the
+    middle of a long answer the pool would wait for the rest for ever; an answer below PIPE_BUF is written whole."""
+    number, path = mkstemp(dir=folder)
+    with open(number, "wb") as file:
+        pickle.dump(find_markers(piece), file)
+    return path
 
 
 @contextmanager

@@ -3,6 +3,7 @@ twice."""
 
 import multiprocessing
 import os
+import pickle
 import select
 import shutil
 import subprocess
@@ -18,7 +19,7 @@ import pytest
 from compensation.finding.cache import keep, kept
 from compensation.finding.found import Finder, finder
 from compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
-from compensation.finding.workers import in_processes, in_turn, on_cluster
+from compensation.finding.workers import find_to_file, in_processes, in_turn, on_cluster
 from compensation.observations import session_target
 from foundation.errors import ConfigError, SessionError
 from markers.noise import Noise
@@ -86,6 +87,15 @@ def test_a_killed_process_loses_nothing(pieces: list[Piece], serial: list[FoundM
         assert index not in found
         found[index] = markers
     assert_all_same(found, serial)
+
+
+def test_what_a_process_answers_fits_into_one_write_of_a_pipe(
+    pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
+):
+    """Else the pool of one that is killed in the middle of its answer would wait for the rest for ever."""
+    answer = find_to_file(pieces[0], str(tmp_path))
+    assert len(pickle.dumps(answer)) < select.PIPE_BUF / 4
+    assert_same(pickle.loads(Path(answer).read_bytes()), serial[0])
 
 
 OWNER = """if True:
