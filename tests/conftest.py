@@ -16,13 +16,15 @@ from tests.stock_camera import run_stock_camera
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
 _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera.py"}
 # In tests/system, whose long runs have each a laboratory of its own, the tests are dealt out one by one but for those
-# of a file that makes something once for all of them.
+# of a file that makes something once for all of them, or whose devices have the same serial numbers.
 _DEALT_OUT = PurePath("tests/system")
 # What compiles the marker fit goes first: the workers that need it later find it kept, instead of waiting for it.
 _FIRST = {"tests/compensation/test_markers.py"}
 # A worker that took these last would be the only one at work for a minute.
 _LONG_FILES = {"tests/stand/test_page.py", "tests/stand/test_page_room.py"}
 _TOGETHER = {
+    # Real devices belong to one program by their serial numbers, whatever their addresses.
+    "tests/system/test_queue_wires.py",
     "tests/system/test_camera_wire.py",
     "tests/system/test_failure_table.py",
     "tests/system/test_kill_recording.py",
