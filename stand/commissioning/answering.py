@@ -57,10 +57,13 @@ async def _of_bus(assembly: Assembly) -> tuple[Sequence[str], bool]:
     config, devices = assembly.config, assembly.devices
     if lacks := await _asked(assembly.bus.open):
         return lacks, False
-    asks: list[Ask] = [devices.thermometers.open]
-    if config.regulator_unit is not None:  # whose `open` would write
-        found = register_map("regulator", config.regulator_unit)
-        asks.insert(0, ModbusUnit(devices.regulator.name, assembly.bus, found).probe)
+    probed = {"regulator": config.regulator_unit, "heat_module": config.heat_module}  # whose `open` would write
+    asks: list[Ask] = [
+        ModbusUnit(name, assembly.bus, register_map(name, unit)).probe
+        for name, unit in probed.items()
+        if unit is not None
+    ]
+    asks.append(devices.thermometers.open)
     if devices.inputs is not None:
         asks.append(devices.inputs.open)
     lacks = [lack for ask in asks for lack in await _asked(ask)]

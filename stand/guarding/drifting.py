@@ -59,8 +59,8 @@ def drifting(channel: str, other: str, set_point: str, same: Sequence[str], limi
         fault = None
         if abs(change_K) > limit_K:
             text = (
-                f"{channel} minus {other} at {held.key[0]:g} degC has gone by {1e3 * change_K:+.0f} mK in {hours:.1f} "
-                f"h ({1e3 * change_K / hours:+.1f} mK/h): one of them drifts; compare both with a third"
+                f"{channel} minus {other} at {held.key[0]:g} degC has changed by {1e3 * change_K:+.0f} mK in "
+                f"{hours:.1f} h ({1e3 * change_K / hours:+.1f} mK/h): one of them drifts; compare both with a third"
             )
             fault = Fault("sensor_drifts", text)
         return _Held(held.key, now_ns - seconds_ns(_STILL_AFTER_S), first=known, fault=fault)

@@ -151,6 +151,11 @@ def _sensors(config: StandConfig) -> tuple[Watch, ...]:
     return (
         Watch(disagreement(PV, AIR, limits.warn_K), limits.warn_after_s, "warn"),
         Watch(disagreement(PV, AIR, limits.trip_K), limits.trip_after_s),
+        # Where a safety thermometer sits is the laboratory's choice, but one that reads low guards nothing.
+        *(
+            Watch(disagreement(each, AIR, limits.warn_K), limits.warn_after_s, "warn")
+            for each in safety_thermometers(config)
+        ),
         Watch(stuck_while_other_moves(PV, AIR, limits.air_moves_K, limits.pv_stuck_after_s), action="hold"),
         *(Watch(stuck(f"thermometers.{name}", limits.stuck_after_s), action="warn") for name in config.sensors),
         *(

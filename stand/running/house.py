@@ -62,8 +62,8 @@ class House:
     """The open stand. `recorder` is what heat depends on; set it before `prepare`.
 
     is_for_one: it is closed with its one guest; else a trip is kept until an operator clears it (`latched`), guest or
-    not. background: tasks that must not end, from the opening on. patience: with the
-    disk, when the last guest has left and the stand is safe.
+    not. background: tasks that must not end, from the opening on. patience: with the disk, when the last guest has
+    left and the stand is safe.
     """
 
     def __init__(self, assembly: Assembly, disk: Disk | None, patience: Patience, *, is_for_one: bool) -> None:

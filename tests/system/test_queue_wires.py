@@ -14,7 +14,7 @@ from foundation.clock import WallClock
 from foundation.hub import Hub
 from stand.assembly import assemble
 from stand.commands.queue_cli import app
-from stand.config.stand_config import load_config
+from stand.config.stand_config import load_config, packaged
 from stand.queueing.queue import queued
 from stand.running.claim import claimed
 from stand.running.order import Order
@@ -106,6 +106,18 @@ def test_a_bus_that_does_not_answer_keeps_a_night_from_the_queue(bench: Bench):
     assert (result.exit_code, result.stdout) == (1, "")
     assert "this stand cannot run it now, and nothing was queued: bus: " in result.stderr
     assert not bench.out.exists()
+
+
+def test_an_analog_output_that_does_not_answer_keeps_a_night_from_the_queue(bench: Bench):
+    def heats_by_a_current(data: dict[str, Any]) -> None:
+        data["regulator"] = yaml.safe_load(packaged("", "software-regulator").read_text())["regulator"]
+        data["heat_module"] = {"registers": "icpdas-m7024", "unit": 9, "watchdog_s": 12.0}
+
+    result = bench.add(bench.real(heats_by_a_current))
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "this stand cannot run it now, and nothing was queued: heat_module: " in result.stderr
+    assert not bench.out.exists()
+    assert set(bench.said) <= READS
 
 
 def test_while_the_stand_is_busy_a_night_is_queued_and_that_nobody_asked_is_said(bench: Bench):

@@ -47,6 +47,19 @@ async def test_a_sensor_of_any_name_is_read_and_guarded_by_its_role(tmp_path: Pa
         assert await stand.true("heater_enabled") == 0
 
 
+async def test_a_safety_thermometer_that_reads_low_is_a_warning_for_it_guards_nothing(tmp_path: Path):
+    (tmp_path / "stand.yaml").write_text(yaml.safe_dump(described(THERMOMETERS)))
+    async with virtual_stand(load_config(tmp_path / "stand.yaml")) as stand:
+        await stand.hold(40, 900)
+        assert stand.trips() == []
+        await stand.break_("thermometer.offset_K", {"ceiling": -40})
+        await stand.wait(700)
+        (warning,) = [event for event in stand.events if event.kind == "guard.sensors_disagree"]
+        assert warning.level == "warning"
+        assert "thermometers.ceiling" in warning.text
+        assert await stand.true("heater_enabled") == 1
+
+
 def test_without_a_safety_thermometer_that_is_read_there_is_no_heat():
     assert vital(config_of()) == (
         "regulator.pv",
