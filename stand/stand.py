@@ -55,9 +55,9 @@ class Stand:
         self._hub = hub
         self._clock = clock
         self.interlock = interlock = Interlock(self.gate, (devices.flap, *devices.axes.values()))
-        cameras = Cameras(devices.cameras, clock)
+        cameras = Cameras(devices.cameras)
         power = CameraSupply(cameras, devices.relays, supply, interlock, self.gate, hub, clock)
-        self.imaging = Imaging(cameras, devices.flap, power, interlock, self.gate, self.motions, hub, clock)
+        self.imaging = Imaging(devices.cameras, devices.flap, power, interlock, self.gate, self.motions, hub, clock)
         self.chamber = Chamber(devices.regulator, devices.relays, chamber, interlock, power.compare, hub, clock)
         self.table = Table(devices.axes, interlock, self.motions, hub, clock)
         self.safety = Safety(self.chamber.permits.revoke, hub, clock)

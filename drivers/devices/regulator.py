@@ -8,8 +8,8 @@ from contextlib import asynccontextmanager
 
 from drivers.settings import Identity
 from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit, is_confirmed
-from drivers.wires.registers import RegisterMap, Sample, Snapshot
+from drivers.wires.modbus_unit import ModbusUnit, Sample, Snapshot, is_confirmed
+from drivers.wires.registers import RegisterMap
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import ConfigError, Occupied, Refused, Unreachable
 from foundation.readings import Reading, bad_reading

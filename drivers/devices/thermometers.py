@@ -10,8 +10,8 @@ from pydantic import Field
 
 from drivers.settings import Identity, Line, OnBus, Range
 from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit
-from drivers.wires.registers import RegisterMap, Sample
+from drivers.wires.modbus_unit import ModbusUnit, Sample
+from drivers.wires.registers import RegisterMap
 from foundation.clock import Clock
 from foundation.documents import Document
 from foundation.errors import ConfigError, DeviceError, Unreachable

@@ -1,4 +1,5 @@
-"""A GigE Vision camera and its stream over libaravis: what the camera driver calls, nothing else.
+"""A GigE Vision camera and its stream over libaravis: what the camera driver calls, nothing else; frames come out as
+arrays. Bit layouts: GigE Vision 1.2, section 27 (Mono10Packed, Mono12Packed), PFNC 2.1, section 6 (Mono10p, Mono12p).
 
 A `GigeDevice` owns one ArvCamera, a `GigeStream` one ArvStream. Everything blocks; a feature call up to 2.5 s when
 the camera is silent (Aravis: five tries of 500 ms). Not thread-safe: one thread per device.
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.wires.aravis_library import Library, library
+from drivers.wires.camera_settings import BITS_PER_PIXEL, PixelFormat, frame_bytes
 
 PACKET_SOCKET_DISABLED = 1  # ArvGvStreamOption: else root would get AF_PACKET and everyone else a UDP socket
 PACKET_SIZE_ADJUSTMENT_NEVER = 0  # ArvGvPacketSizeAdjustment
@@ -38,6 +40,9 @@ FLOAT_KINDS = frozenset({"Float", "FloatReg", "Converter", "SwissKnife"})
 G_TYPE_INT, G_TYPE_UINT, G_TYPE_DOUBLE = 6 << 2, 7 << 2, 15 << 2
 
 CONTROL_LOST_CALLBACK = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,14 +274,15 @@ class GigeStream:
             height=int(get("arv_buffer_get_image_height", buffer)) if complete else 0,
         )
 
-    def copy_bytes(self, buffer: int, size: int) -> NDArray[np.uint8] | None:
-        """The first `size` bytes in an array of their own (chunk data may follow them), None when there are fewer."""
-        length = ctypes.c_size_t()
+    def pixels(self, buffer: int, pixel_format: PixelFormat, shape: tuple[int, int]) -> Pixels | None:
+        """The image of `shape` (height, width) in an array of its own, as of `unpacked`; None when the buffer has too
+        few bytes (chunk data may follow the pixels)."""
+        size, length = frame_bytes(pixel_format, shape[0] * shape[1]), ctypes.c_size_t()
         address = self._library.call("arv_buffer_get_data", buffer, ctypes.byref(length))
         if not address or length.value < size:
             return None
         pointer = ctypes.cast(address, ctypes.POINTER(ctypes.c_uint8))
-        return np.ctypeslib.as_array(pointer, shape=(size,)).copy()
+        return unpacked(pixel_format, np.ctypeslib.as_array(pointer, shape=(size,)).copy(), shape)
 
     def counters(self) -> dict[str, int]:
         """Aravis' own counters of this stream (n_completed_buffers, n_resend_requests, ...)."""
@@ -284,3 +290,48 @@ class GigeStream:
             self._call("arv_stream_get_info_name", i) for i in range(self._call("arv_stream_get_n_infos"))
         ]
         return {name.decode(): int(self._call("arv_stream_get_info_uint64_by_name", name)) for name in names}
+
+
+def unpacked(pixel_format: PixelFormat, data: NDArray[np.uint8], shape: tuple[int, int]) -> Pixels:
+    """The image of `shape` (height, width) in `data` (frame_bytes of them): uint8, or uint16 with the camera's own
+    values (0..1023 of 10 bits, 0..4095 of 12)."""
+    count = shape[0] * shape[1]
+    if pixel_format == "Mono8":
+        return data.reshape(shape)
+    if BITS_PER_PIXEL[pixel_format] == 16:
+        return data.view("<u2").reshape(shape)
+    if pixel_format == "Mono10p":
+        return _of_10_bits(data, count).reshape(shape)
+    return _of_three_bytes(pixel_format, data, count).reshape(shape)
+
+
+def _of_three_bytes(pixel_format: PixelFormat, data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
+    """Two pixels in three bytes, the middle one shared."""
+    first, middle, last = _groups(data, 3)
+    pairs = np.empty((len(first), 2), np.uint16)
+    if pixel_format == "Mono12p":  # the first pixel's low bits come first
+        pairs[:, 0] = first | (middle & 0xF) << 8
+        pairs[:, 1] = middle >> 4 | last << 4
+    elif pixel_format == "Mono12Packed":  # high bits in the outer bytes
+        pairs[:, 0] = first << 4 | middle & 0xF
+        pairs[:, 1] = last << 4 | middle >> 4
+    else:  # Mono10Packed
+        pairs[:, 0] = first << 2 | middle & 0x3
+        pairs[:, 1] = last << 2 | middle >> 4 & 0x3
+    return pairs.reshape(-1)[:count]
+
+
+def _of_10_bits(data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
+    """Four pixels in five bytes, low bits first."""
+    groups = _groups(data, 5)
+    pixels = np.empty((len(groups[0]), 4), np.uint16)
+    for i in range(4):
+        pixels[:, i] = (groups[i] >> 2 * i | groups[i + 1] << 8 - 2 * i) & 0x3FF
+    return pixels.reshape(-1)[:count]
+
+
+def _groups(data: NDArray[np.uint8], size: int) -> NDArray[np.uint16]:
+    """Shape (size, groups): the bytes of each group of `size`, the last one filled up with zeros."""
+    whole = np.zeros(-(-len(data) // size) * size, np.uint16)
+    whole[: len(data)] = data
+    return whole.reshape(-1, size).T

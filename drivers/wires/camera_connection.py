@@ -21,6 +21,7 @@ from drivers.wires.aravis import (
     BufferInfo,
     GigeDevice,
     GigeStream,
+    Pixels,
 )
 from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_apply import (
@@ -32,7 +33,6 @@ from drivers.wires.camera_apply import (
     software_trigger,
 )
 from drivers.wires.camera_errors import NO_CONTROL_HINT
-from drivers.wires.camera_pixels import Pixels, frame_bytes, unpacked
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from drivers.wires.camera_temperature import find_temperature, read_temperature, temperature_place
 from foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
@@ -305,15 +305,15 @@ class Connection:
     def _image(self, stream: GigeStream, buffer: int, info: BufferInfo) -> Pixels | None:
         """The pixels in an array of their own, or None when the frame is not whole."""
         shape = self.effective.height_px, self.effective.width_px
-        pixel_format = self.effective.pixel_format
         if info.status != BUFFER_SUCCESS:
             self._counts[f"incomplete_{BUFFER_STATUS.get(info.status, 'unknown')}"] += 1
             return None
-        data = stream.copy_bytes(buffer, frame_bytes(pixel_format, shape[0] * shape[1]))
-        if data is None or (info.height, info.width) != shape:
+        image = (
+            stream.pixels(buffer, self.effective.pixel_format, shape) if (info.height, info.width) == shape else None
+        )
+        if image is None:
             self._counts["wrong_size"] += 1
             return None
-        image = unpacked(pixel_format, data, shape)
         image.setflags(write=False)
         return image
 

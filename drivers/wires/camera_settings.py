@@ -9,9 +9,27 @@ from typing import Literal, Self, cast
 from pydantic import Field, model_validator
 
 from drivers.settings import CameraSettings
-from drivers.wires.camera_pixels import PixelFormat
 from foundation.addresses import IpAddress
 from foundation.documents import Document
+
+PixelFormat = Literal[
+    "Mono8", "Mono10", "Mono12", "Mono16", "Mono10Packed", "Mono12Packed", "Mono10p", "Mono12p"
+]  # packed: two pixels in three bytes; p: as many as fit, without gaps
+BITS_PER_PIXEL: dict[PixelFormat, int] = {
+    "Mono8": 8,
+    "Mono10": 16,
+    "Mono12": 16,
+    "Mono16": 16,
+    "Mono10Packed": 12,
+    "Mono12Packed": 12,
+    "Mono10p": 10,
+    "Mono12p": 12,
+}
+
+
+def frame_bytes(pixel_format: PixelFormat, count: int) -> int:
+    """Bytes of `count` pixels, the last one begun counted as whole."""
+    return -(-count * BITS_PER_PIXEL[pixel_format] // 8)
 
 
 class TemperatureFeature(Document):

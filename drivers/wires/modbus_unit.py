@@ -1,26 +1,51 @@
-"""One unit on a bus, spoken to in the names of its register map; every write is read back."""
+"""One unit on a bus, spoken to in the names of its register map; every write is read back.
+
+Below `ModbusUnit` is its codec, without I/O: words to values and back, and which requests cover what is asked for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterable
+import math
+import struct
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 from drivers.settings import Identity, same_device
 from drivers.wires.bus import Bus
-from drivers.wires.registers import (
-    Block,
-    Command,
-    RegisterMap,
-    Snapshot,
-    Told,
-    decode,
-    decode_blocks,
-    encode,
-    plan_blocks,
-)
+from drivers.wires.registers import Command, Point, PointType, RegisterMap, Space, Split, Told
 from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 
 WRITE_TRIES = 2
 CONFIRM_LOOKS = 3  # a status bit may lag its command by a scan of the unit
+FORMATS: dict[PointType, str] = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+_SMALLEST = 1e-30  # a float of exchanged words is next to nothing: 25.0 would be 2.4e-41
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Addresses read in one request, and the points in it."""
+
+    space: Space
+    address: int
+    count: int
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One decoded point: the raw word(s) as an unsigned number; `value` is NaN exactly when `reason` is not empty."""
+
+    raw: int
+    value: float
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """Decoded points (split ones under both names) and bits of one poll."""
+
+    samples: Mapping[str, Sample]
+    bits: Mapping[str, bool]
 
 
 class ModbusUnit:
@@ -164,3 +189,92 @@ def is_confirmed(command: Command, snapshot: Snapshot) -> bool:
     if confirm.equals is not None:
         return snapshot.samples[confirm.point].value == confirm.equals
     return snapshot.bits[confirm.bit] == confirm.is_
+
+
+def plan_blocks(register_map: RegisterMap, names: Iterable[str]) -> tuple[Block, ...]:
+    """The fewest reads that cover `names`: by address, gaps and lengths as the transport allows."""
+    blocks: list[Block] = []
+    points = register_map.points
+    for name in sorted(set(names), key=lambda name: (points[name].space, points[name].address)):
+        point = points[name]
+        end = point.address + point.words
+        last = blocks[-1] if blocks else None
+        if (
+            last is not None
+            and last.space == point.space
+            and point.address - (last.address + last.count) <= register_map.transport.max_gap_words
+            and end - last.address <= register_map.transport.max_read_words
+        ):
+            blocks[-1] = Block(last.space, last.address, end - last.address, (*last.names, name))
+        else:
+            blocks.append(Block(point.space, point.address, point.words, (name,)))
+    return tuple(blocks)
+
+
+def decode_blocks(register_map: RegisterMap, replies: Mapping[Block, list[int]]) -> Snapshot:
+    """Replies of planned blocks as samples and bits; `bad_if` bits that were not read spoil nothing."""
+    samples: dict[str, Sample] = {}
+    bits: dict[str, bool] = {}
+    for block, words in replies.items():
+        for name in block.names:
+            point = register_map.points[name]
+            start = point.address - block.address
+            samples[name] = decode(point, words[start : start + point.words])
+            bits.update(_bits(name, point, samples[name].raw))
+    for name, sample in list(samples.items()):
+        point = register_map.points[name]
+        alarms = [bit for bit in point.bad_if if bits.get(bit)]
+        if alarms:
+            samples[name] = Sample(sample.raw, math.nan, ", ".join(alarms))
+        if point.split is not None:
+            samples.update(_split(point.split, samples[name]))
+    return Snapshot(samples, bits)
+
+
+def decode(point: Point, words: list[int]) -> Sample:
+    """Raw words (0..65535, in order of address) as a value in the point's unit."""
+    raw = 0
+    for word in words if point.word_order == "high_first" else reversed(words):
+        raw = raw << 16 | word
+    for fault in point.faults:
+        if raw == fault.raw:
+            return Sample(raw, math.nan, fault.code)
+    number = raw if point.type == "bit" else struct.unpack(FORMATS[point.type], raw.to_bytes(2 * len(words), "big"))[0]
+    if point.type == "float32" and 0 < abs(number) < _SMALLEST:
+        return Sample(raw, math.nan, f"{number:g} is no measurement; is word_order {point.word_order} right?")
+    value = number * point.scale + point.offset
+    if not math.isfinite(value):
+        return Sample(raw, math.nan, "not a number")
+    if point.valid is not None and not point.valid[0] <= value <= point.valid[1]:
+        return Sample(raw, math.nan, f"{value:g} {point.unit} is outside {point.valid[0]:g}..{point.valid[1]:g}")
+    return Sample(raw, value)
+
+
+def encode(point: Point, value: float) -> list[int]:
+    """The words to write for `value`; ValueError when it is read-only, outside its limits or does not fit."""
+    if point.access != "rw" or point.type == "bit":
+        raise ValueError("not a writable register")
+    if point.limits is not None and not point.limits[0] <= value <= point.limits[1]:
+        raise ValueError(f"{value:g} {point.unit} is outside the limits {point.limits[0]:g}..{point.limits[1]:g}")
+    if not math.isfinite(value):
+        raise ValueError(f"{value} cannot be written")
+    number = (value - point.offset) / point.scale
+    try:
+        packed = struct.pack(FORMATS[point.type], number if point.type == "float32" else round(number))
+    except (struct.error, OverflowError) as error:
+        raise ValueError(f"{value:g} {point.unit} does not fit {point.type}") from error
+    words = [int.from_bytes(packed[i : i + 2], "big") for i in range(0, len(packed), 2)]
+    return words if point.word_order == "high_first" else words[::-1]
+
+
+def _bits(name: str, point: Point, raw: int) -> dict[str, bool]:
+    if point.type == "bit":
+        return {name: bool(raw)}
+    return {bit_name: bool(raw >> bit & 1) for bit, bit_name in point.bits.items()}
+
+
+def _split(split: Split, sample: Sample) -> dict[str, Sample]:
+    return {
+        split.positive: Sample(sample.raw, max(sample.value, 0.0) if not sample.reason else math.nan, sample.reason),
+        split.negative: Sample(sample.raw, max(-sample.value, 0.0) if not sample.reason else math.nan, sample.reason),
+    }

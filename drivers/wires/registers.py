@@ -1,4 +1,4 @@
-"""Register map: YAML -> checked points and commands, block reads, scaling, faults. No I/O.
+"""Register map: YAML -> checked points and commands. How they are read, scaled and written: modbus_unit.py.
 
 A point is one quantity at one address (base 0); a word may carry named bits, and a coil or discrete input is a bit
 named by its point. One map drives a unit and can be read beside its manual.
@@ -6,10 +6,7 @@ named by its point. One map drives a unit and can be read beside its manual.
 
 from __future__ import annotations
 
-import math
-import struct
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -17,12 +14,9 @@ from pydantic import Field, model_validator
 
 from foundation.documents import Document, load_document
 
-_SMALLEST = 1e-30  # a float of exchanged words is next to nothing: 25.0 would be 2.4e-41
-
 Space = Literal["holding", "input", "coil", "discrete"]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
 PointType = Literal["bit", "int16", "uint16", "int32", "uint32", "float32"]
-FORMATS: dict[PointType, str] = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
 BIT_SPACES = ("coil", "discrete")
 
 
@@ -251,119 +245,3 @@ class RegisterMap(Document):
 def load_register_map(path: Path) -> RegisterMap:
     """The map in a YAML file; raises ConfigError naming file, path and fault."""
     return load_document(path, RegisterMap)
-
-
-@dataclass(frozen=True, slots=True)
-class Block:
-    """Addresses read in one request, and the points in it."""
-
-    space: Space
-    address: int
-    count: int
-    names: tuple[str, ...]
-
-
-def plan_blocks(register_map: RegisterMap, names: Iterable[str]) -> tuple[Block, ...]:
-    """The fewest reads that cover `names`: by address, gaps and lengths as the transport allows."""
-    blocks: list[Block] = []
-    points = register_map.points
-    for name in sorted(set(names), key=lambda name: (points[name].space, points[name].address)):
-        point = points[name]
-        end = point.address + point.words
-        last = blocks[-1] if blocks else None
-        if (
-            last is not None
-            and last.space == point.space
-            and point.address - (last.address + last.count) <= register_map.transport.max_gap_words
-            and end - last.address <= register_map.transport.max_read_words
-        ):
-            blocks[-1] = Block(last.space, last.address, end - last.address, (*last.names, name))
-        else:
-            blocks.append(Block(point.space, point.address, point.words, (name,)))
-    return tuple(blocks)
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One decoded point: the raw word(s) as an unsigned number; `value` is NaN exactly when `reason` is not empty."""
-
-    raw: int
-    value: float
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """Decoded points (split ones under both names) and bits of one poll."""
-
-    samples: Mapping[str, Sample]
-    bits: Mapping[str, bool]
-
-
-def decode_blocks(register_map: RegisterMap, replies: Mapping[Block, list[int]]) -> Snapshot:
-    """Replies of planned blocks as samples and bits; `bad_if` bits that were not read spoil nothing."""
-    samples: dict[str, Sample] = {}
-    bits: dict[str, bool] = {}
-    for block, words in replies.items():
-        for name in block.names:
-            point = register_map.points[name]
-            start = point.address - block.address
-            samples[name] = decode(point, words[start : start + point.words])
-            bits.update(_bits(name, point, samples[name].raw))
-    for name, sample in list(samples.items()):
-        point = register_map.points[name]
-        alarms = [bit for bit in point.bad_if if bits.get(bit)]
-        if alarms:
-            samples[name] = Sample(sample.raw, math.nan, ", ".join(alarms))
-        if point.split is not None:
-            samples.update(_split(point.split, samples[name]))
-    return Snapshot(samples, bits)
-
-
-def decode(point: Point, words: list[int]) -> Sample:
-    """Raw words (0..65535, in order of address) as a value in the point's unit."""
-    raw = 0
-    for word in words if point.word_order == "high_first" else reversed(words):
-        raw = raw << 16 | word
-    for fault in point.faults:
-        if raw == fault.raw:
-            return Sample(raw, math.nan, fault.code)
-    number = raw if point.type == "bit" else struct.unpack(FORMATS[point.type], raw.to_bytes(2 * len(words), "big"))[0]
-    if point.type == "float32" and 0 < abs(number) < _SMALLEST:
-        return Sample(raw, math.nan, f"{number:g} is no measurement; is word_order {point.word_order} right?")
-    value = number * point.scale + point.offset
-    if not math.isfinite(value):
-        return Sample(raw, math.nan, "not a number")
-    if point.valid is not None and not point.valid[0] <= value <= point.valid[1]:
-        return Sample(raw, math.nan, f"{value:g} {point.unit} is outside {point.valid[0]:g}..{point.valid[1]:g}")
-    return Sample(raw, value)
-
-
-def encode(point: Point, value: float) -> list[int]:
-    """The words to write for `value`; ValueError when it is read-only, outside its limits or does not fit."""
-    if point.access != "rw" or point.type == "bit":
-        raise ValueError("not a writable register")
-    if point.limits is not None and not point.limits[0] <= value <= point.limits[1]:
-        raise ValueError(f"{value:g} {point.unit} is outside the limits {point.limits[0]:g}..{point.limits[1]:g}")
-    if not math.isfinite(value):
-        raise ValueError(f"{value} cannot be written")
-    number = (value - point.offset) / point.scale
-    try:
-        packed = struct.pack(FORMATS[point.type], number if point.type == "float32" else round(number))
-    except (struct.error, OverflowError) as error:
-        raise ValueError(f"{value:g} {point.unit} does not fit {point.type}") from error
-    words = [int.from_bytes(packed[i : i + 2], "big") for i in range(0, len(packed), 2)]
-    return words if point.word_order == "high_first" else words[::-1]
-
-
-def _bits(name: str, point: Point, raw: int) -> dict[str, bool]:
-    if point.type == "bit":
-        return {name: bool(raw)}
-    return {bit_name: bool(raw >> bit & 1) for bit, bit_name in point.bits.items()}
-
-
-def _split(split: Split, sample: Sample) -> dict[str, Sample]:
-    return {
-        split.positive: Sample(sample.raw, max(sample.value, 0.0) if not sample.reason else math.nan, sample.reason),
-        split.negative: Sample(sample.raw, max(-sample.value, 0.0) if not sample.reason else math.nan, sample.reason),
-    }

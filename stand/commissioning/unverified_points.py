@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from itertools import groupby
 
 from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit
-from drivers.wires.registers import RegisterMap, Sample
+from drivers.wires.modbus_unit import ModbusUnit, Sample
+from drivers.wires.registers import RegisterMap
 from foundation.errors import DeviceError, Refused
 from stand.commissioning.finding import Finding, Verdict
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from drivers.devices.camera_gige import Settings as GigeSettings
 from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
-from drivers.wires.camera_pixels import frame_bytes
+from drivers.wires.camera_settings import frame_bytes
 from stand.config.stand_config import StandConfig
 
 _SENSOR_PX = (2448, 2048)  # of a camera whose size nobody states, as in the plan's estimate of the disk

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 
-from drivers.devices.protocols import Shutter
+from drivers.devices.protocols import Camera, Shutter
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import Unreachable
 from foundation.hub import Hub
@@ -17,8 +17,9 @@ from stand.config.stand_config import LEADING
 from stand.gate import CAMERA_LOST, Gate
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
 from stand.imaging.camera_supply import CameraSupply
-from stand.imaging.cameras import Cameras
 from stand.interlock import Interlock, Motions
+
+_APART_S = 0.001  # between two cameras' frames: an image and its description are found by their instant
 
 
 class Imaging:
@@ -26,7 +27,7 @@ class Imaging:
 
     def __init__(
         self,
-        cameras: Cameras,
+        cameras: Mapping[str, Camera],
         flap: Shutter,
         supply: CameraSupply,
         interlock: Interlock,
@@ -69,7 +70,7 @@ class Imaging:
         is still ahead. False when a camera was lost: see `_regain`; the flap may have been shut meanwhile."""
         self._interlock.check()
         try:
-            self._publish(await self._cameras.grab(exposure_s, due_ns, cameras), step_id)
+            self._publish(await self._grab(exposure_s, due_ns, cameras), step_id)
         except Unreachable as error:
             await self._regain(error, exposure_s, cameras)
             return False
@@ -80,13 +81,17 @@ class Imaging:
         published. None when a camera was lost: see `_regain`."""
         await self.open_flap()
         try:
-            return self._publish(await self._cameras.grab(exposure_s), step_id)[f"{LEADING}.image"]
+            return self._publish(await self._grab(exposure_s), step_id)[f"{LEADING}.image"]
         except Unreachable as error:
             lost = error
         finally:
             await self.close_flap()
         await self._regain(lost, exposure_s)
         return None
+
+    async def _grab(self, exposure_s: float, due_ns: int = 0, names: Collection[str] = ()) -> tuple[Frame, ...]:
+        cameras = [camera for name, camera in self._cameras.items() if not names or name in names]
+        return await grab_together(cameras, self._clock, exposure_s, due_ns)
 
     def _publish(self, frames: Iterable[Frame], step_id: str) -> dict[str, Frame]:
         """By channel."""
@@ -110,7 +115,7 @@ class Imaging:
         if self._without_camera_ns:
             # It opened and gave no frame. The gate stays held until it gives one, which is not kept: else a hold would
             # begin with each try, and the flap would never be shut in it.
-            proof = partial(self._cameras.grab, exposure_s, 0, cameras)
+            proof = partial(self._grab, exposure_s, 0, cameras)
         try:
             is_back = await supply.opening.until_open(
                 self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on, proof=proof
@@ -120,3 +125,29 @@ class Imaging:
             self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
         if is_back:
             self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
+
+
+async def grab_together(
+    cameras: Collection[Camera], clock: Clock, exposure_s: float, due_ns: int = 0
+) -> tuple[Frame, ...]:
+    """One frame of each, the first at `due_ns` when that is still ahead, the others a little later each. Unreachable
+    when one was lost: then there is a frame of none.
+
+    In real time they expose and send together; in virtual time, which stands still meanwhile, one after the other.
+    """
+    if not clock.lead_ns or len(cameras) == 1:
+        frames: list[Frame] = []
+        for camera in cameras:
+            if frames:
+                await clock.sleep_until(clock.now_ns() + seconds_ns(_APART_S))
+            frames.append(await camera.grab(exposure_s, due_ns if not frames else 0))
+        return tuple(frames)
+    first_ns = max(due_ns, clock.now_ns())
+    grabs = (camera.grab(exposure_s, first_ns + number * seconds_ns(_APART_S)) for number, camera in enumerate(cameras))
+    results = await asyncio.gather(*grabs, return_exceptions=True)  # each ends: none may be in the wire's lane
+    together: list[Frame] = []
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
+        together.append(result)
+    return tuple(together)

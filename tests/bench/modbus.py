@@ -17,7 +17,8 @@ from pymodbus.client.base import ModbusBaseSyncClient
 
 from drivers.devices.regulator import Regulator
 from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import Block, RegisterMap, load_register_map, plan_blocks
+from drivers.wires.modbus_unit import Block, plan_blocks
+from drivers.wires.registers import RegisterMap, load_register_map
 from foundation.clock import WallClock
 from stand.config.stand_config import packaged
 from tests.bench.fakes import fakes

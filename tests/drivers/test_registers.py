@@ -9,17 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.wires.registers import (
-    Block,
-    Point,
-    RegisterMap,
-    Sample,
-    decode,
-    decode_blocks,
-    encode,
-    load_register_map,
-    plan_blocks,
-)
+from drivers.wires.modbus_unit import Block, Sample, decode, decode_blocks, encode, plan_blocks
+from drivers.wires.registers import Point, RegisterMap, load_register_map
 from foundation.documents import parse_document
 from foundation.errors import ConfigError
 

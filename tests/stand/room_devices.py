@@ -122,7 +122,7 @@ class Camera(Device):
         await self.act("grab")
         self.frames += 1
         image = np.zeros((2, 3), np.uint8)
-        return Frame("camera.image", image, self.clock.now_ns(), exposure_s or 0.0, 0.0, 40.0, self.frames, 0)
+        return Frame(f"{self.name}.image", image, self.clock.now_ns(), exposure_s or 0.0, 0.0, 40.0, self.frames, 0)
 
 
 @dataclass

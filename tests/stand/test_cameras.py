@@ -12,6 +12,7 @@ from foundation.clock import VirtualClock, WallClock, seconds_ns
 from foundation.errors import ConfigError, Unreachable
 from foundation.readings import Frame
 from stand.imaging.cameras import Cameras
+from stand.imaging.imaging import grab_together
 
 
 @dataclass
@@ -41,14 +42,14 @@ async def pair() -> AsyncIterator[tuple[Camera, Camera, Cameras]]:
     clock = VirtualClock(0)
     one, other = Camera("camera", clock), Camera("side", clock)
     time = asyncio.create_task(clock.run())
-    yield one, other, Cameras(cast("Any", {"camera": one, "side": other}), clock)
+    yield one, other, Cameras(cast("Any", {"camera": one, "side": other}))
     time.cancel()
 
 
 async def test_each_gives_a_frame_at_an_instant_of_its_own_and_the_first_is_due(
     pair: tuple[Camera, Camera, Cameras],
 ):
-    frames = await pair[2].grab(0.2, due_ns=500)
+    frames = await grab_together(cast("Any", pair[:2]), cast("Any", pair[0].clock), 0.2, due_ns=500)
     assert [(frame.channel, frame.time_ns, frame.exposure_s) for frame in frames] == [
         ("camera.image", 500, 0.2),
         ("side.image", 1_000_000, 0.2),
@@ -64,15 +65,10 @@ async def test_in_real_time_they_expose_together_a_millisecond_apart():
             return Frame(f"{self.name}.image", np.zeros((2, 3), np.uint8), due_ns, 0.1, 0.0, 40.0, 1, 0)
 
     clock = WallClock()
-    cameras = {name: Together(name, cast("Any", clock)) for name in ("camera", "side")}
+    cameras = [Together(name, cast("Any", clock)) for name in ("camera", "side")]
     due_ns = clock.now_ns() + seconds_ns(1.0)
-    frames = await Cameras(cast("Any", cameras), clock).grab(0.1, due_ns)
+    frames = await grab_together(cast("Any", cameras), clock, 0.1, due_ns)
     assert [frame.time_ns - due_ns for frame in frames] == [0, 1_000_000]
-
-
-async def test_those_that_are_named_expose_and_no_other(pair: tuple[Camera, Camera, Cameras]):
-    frames = await pair[2].grab(0.2, names=("side",))
-    assert [frame.channel for frame in frames] == ["side.image"]
 
 
 async def test_when_one_is_lost_there_is_a_frame_of_none_until_all_are_open_again(
@@ -82,9 +78,9 @@ async def test_when_one_is_lost_there_is_a_frame_of_none_until_all_are_open_agai
     other.is_usable = False
     assert not cameras.is_usable
     with pytest.raises(Unreachable, match="side"):
-        await cameras.grab(0.2)
+        await grab_together(cast("Any", pair[:2]), one.clock, 0.2)
     await cameras.open()
-    assert (cameras.is_usable, len(await cameras.grab(0.2))) == (True, 2)
+    assert (cameras.is_usable, len(await grab_together(cast("Any", pair[:2]), one.clock, 0.2))) == (True, 2)
     assert (one.opened, other.opened) == (1, 1)
 
 
@@ -96,7 +92,7 @@ async def test_whichever_has_started_anew_is_told(pair: tuple[Camera, Camera, Ca
 
 
 async def test_without_any_opening_is_refused_with_a_sentence():
-    none = Cameras({}, VirtualClock(0))
+    none = Cameras({})
     await none.close()
     with pytest.raises(ConfigError, match="this stand has none; name it under cameras"):
         await none.open()

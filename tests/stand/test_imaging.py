@@ -1,6 +1,7 @@
 """Flap, frames and the camera's supply over devices in memory; time is virtual."""
 
 import asyncio
+from typing import Any, cast
 
 import pytest
 
@@ -12,7 +13,7 @@ from stand.fault import Fault
 from stand.gate import CAMERA_LOST, INTERLOCK
 from stand.imaging.camera_opening import LOST_LIMIT_S
 from stand.interlock import Interlocked
-from tests.stand.room_devices import Rooms, rooms
+from tests.stand.room_devices import Camera, Rooms, rooms
 
 HELD, ON, OFF = (f"relays {CAMERA_POWER} {how}" for how in ("held", "on", "off"))
 
@@ -32,6 +33,15 @@ async def test_a_frame_carries_the_step_that_asked_for_it():
         await with_camera(here)
         assert await here.stand.imaging.take_frame(0.01, "capture-1")
         assert [frame.step_id for frame in here.frames] == ["capture-1"]
+
+
+async def test_of_two_cameras_those_that_are_named_expose_and_no_other():
+    async with rooms() as here:
+        cast("dict[str, Any]", here.stand.devices.cameras)["side"] = Camera("side", here.clock, here.calls)
+        await with_camera(here)
+        assert await here.stand.imaging.take_frame(0.01, "capture-1", cameras=("side",))
+        assert await here.stand.imaging.take_frame(0.01, "capture-2")
+        assert [frame.channel for frame in here.frames] == ["side.image", "camera.image", "side.image"]
 
 
 async def test_a_lost_camera_holds_the_gate_until_it_is_open_and_gives_no_frame():
