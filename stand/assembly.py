@@ -38,7 +38,7 @@ from stand.estimating.camera_lines import sharing
 from stand.fault import Fault
 from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Recording, Watch, intrusion
+from stand.guarding.interlocks import Recording, Watch, heat_uncontrolled, intrusion
 from stand.guarding.notify import Notifier
 from stand.guarding.rules import Announcements, camera_measured, camera_stale, recorded, vital, watches
 from stand.imaging.camera_supply import SupplyLimits
@@ -117,6 +117,7 @@ class Assembly:
             (
                 *watches(self.config, announced),
                 Watch(intrusion(lambda: stand.chamber.permits.intrusions), action="hold"),
+                *_obeyed(self.devices.regulator),
                 *camera_measured(self.config, frames_to_come),
                 *(recorded(self.config, recording) if recording is not None else ()),
             ),
@@ -132,6 +133,13 @@ class Assembly:
         )
         stand.chamber.permits.allowed = guard.may_permit
         return guard
+
+
+def _obeyed(regulator: Controller) -> tuple[Watch, ...]:
+    """Of a regulator of our own: that what it heats by does what it is told."""
+    if not isinstance(regulator, SoftwareRegulator):
+        return ()
+    return (Watch(heat_uncontrolled(lambda: regulator.heat_uncontrolled), action="hold"),)
 
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:

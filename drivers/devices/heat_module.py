@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import suppress
-from typing import Self
+from typing import NoReturn, Self
 
 from pydantic import Field, model_validator
 
@@ -52,7 +52,8 @@ class HeatModuleSettings(OnBus):
 
 class HeatModule:
     """Points output_<n>, safe_<n>, power_on_<n>, watchdog_s and coils watchdog_on, tripped of the map; present_<n>
-    (what it gives) and type_code_<n> where it has them. Not heated with before `arm`."""
+    (what it gives) and type_code_<n> where it has them. Not heated with before `arm`. uncontrolled: as of
+    HeatOutput."""
 
     def __init__(self, wire: ModbusUnit, settings: HeatModuleSettings, clock: Clock) -> None:
         self.name = name = wire.name
@@ -75,6 +76,8 @@ class HeatModule:
         self._checked_ns = 0  # when its watchdog and safe value were last read
         self._left_mA: float | None = None  # by the last write that was confirmed
         self._trip = ""  # why it gives no heat until it is armed again
+        self._differed = False  # at the last step it gave other than what it was left at
+        self.uncontrolled = ""
         self._last: tuple[Reading, ...] = ()
 
     @property
@@ -117,12 +120,12 @@ class HeatModule:
             if await self._is(_TRIPPED):
                 raise DeviceFault(self.name, "its host watchdog trips as soon as it is cleared")
             self._armed_ns = self._checked_ns = self._clock.now_ns()
-            self._trip = ""
+            self._trip, self._differed, self.uncontrolled = "", False, ""
 
     async def give(self, percent: float, *, at_once: bool = False) -> None:
         """The heat from now on; at_once has no meaning here. Also refreshes the watchdog. DeviceFault when it does not
-        give what it was left at, which ends with zero, or when it has tripped, or somebody has changed what it does
-        without us, which lasts until it is armed again."""
+        give what it was left at, which ends with zero; or when it has tripped, somebody has changed what it does
+        without us, or it is `uncontrolled`, which last until it is armed again."""
         async with self._lock:
             if self._armed_ns is None:
                 raise DeviceFault(self.name, "gives no heat: it was not armed")
@@ -133,7 +136,10 @@ class HeatModule:
             settings = self._settings
             wanted_mA = settings.zero_mA + (settings.full_mA - settings.zero_mA) * min(100.0, max(0.0, percent)) / 100
             self._left_mA = None  # until the write is confirmed
-            self._left_mA = await self._unit.write(self._output, wanted_mA)
+            try:
+                self._left_mA = await self._unit.write(self._output, wanted_mA)
+            except Refused as error:
+                await self._end(f"does not take {wanted_mA:.2f} mA ({error.text})")
             self._armed_ns = self._clock.now_ns()
 
     async def off(self) -> None:
@@ -141,6 +147,7 @@ class HeatModule:
         trips, which is as safe."""
         async with self._lock:
             await self._zero()
+            self.uncontrolled = ""
             with suppress(DeviceError):
                 await self._switch(_WATCHDOG, False)
             self._armed_ns = None
@@ -203,11 +210,29 @@ class HeatModule:
                 "mA until control is started again"
             )
             raise DeviceFault(self.name, self._trip)
-        left_mA = self._left_mA
-        if left_mA is not None and abs(given_mA - left_mA) > _TOLERANCE_mA:
-            await self._zero()
+        left_mA, differed = self._left_mA, self._differed
+        self._differed = left_mA is not None and abs(given_mA - left_mA) > _TOLERANCE_mA
+        if left_mA is not None and self._differed:
             text = f"gave {given_mA:.2f} mA where it was left at {left_mA:.2f} mA; does something else write to it?"
-            raise DeviceFault(self.name, text)
+            await self._end(text, is_again=differed)
+
+    async def _end(self, text: str, *, is_again: bool = False) -> NoReturn:
+        """The heat, since the output is not what was commanded: DeviceFault with `text`. One that is not at zero
+        after two tries, or that is_again so though it was, is not controlled any more."""
+        try:
+            try:
+                await self._zero()
+            except DeviceFault:
+                await self._zero()
+        except DeviceFault as error:
+            self._lose(f"{text}; it {error.text}")
+        if is_again:
+            self._lose(text)
+        raise DeviceFault(self.name, text)
+
+    def _lose(self, text: str) -> NoReturn:
+        self._trip = self.uncontrolled = text
+        raise DeviceFault(self.name, text)
 
     async def _check_dead_man(self) -> None:
         """Now and then: would it still end the heat when this program dies, as when it was armed?"""

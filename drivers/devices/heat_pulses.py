@@ -14,7 +14,7 @@ from drivers.devices.protocols import Switches
 from drivers.devices.relays import HEAT
 from foundation.clock import NS_PER_S, Now, seconds_ns
 from foundation.documents import Document
-from foundation.errors import DeviceFault
+from foundation.errors import DeviceFault, Refused
 
 _OVERLAP_S = 2.0  # that a full output is held beyond its cycle: the next pulse may come late
 _TOLERANCE_S = 1.0  # of the board's timer against our clock, and of a reply that was late
@@ -50,7 +50,8 @@ def pulse_s(percent: float, owed_s: float, settings: PulsesSettings) -> tuple[fl
 
 
 class HeatPulses:
-    """The relay `heat` of the board. What it reads before each pulse is compared with what the last one left."""
+    """The relay `heat` of the board. What it reads before each pulse is compared with what the last one left.
+    uncontrolled: as of HeatOutput."""
 
     identity = None  # the board has one
 
@@ -62,6 +63,7 @@ class HeatPulses:
         self._due_ns = 0
         self._until_ns = 0  # when the relay drops by itself
         self._is_compared = False  # whether what it is left as is known
+        self.uncontrolled = ""
 
     async def open(self) -> None:
         """The board is opened by itself."""
@@ -98,8 +100,22 @@ class HeatPulses:
         await self._off()
 
     async def _off(self) -> None:
-        await self._board.switch(HEAT, on=False)
-        self._until_ns, self._is_compared = 0, True
+        try:
+            await self._switch_off()
+        except DeviceFault as error:
+            self.uncontrolled = error.text
+            raise
+        self._until_ns, self._is_compared, self.uncontrolled = 0, True, ""
+
+    async def _switch_off(self) -> None:
+        """With a second try for a relay that reads on; DeviceFault when it stays so."""
+        try:
+            await self._board.switch(HEAT, on=False)
+        except Refused:
+            try:
+                await self._board.switch(HEAT, on=False)
+            except Refused as error:
+                raise DeviceFault(f"{self._board.name}.{HEAT}", f"stays on: {error.text}") from error
 
     async def _compare(self, now_ns: int) -> None:
         """Not within the tolerance of the instant at which it drops, and not while its last command is unconfirmed."""

@@ -83,6 +83,11 @@ class SoftwareRegulator:
         """Of what it heats by, where that is a device of its own."""
         return self._heat.identity
 
+    @property
+    def heat_uncontrolled(self) -> str:
+        """Why what it heats by may give heat though it was told not to; "" while it obeys."""
+        return self._heat.uncontrolled
+
     async def open(self) -> None:
         """What it heats by; thermometer and relays are devices of their own."""
         await self._heat.open()

@@ -245,6 +245,9 @@ FAULTS: dict[str, Fault] = {
     "heat_module.stuck_mA": Fault(
         to(lambda lab: lab.heat_module, "stuck_mA", number_or_none), 12.0, None, "it gives this, whatever is written"
     ),
+    "heat_module.lost_writes": Fault(
+        to(lambda lab: lab.heat_module, "lost_writes"), True, False, "writes to its outputs are acknowledged, not done"
+    ),
     "heat_module.restart": Fault(once(lambda lab: lab.heat_module.power_cycle()), True, False, "off and on again"),
     "heat_module.refreshed_by": Fault(
         to(lambda lab: lab.heat_module, "refreshed_by", str), "nothing", "requests", "what its watchdog is kept by"

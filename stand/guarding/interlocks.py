@@ -254,6 +254,16 @@ def intrusion(times: Callable[[], int]) -> Rule:
     return rule
 
 
+def heat_uncontrolled(why: Callable[[], str]) -> Rule:
+    """What a regulator of our own heats by does not obey: it reads back other than commanded, and not off. No grace:
+    the relay in series is all that ends the heat then."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        return Fault("heat_uncontrolled", f"the heat does not obey: {why()}") if why() else None
+
+    return rule
+
+
 class Recording(Protocol):
     """What a rule may ask of the recorder; it never asks the disk."""
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from drivers.devices.heat_pulses import HeatPulses, PulsesSettings, pulse_s
 from foundation.clock import FollowedClock, seconds_ns
-from foundation.errors import DeviceFault
+from foundation.errors import DeviceFault, Refused
 from foundation.readings import Reading
 
 SETTINGS = PulsesSettings(cycle_s=20, min_on_s=1, min_off_s=2)
@@ -111,3 +111,24 @@ async def test_a_relay_that_is_not_as_it_was_left_is_switched_off_and_told(perce
 def test_pulses_and_pauses_that_fill_the_cycle_are_refused():
     with pytest.raises(ValueError, match="more than half of cycle_s"):
         PulsesSettings(cycle_s=10, min_on_s=3, min_off_s=3)
+
+
+async def test_a_relay_that_stays_on_is_told_as_not_obeying_until_it_is_off():
+    class Stuck(Board):
+        is_stuck: bool = True
+
+        async def switch(self, channel: str, on: bool) -> None:
+            if self.is_stuck:
+                raise Refused(self.name, "heat off was acknowledged but reads back otherwise")
+            await super().switch(channel, on)
+
+    board = Stuck(FollowedClock(0))
+    heat = HeatPulses(board, SETTINGS, board.clock)
+    await heat.give(50)
+    assert heat.uncontrolled == ""
+    with pytest.raises(DeviceFault, match="stays on"):
+        await heat.off()
+    assert "reads back otherwise" in heat.uncontrolled
+    board.is_stuck = False
+    await heat.off()
+    assert heat.uncontrolled == ""

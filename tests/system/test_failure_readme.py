@@ -21,7 +21,10 @@ def test_each_fault_that_the_table_names_is_one_of_the_simulator():
     listed = subprocess.run([sys.executable, "-m", "drivers.sim", "--faults"], capture_output=True, check=True).stdout
     known = {row["name"] for row in json.loads(listed)}
     named = set(
-        re.findall(r"`((?:bus|linear|regulator|chamber|relays|thermometers?|flap|camera|heater|imager)\.\w+)`", README)
+        re.findall(
+            r"`((?:bus|linear|regulator|chamber|relays|thermometers?|flap|camera|heater|imager|heat_module|inputs)\.\w+)`",
+            README,
+        )
     )
     assert named
     assert named <= known

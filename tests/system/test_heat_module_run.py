@@ -120,3 +120,63 @@ async def test_a_process_that_is_killed_leaves_the_module_at_its_safe_value_afte
         process.wait(LIMIT_S)
         await control.close()
         await asyncio.to_thread(simulator.stop)
+
+
+QUICK: dict[str, dict[str, object]] = {
+    "regulator": {"poll_s": 2.0, "sample_s": 2.0},
+    "thermometer_module": {"poll_s": 2.0},
+    "guard": {"period_s": 1.0},
+}
+
+
+async def seconds_of_heat(stand: VirtualStand) -> float:
+    """For how much of the next 12 s the plant is heated, in steps of 0.25 s."""
+    heated = 0
+    for _ in range(48):
+        await stand.wait(0.25)
+        heated += await stand.true("heater_W") > 0
+    return heated / 4
+
+
+async def test_an_output_that_is_stuck_costs_the_permission_at_once_and_the_relay_in_series_ends_the_heat(
+    tmp_path: Path,
+):
+    """Within one step of the law and one look of the guard; the module itself gives its current on."""
+    async with virtual_stand(load_config(stand_file(tmp_path, **QUICK))) as stand:
+        await stand.hold(20, 10.5)  # no heat is wanted
+        assert await stand.true("heater_W") == 0
+        await stand.break_("heat_module.stuck_mA", 12.0)
+        assert 0 < await seconds_of_heat(stand) <= 2.0 + 1.0
+        assert stand.trips() == ["heat_uncontrolled"]
+        await stand.wait(60)
+        assert (await stand.true("heater_enabled"), await stand.true("heater_W")) == (0, 0)
+        (unsafe,) = stand.assembly.stand.safety.unconfirmed
+        assert "it gives 12.00 mA" in unsafe
+        await stand.break_("heat_module.stuck_mA", None)
+        await stand.wait(20)
+        assert stand.assembly.stand.safety.is_confirmed
+
+
+async def test_an_output_that_takes_no_new_value_costs_the_permission_at_once(tmp_path: Path):
+    async with virtual_stand(load_config(stand_file(tmp_path, **QUICK))) as stand:
+        await stand.hold(40, 60)
+        assert await stand.true("heater_W") > 100
+        await stand.break_("heat_module.lost_writes", True)
+        assert 0 < await seconds_of_heat(stand) <= 2.0 + 1.0
+        assert stand.trips() == ["heat_uncontrolled"]
+        assert await stand.true("heater_enabled") == 0
+
+
+async def test_one_write_by_another_master_ends_with_zero_and_one_after_the_other_with_the_permission(tmp_path: Path):
+    async with virtual_stand(load_config(stand_file(tmp_path, **QUICK))) as stand:
+        await stand.hold(20, 10)
+        await stand.break_("heat_module.written_mA", 12.0)
+        await stand.wait(3)
+        assert (await stand.true("heater_W"), stand.trips()) == (0, [])
+        await stand.wait(4)
+        for _ in range(4):
+            await stand.break_("heat_module.written_mA", 12.0)
+            await stand.wait(1)
+        await stand.wait(1)
+        assert stand.trips() == ["heat_uncontrolled"]
+        assert (await stand.true("heater_W"), await stand.true("heater_enabled")) == (0, 0)

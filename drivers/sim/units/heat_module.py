@@ -57,7 +57,7 @@ class FakeHeatModule:
     A tripped watchdog puts every output at its safe value; writes to outputs are then acknowledged and ignored until
     the trip is cleared, which a power cycle does not do. refreshed_by: what starts its time again (nothing: it wants
     the DCON broadcast `~**`). refuses: an ignored write is answered with an exception. stuck_mA: the output gives this.
-    safe_fixed: its safe values take no writes. silent.
+    lost_writes: writes to outputs are acknowledged, not done. safe_fixed: its safe values take no writes. silent.
     """
 
     def __init__(self, plant: Heated, clock: Now, unit: int, channel: int) -> None:
@@ -65,6 +65,7 @@ class FakeHeatModule:
         self.silent = False
         self.refuses = False
         self.safe_fixed = False
+        self.lost_writes = False
         self.stuck_mA: float | None = None
         self.refreshed_by: Refreshed = "requests"
         self.type_codes = [0x31] * OUTPUTS
@@ -214,6 +215,8 @@ class FakeHeatModule:
     def _set(self, table: list[float], output: int, word: int) -> None:
         low_mA, high_mA = RANGES_mA[self.type_codes[output]]
         wanted_mA = word / 1000 if self.coils[ENGINEERING] else low_mA + word / HEX_FULL_SCALE * (high_mA - low_mA)
+        if table is self.values_mA and self.lost_writes:
+            return
         if table is self.values_mA and self.coils[TRIPPED]:
             if self.refuses:
                 raise Refusal(OPERATION_ERROR)
