@@ -1,7 +1,8 @@
 """The event `capture_restarted`: a capture that could not be continued was begun again, its frames so far do not count.
 
-Its data have `step_id` and the number of `frames`. One that was interrupted for long is such a capture, and a warm-up
-that was: it shows a camera that was cold when it was switched on.
+Its data have `step_id`, the number of `frames` and, when it is for frames that the disk has lost, how many these are:
+`frames_lost`. One that was interrupted for long is such a capture, and a warm-up that was: it shows a camera that was
+cold when it was switched on.
 """
 
 from __future__ import annotations
@@ -14,9 +15,13 @@ KIND = "capture_restarted"
 _TEXT = "capture {} is restarted, {}; its {} frames so far do not count"
 
 
-def restarted(time_ns: int, step_id: str, frames: int, how: str) -> Event:
+def restarted(time_ns: int, step_id: str, frames: int, how: str, frames_lost: int = 0) -> Event:
     """The event: so many frames of that step, all before `time_ns`, are superseded. how: as in `from a cold camera`."""
-    data: dict[str, object] = {"step_id": step_id, "frames": frames}
+    data: dict[str, object] = {
+        "step_id": step_id,
+        "frames": frames,
+        **({"frames_lost": frames_lost} if frames_lost else {}),
+    }
     return Event(time_ns, "warning", KIND, _TEXT.format(step_id, how, frames), data)
 
 
@@ -24,6 +29,12 @@ def restarted_step(event: Event) -> str:
     """The id of the capture that was restarted; "" when the event is of another kind."""
     named = event.data.get("step_id") if event.kind == KIND else None
     return named if isinstance(named, str) else ""
+
+
+def frames_lost_of(event: Event) -> int:
+    """So many frames of the capture were lost by the disk; 0 when it was restarted for another reason."""
+    count = event.data.get("frames_lost")
+    return count if isinstance(count, int) else 0
 
 
 def begins_of(events: Iterable[Event]) -> dict[str, int]:

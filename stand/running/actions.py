@@ -3,7 +3,7 @@
 Rows are read from the top; the first that fits decides:
 
     the plan is done                                         None
-    the capture under way has all its frames                 Complete, unless the disk lost some of them
+    the capture under way has all its frames                 Complete, unless it is taken again for lost ones
     its next frame is not due yet                            Sleep
     something holds the run                                  Wait
     the soak under way has earned its time                   Complete
@@ -37,14 +37,15 @@ CREDITED_WITHIN_K = 1.0
 # A capture that was interrupted for longer than this is taken again: its flap was shut meanwhile, and the air is not
 # the same any more.
 AGAIN_AFTER_S = 60.0
+# A disk that loses frames each time must not hold the night for good.
+AGAIN_FOR_LOST_FRAMES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
     """What of the stand decides. lead_ns: how long before its instant a frame is asked for. held: whether the gate is
     closed, as after a latched fault. pv_degC: the chamber's last known temperature, NaN when it is not known.
-    lost_equilibrium: the camera's. frames_lost: so many frames of the capture under way did not come onto the disk, and
-    it may be taken again for that."""
+    lost_equilibrium: the camera's. frames_lost: so many frames of the capture under way did not come onto the disk."""
 
     now_ns: int
     lead_ns: int = 0
@@ -121,10 +122,11 @@ class Aim:
 
 @dataclass(frozen=True, slots=True)
 class TakeAgain:
-    """The capture is restarted; why: as a clause."""
+    """The capture is restarted; why: as a clause. frames_lost: by the disk, when it is for them."""
 
     planned: PlannedStep
     why: str
+    frames_lost: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +172,7 @@ def next_action(state: RunState, around: Surroundings) -> Action | None:
     planned = state.plan[state.index]
     is_under_way = state.under_way == planned.step_id
     step = planned.step
-    if is_under_way and isinstance(step, Capture) and has_all_frames(state, planned) and not around.frames_lost:
+    if is_under_way and has_all_frames(state, planned) and not is_lossy(state, around, planned):
         return Complete(planned)
     if is_under_way and state.due_ns is not None and around.now_ns < state.due_ns - around.lead_ns:
         return Sleep(state.due_ns - around.lead_ns)
@@ -192,6 +194,15 @@ def has_all_frames(state: RunState, planned: PlannedStep) -> bool:
     return isinstance(planned.step, Capture) and state.frames.get(planned.step_id, 0) >= planned.step.frames
 
 
+def is_lossy(state: RunState, around: Surroundings, planned: PlannedStep) -> bool:
+    """Whether the capture, which has all its frames, is taken again because the disk has lost some; not one of a camera
+    that has warmed up meanwhile."""
+    if not around.frames_lost or not isinstance(planned.step, Capture) or planned.step.role is Role.WARM_UP:
+        return False
+    has_tries = state.taken_again.get(planned.step_id, 0) < AGAIN_FOR_LOST_FRAMES
+    return has_tries and has_all_frames(state, planned)
+
+
 def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Action | None:
     """What is needed before the step; None when everything is as the steps before it have left it."""
     set_up = state.set_up
@@ -211,7 +222,7 @@ def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Ac
 
 def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capture: Capture) -> Action:
     if has_all_frames(state, planned):
-        return TakeAgain(planned, f"the disk has lost {around.frames_lost} of its frames")
+        return TakeAgain(planned, f"the disk has lost {around.frames_lost} of its frames", around.frames_lost)
     if state.due_ns is None or state.readying or state.is_lost:
         return Aim(capture)
     outage_ns, has_frames = state.outage_ns(around.now_ns), state.frames.get(planned.step_id, 0) > 0

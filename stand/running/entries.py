@@ -90,10 +90,12 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """These steps count as neither begun nor done from now on, and no frame of theirs before counts."""
+    """These steps count as neither begun nor done from now on, and no frame of theirs before counts. frames_lost: by
+    the disk, when it is for them (0 in journals from before 2026-11-24)."""
 
     time_ns: int
     step_ids: list[str]
+    frames_lost: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
 from contextlib import contextmanager
 
@@ -61,7 +60,7 @@ from stand.running.actions import (
     TakeFrame,
     Wait,
     due_after_ns,
-    has_all_frames,
+    is_lossy,
     next_action,
     next_due_ns,
 )
@@ -89,7 +88,6 @@ from stand.running.settling_watch import SettlingWatch
 from stand.running.state import Plan, RunState, duration_of
 from stand.stand import Stand
 
-_TRIES = 3  # to have all frames of a capture on the disk, beyond the first
 _JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
 
 
@@ -124,7 +122,6 @@ class Executor:
         self._allowed = allowed
         self._lost = lost
         self._decider = decider
-        self._taken_again = Counter[str]()  # captures, by id, of which the disk has lost frames
         self._changed = asyncio.Event()  # set, and replaced, when the plan was changed
         if stand.imaging.supply.equilibrium.is_lost:
             self._on_lost_equilibrium()
@@ -182,17 +179,8 @@ class Executor:
             flap_open=stand.imaging.flap_open,
             lost_equilibrium=stand.imaging.supply.equilibrium.is_lost,
             pv_degC=math.nan if pv is None else pv.value,
-            frames_lost=self._frames_lost(),
+            frames_lost=self._lost(self._state.under_way),
         )
-
-    def _frames_lost(self) -> int:
-        """Of the capture under way, when it has all its frames and may be taken again. A camera that has warmed up
-        cannot; a disk that loses frames each time must not hold the night for good."""
-        planned = self._state.step(self._state.under_way)
-        if planned is None or not has_all_frames(self._state, planned) or self._taken_again[planned.step_id] >= _TRIES:
-            return 0
-        is_warm_up = isinstance(planned.step, Capture) and planned.step.role is Role.WARM_UP
-        return 0 if is_warm_up else self._lost(planned.step_id)
 
     @contextmanager
     def _failing(self) -> Generator[None]:
@@ -248,9 +236,8 @@ class Executor:
                 self._mark(planned, StepState.STARTED)
             case Aim(capture):
                 await self._aim(capture)
-            case TakeAgain(planned, why):
-                self._taken_again[planned.step_id] += has_all_frames(self._state, planned)
-                await self._begin_anew((planned,), why)
+            case TakeAgain(planned, why, frames_lost):
+                await self._begin_anew((planned,), why, frames_lost)
                 await self._log.write(Step(self._clock.now_ns(), planned.step_id, "started"))
             case TakeFrame():
                 await self._take(action)
@@ -265,7 +252,7 @@ class Executor:
     async def _conclude(self, action: Action) -> None:
         """What follows when the step under way is done, or has to wait for those before it."""
         match action:
-            case Complete() if self._frames_lost():
+            case Complete(planned) if is_lossy(self._state, self._surroundings(), planned):
                 pass  # by the flush: it is taken again
             case Complete(planned) | Perform(planned) if planned.step_id == self._state.under_way:
                 self._mark(planned, StepState.DONE)
@@ -278,13 +265,14 @@ class Executor:
             case _:
                 pass
 
-    async def _begin_anew(self, again: Plan, how: str) -> None:
+    async def _begin_anew(self, again: Plan, how: str, frames_lost: int = 0) -> None:
         """These steps count as neither begun nor done, and no frame of theirs so far: reported before it is journaled,
         so that no frame is ever left out unreported."""
         now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]
-        self._hub.publish(restarted(now_ns, step_ids[-1], self._state.frames.get(step_ids[-1], 0), how))
+        frames = self._state.frames.get(step_ids[-1], 0)
+        self._hub.publish(restarted(now_ns, step_ids[-1], frames, how, frames_lost))
         await self._flushed()
-        await self._log.write(Again(now_ns, step_ids))
+        await self._log.write(Again(now_ns, step_ids, frames_lost))
 
     async def _perform(self, planned: PlannedStep) -> None:
         stand = self._stand

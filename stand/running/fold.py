@@ -205,6 +205,7 @@ def _done(state: RunState, entry: Step) -> RunState:
             under_way="" if is_under_way else state.under_way,
             earned_ns=_without(state.earned_ns, entry.step_id),
             frames=_without(state.frames, entry.step_id),
+            taken_again=_without(state.taken_again, entry.step_id),
             due_ns=None if is_under_way else state.due_ns,
             is_lost=state.is_lost and not is_under_way,
         )
@@ -258,7 +259,8 @@ def _gap(state: RunState, entry: Gap) -> RunState:
 
 def _again(state: RunState, entry: Again) -> RunState:
     """A capture under way is restarted where it is; for other steps what those before them set up is needed again."""
-    ids = frozenset(entry.step_ids)
+    ids, counts = frozenset(entry.step_ids), state.taken_again
+    lossy = {each: counts.get(each, 0) + 1 for each in entry.step_ids} if entry.frames_lost else {}
     frames = MappingProxyType({each: count for each, count in state.frames.items() if each not in ids})
     kept = replace(
         state,
@@ -268,6 +270,7 @@ def _again(state: RunState, entry: Again) -> RunState:
         begun=state.begun.minus(ids),
         skipped=state.skipped.minus(ids),
         frames=frames,
+        taken_again=MappingProxyType({**counts, **lossy}) if lossy else counts,
     )
     if ids != frozenset((state.under_way,)):
         kept = replace(kept, under_way="", due_ns=None, is_lost=False, disturbances=state.disturbances + 1)

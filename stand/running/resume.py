@@ -18,7 +18,7 @@ from experiments.steps import Capture, PlannedStep
 from foundation.errors import SessionError
 from foundation.items import Event, Item, StepMark, StepState
 from foundation.progress import late_progress
-from recording.format.restarts import restarted_step
+from recording.format.restarts import frames_lost_of, restarted_step
 from recording.reading.contents import PLAN_CHANGED, RUN_BEGINS, RUN_END
 from recording.reading.glance import glance
 from recording.reading.run_word import Run, last_run_event
@@ -167,7 +167,7 @@ def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Itera
         if isinstance(item, Event):
             step_id = restarted_step(item)
             if step_id and (item.time_ns, step_id) not in known:
-                others.append(Again(item.time_ns, [step_id]))
+                others.append(Again(item.time_ns, [step_id], frames_lost_of(item)))
             change = change_of(item.time_ns, item.data) if item.kind == PLAN_CHANGED else None
             if change is not None and change not in entries:
                 others.append(change)

@@ -85,7 +85,8 @@ class RunState:
 
     done, begun, skipped: ids of steps; what is skipped counts as done. under_way: the id of the step that was begun by
     this daemon and is not done, "" when there is none. earned_ns: of soaks, by id; one that is done and not listed has
-    earned all of it. frames: by the id of a capture that is not done. changes: of the plan, as they came.
+    earned all of it. frames: by the id of a capture that is not done. taken_again: by the same, how often because the
+    disk had lost some of them. changes: of the plan, as they came.
 
     disturbances: how often something may have undone the set-up (an interlock, a camera that was off, a daemon's death,
     a warm-up that is restarted), of which so many are `restored`. is_cold: the camera was or may have been off, and the
@@ -108,6 +109,7 @@ class RunState:
     under_way: str = ""
     earned_ns: Mapping[str, int] = field(default_factory=_nothing)
     frames: Mapping[str, int] = field(default_factory=_nothing)
+    taken_again: Mapping[str, int] = field(default_factory=_nothing)
     changes: tuple[Change, ...] = ()
     disturbances: int = 0
     restored: int = 0

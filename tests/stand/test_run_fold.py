@@ -42,7 +42,7 @@ KINDS = {
     Step: st.tuples(ids, st.sampled_from(["started", "done"])),
     Dwell: st.tuples(ids, st.floats(0, 200)),
     Held: st.tuples(st.sampled_from(["operator", "interlock", "disk_low"]), st.booleans()),
-    Again: st.tuples(st.lists(ids, max_size=3)),
+    Again: st.tuples(st.lists(ids, max_size=3), st.integers(0, 2)),
     Skipped: st.tuples(ids),
     Extended: st.tuples(ids, st.floats(-5, 50)),
     Edited: st.tuples(st.integers(-1, 15), st.lists(st.sampled_from([soak, open_flap]), max_size=3)),

@@ -296,6 +296,28 @@ def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_hol
     assert not state.is_disturbed
 
 
+def test_a_capture_is_taken_again_three_times_for_lost_frames_also_when_it_is_resumed_meanwhile():
+    """A disk that loses frames each time does not hold the night for good."""
+    around = Surroundings(30 * S, flap_open=True, frames_lost=1)
+    again = [Again(30 * S, [CAPTURE], 1), Step(30 * S, CAPTURE, "started"), *[Taken(31 * S, CAPTURE)] * 2]
+    entries = [*STATES["all frames"], *again, *again, Gap(32 * S, 33 * S), Restored(34 * S, 1)]
+    twice = fold(PLAN, [*entries, Step(35 * S, CAPTURE, "started")])
+    assert next_action(twice, around) == TakeAgain(PLAN[5], "the disk has lost 1 of its frames", 1)
+    thrice = after(twice, Again(36 * S, [CAPTURE], 1))
+    assert isinstance(next_action(fold(PLAN, []), around), Begin)
+    for entry in again[1:]:
+        thrice = after(thrice, entry)
+    assert isinstance(next_action(thrice, around), Complete)
+    done = after(thrice, Step(40 * S, CAPTURE, "done"))
+    assert (thrice.taken_again, done.taken_again) == ({CAPTURE: 3}, {})
+
+
+def test_a_warm_up_of_which_the_disk_lost_frames_is_not_taken_again():
+    frames = [Taken(0, WARM)] * next(planned.step.frames for planned in PLAN if planned.step_id == WARM)
+    state = fold(PLAN, [*begun(WARM), *frames])
+    assert isinstance(next_action(state, Surroundings(20 * S, frames_lost=1)), Complete)
+
+
 def test_a_frame_is_settled_when_it_is_the_first_after_a_soak_and_no_warm_up():
     assert next_action(*met("next is due", "nothing")).is_settled
     assert not next_action(*met("one frame", "nothing")).is_settled
