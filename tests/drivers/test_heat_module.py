@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from drivers.devices.heat_module import HeatModule, HeatModuleSettings
 from drivers.sim.faults import LinkFaults
 from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.units import heat_module as fake_module
 from drivers.sim.units.heat_module import FakeHeatModule
 from drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
 from drivers.sim.wire import TcpWire
@@ -261,6 +262,32 @@ def test_its_frames_are_those_of_the_manual():
         assert RtuEngine([bench.fake]).feed(frame) == frame
     assert (bench.fake.coils[260], bench.fake.timeout_tenths) == (True, 50)
     assert (MAP.points["watchdog_on"].address, MAP.points["watchdog_s"].address) == (0x104, 0x1E8)
+
+
+# The fact sheet's numbers of the M-7024 (chambers.md, section 6; sister modules) and of its family's format coil.
+NUMBERS = {
+    "watchdog_mode": ("coil", 260),
+    "watchdog_on": ("coil", 261),
+    "data_format": ("coil", 269),
+    "tripped": ("coil", 270),
+    "output_0": ("holding", 40033),
+    "safe_0": ("holding", 40097),
+    "power_on_0": ("holding", 40193),
+    "watchdog_s": ("holding", 40489),
+}
+
+
+def test_its_registers_are_those_of_the_fact_sheet_in_driver_and_fake_and_none_passes_as_seen():
+    first = {"coil": 1, "holding": 40001}
+    theirs = fake_module.WATCHDOG_MODE, fake_module.WATCHDOG_ENABLED, fake_module.ENGINEERING, fake_module.TRIPPED
+    words = fake_module.VALUES, fake_module.SAFE_VALUES, fake_module.POWER_ON_VALUES, fake_module.TIMEOUT
+    for (name, (space, number)), fake in zip(NUMBERS.items(), (*theirs, *words), strict=True):
+        point = MAP.points[name]
+        assert (point.space, point.address, fake) == (space, number - first[space], number - first[space]), name
+        assert point.unverified, name
+    assert fake_module.TRIPS == 40492 - 40001
+    assert MAP.points["watchdog_s"].limits == (0.1, 25.5)
+    assert {point.model_dump()["unverified"] != "" for point in MAP.points.values()} == {True}
 
 
 def test_a_module_without_a_watchdog_that_can_be_read_is_refused():
