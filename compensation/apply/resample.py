@@ -9,8 +9,9 @@ noise, and exact for cubics:
 For images of lenses (a blur of 0.5 px and more) this leaves the centres of markers where they are at least as well as a
 cubic B-spline does, and needs no filter before. cv2.remap is no alternative: it rounds positions to 1/32 px.
 
-Rows are read first, columns then. Offsets and weights are linear between the points of a lattice; beyond its border the
-image is mirrored about the outermost pixels' centres.
+Rows are read first, columns then, in strips so narrow that what is read again lies in the processor's cache. Offsets
+and weights are bilinear between the points of a lattice; beyond its border the image is mirrored about the outermost
+pixels' centres.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 BLOCK_px = 16
 """Apart are the points of the lattice."""
@@ -34,14 +36,18 @@ _BEFORE = 3
 """Of the 8 pixels, those before the one at or left of the place."""
 _BLUR_px = 0.7
 _NOISE = 1e-6
-_REACH = 0.5
+_REACH = 1.0
 """How far a place may lie outside the two middle pixels, so that a block of places reads the same pixels."""
-_NODES = 512
+_NODES = 1024
 _PER_NODE = np.float32(_NODES / (1 + 2 * _REACH))
-_BEYOND_px = 48
-_KEPT_ROWS = 64
+_STRIP = 256
+_HELD_ROWS = 128
+_HELD_BANDS = _HELD_ROWS // BLOCK_px
 _NOWHERE = 1 << 40
 SMALLEST_px = 16
+_GREATEST_CHANGE_px = 1.0
+_AT = np.uint64
+"""Of indices: one that may be negative is looked at twice."""
 
 
 @cache
@@ -73,149 +79,199 @@ def resample(image: Image, from_x: Float32, from_y: Float32) -> Float32:
             f"an image to interpolate is (height, width) of at least {SMALLEST_px} x {SMALLEST_px} pixels, "
             f"not {image.shape}"
         )
-    if max(np.abs(np.diff(offset, axis=axis)).max() for offset in (from_x, from_y) for axis in (0, 1)) > 2 * _REACH:
+    change = max(np.abs(np.diff(offset, axis=axis)).max() for offset in (from_x, from_y) for axis in (0, 1))
+    if change > _GREATEST_CHANGE_px:
         raise ValueError(f"the shift changes by more than a pixel within {BLOCK_px} px: that is no drift of a camera")
     out = np.empty(image.shape, np.float32)
-    _resample(image, _padded(from_x), _padded(from_y), _weights_table(), out)
+    _resample(image, _of_source_rows(from_x, from_y), from_y, _weights_table(), out)
     return out
 
 
-def _padded(lattice: Float32) -> Float32:
-    """With its last row twice: the last cell of an image may begin at its end."""
-    return np.pad(lattice, ((0, 1), (0, 0)), mode="edge")
+def _of_source_rows(from_x: Float32, from_y: Float32) -> Float32:
+    """from_x (M, N) at rows of the source: what the row of the result asks for that is read from it."""
+    rows, columns = np.mgrid[: from_x.shape[0], : from_x.shape[1]]
+    at = np.clip(rows - _PER_BLOCK * from_y, 0, len(from_x) - 1)
+    above = np.minimum(at.astype(np.int64), len(from_x) - 2)
+    part = (at - above).astype(np.float32)
+    return from_x[above, columns] + part * (from_x[above + 1, columns] - from_x[above, columns])
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, out: Float32) -> None:
-    """Row by row; source rows that were read along x are kept until no row of the result needs them."""
+    """Strip by strip; bands of source rows that were read along x are held until others need their place. from_x: of
+    the source's rows, from_y: of the result's."""
     height, width = image.shape
-    blocks = (width + BLOCK_px - 1) // BLOCK_px
-    kept = np.empty((_KEPT_ROWS, blocks * BLOCK_px), np.float32)
-    kept_row = np.full(_KEPT_ROWS, -(1 << 40), np.int64)
-    padded = np.empty(blocks * BLOCK_px + 2 * _BEYOND_px, np.float32)
-    line = np.empty(blocks * BLOCK_px, np.float32)
-    begin, end = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-    for y in range(height):
-        before = _NOWHERE
-        for block in range(blocks):
-            first, last = _offset(from_y, y, block), _offset(from_y, y, block + 1)
-            whole = math.floor(np.float32(0.5) * (first + last))
-            top = min(max(y + whole - _BEFORE, 1 - height), 2 * height - 2 - TAPS)
-            if whole != before:
-                before = whole
-                for row in range(top, top + TAPS):
-                    slot = row % _KEPT_ROWS
-                    if kept_row[slot] != row:
-                        kept_row[slot] = row
-                        _pad(image[_mirrored(row, height)], padded)
-                        _read_row(padded, row, from_x, from_y, table, kept[slot])
-                _weights(table, first - np.float32(whole), begin)
-            else:
-                begin, end = end, begin
-            _weights(table, last - np.float32(whole), end)
-            left = block * BLOCK_px
-            _mean_of_rows(kept, top, left, begin, end, line[left : left + BLOCK_px])
-        for x in range(width):
-            out[y, x] = line[x]
+    held = np.empty((_HELD_ROWS, _STRIP), np.float32)
+    bands = np.empty(_HELD_BANDS, np.int64)
+    weights, weights_along = np.empty((2 * TAPS, _STRIP), np.float32), np.empty((2 * TAPS, _STRIP), np.float32)
+    whole, whole_along = np.empty(_STRIP // BLOCK_px, np.int64), np.empty(_STRIP // BLOCK_px, np.int64)
+    row, line = np.empty(2 * _STRIP, np.float32), np.empty(_STRIP, np.float32)
+    for left in range(0, width, _STRIP):
+        wide = min(_STRIP, width - left)
+        cells = (wide + BLOCK_px - 1) // BLOCK_px
+        bands[:] = _NOWHERE
+        for y in range(height):
+            if y % BLOCK_px == 0:
+                cell_row = y // BLOCK_px
+                _weigh(from_y[cell_row], from_y[cell_row + 1], left // BLOCK_px, cells, table, whole, weights)
+            begin = 0
+            while begin < cells:
+                end = _run(whole, begin, cells)
+                top = y + whole[begin] - _BEFORE
+                for band in range(top // BLOCK_px, (top + TAPS - 1) // BLOCK_px + 1):
+                    if bands[band % _HELD_BANDS] != band:
+                        bands[band % _HELD_BANDS] = band
+                        _read_band(image, band, from_x, left, cells, table, whole_along, weights_along, row, held)
+                down = np.float32(y % BLOCK_px)
+                _mean_of_rows(held, top, weights, down, begin * BLOCK_px, (end - begin) * BLOCK_px, line)
+                begin = end
+            for x in range(_AT(wide)):
+                out[_AT(y), _AT(left) + x] = line[x]
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _read_row(padded: Float32, row: int, from_x: Float32, from_y: Float32, table: Float32, out: Float32) -> None:
-    """A source row at the places that the row of the result which is read from it asks for."""
-    begin, end = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-    lowest = float(BLOCK_px * (from_x.shape[0] - 2))
-    within = min(max(float(row), 0.0), lowest)
-    for block in range(len(out) // BLOCK_px):
-        y = min(max(row - float(_offset(from_y, within, block)), 0.0), lowest)
-        first, last = _offset(from_x, y, block), _offset(from_x, y, block + 1)
-        whole = math.floor(np.float32(0.5) * (first + last))
-        _weights(table, first - np.float32(whole), begin)
-        _weights(table, last - np.float32(whole), end)
-        left = block * BLOCK_px
-        at = min(max(_BEYOND_px + left + whole - _BEFORE, 0), len(padded) - BLOCK_px - TAPS)
-        _mean_along(padded[at : at + BLOCK_px + TAPS], begin, end, out[left : left + BLOCK_px])
+def _read_band(
+    image: Image,
+    band: int,
+    from_x: Float32,
+    left: int,
+    cells: int,
+    table: Float32,
+    whole: Int64,
+    weights: Float32,
+    row: Float32,
+    held: Float32,
+) -> None:
+    """BLOCK_px rows of the source, in the strip that begins at `left`, at the places that the result asks for."""
+    height, last = image.shape[0], from_x.shape[0] - 1
+    upper, lower = from_x[min(max(band, 0), last)], from_x[min(max(band + 1, 0), last)]
+    _weigh(upper, lower, left // BLOCK_px, cells, table, whole, weights)
+    low, high = whole[0], whole[0]
+    for cell in range(1, cells):
+        low, high = min(low, whole[cell]), max(high, whole[cell])
+    for down in range(BLOCK_px):
+        y = band * BLOCK_px + down
+        _take(image, _mirrored(y, height), left + low - _BEFORE, cells * BLOCK_px + TAPS + high - low, row)
+        begin = 0
+        while begin < cells:
+            end = _run(whole, begin, cells)
+            at, count = begin * BLOCK_px, (end - begin) * BLOCK_px
+            _mean_along(row, whole[begin] - low, weights, np.float32(down), at, count, held, y % _HELD_ROWS)
+            begin = end
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _offset(lattice: Float32, y: float, column: int) -> np.float32:
-    """The lattice's value at one of its columns and the image's row y."""
-    cell = int(y) // BLOCK_px
-    part = (np.float32(y) - np.float32(cell * BLOCK_px)) * _PER_BLOCK
-    return lattice[cell, column] + part * (lattice[cell + 1, column] - lattice[cell, column])
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _mirrored(row: int, height: int) -> int:
-    """The row of the image that stands for one beyond it."""
-    row = abs(row)
-    return row if row < height else 2 * (height - 1) - row
+@nb.njit(cache=True, nogil=True)
+def _run(whole: Int64, begin: int, cells: int) -> int:
+    """The first cell after `begin` that reads other whole pixels, `cells` at most."""
+    end = begin + 1
+    while end < cells and whole[end] == whole[begin]:
+        end += 1
+    return end
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _pad(row: Image, padded: Float32) -> None:
-    """Copy a row, mirrored at its ends."""
-    width = len(row)
-    for x in range(width):
-        padded[_BEYOND_px + x] = row[x]
-    for x in range(_BEYOND_px):
-        padded[_BEYOND_px - 1 - x] = padded[_BEYOND_px + min(1 + x, width - 1)]
-    for x in range(_BEYOND_px + width, len(padded)):
-        padded[x] = padded[max(2 * (_BEYOND_px + width - 1) - x, _BEYOND_px)]
+def _weigh(
+    upper: Float32, lower: Float32, first: int, cells: int, table: Float32, whole: Int64, weights: Float32
+) -> None:
+    """Of a row of cells, from `first` on, whose corners have the offsets `upper` and `lower`: the whole pixels of each
+    cell, and of each column of pixels the weights in its first row (TAPS, pixels) and by what they grow from one row to
+    the next (TAPS, pixels)."""
+    corners = np.empty((4, TAPS), np.float32)
+    before, here, there = _NOWHERE, _AT(0), _AT(2)
+    for cell in range(cells):
+        at, behind = _AT(first + cell), _AT(first + cell + 1)
+        own = math.floor(np.float32(0.25) * (upper[at] + upper[behind] + lower[at] + lower[behind]))
+        whole[cell] = own
+        here, there = there, here
+        if own != before:
+            _weights(table, upper[at] - np.float32(own), corners, here)
+            _weights(table, lower[at] - np.float32(own), corners, here + _AT(1))
+        before = own
+        _weights(table, upper[behind] - np.float32(own), corners, there)
+        _weights(table, lower[behind] - np.float32(own), corners, there + _AT(1))
+        left = _AT(cell * BLOCK_px)
+        for k in range(_AT(TAPS)):
+            value, growth = corners[here, k], corners[here + _AT(1), k] - corners[here, k]
+            change = corners[there, k] - value
+            growth_change = corners[there + _AT(1), k] - corners[there, k] - growth
+            change, growth, growth_change = change * _PER_BLOCK, growth * _PER_BLOCK, growth_change * _PER_BLOCK**2
+            for x in range(_AT(BLOCK_px)):
+                weights[k, left + x] = value + np.float32(x) * change
+            for x in range(_AT(BLOCK_px)):
+                weights[k + _AT(TAPS), left + x] = growth + np.float32(x) * growth_change
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _weights(table: Float32, place: np.float32, weights: Float32) -> None:
-    """The weights (TAPS,) of one place."""
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _weights(table: Float32, place: np.float32, weights: Float32, row: np.uint64) -> None:
+    """Set a row of `weights` to those of one place."""
     at = (place + np.float32(_REACH)) * _PER_NODE
-    node = min(max(int(at), 0), _NODES - 1)
+    node = _AT(min(max(int(at), 0), _NODES - 1))
     part = at - np.float32(node)
-    before, after = table[node], table[node + 1]
-    for k in range(TAPS):
-        weights[k] = before[k] + part * (after[k] - before[k])
+    for k in range(_AT(TAPS)):
+        weights[row, k] = table[node, k] + part * (table[node + _AT(1), k] - table[node, k])
+
+
+@nb.njit(cache=True, nogil=True)
+def _mirrored(place: int, size: int) -> int:
+    """The row or column of the image that stands for one beyond it."""
+    place = abs(place)
+    return min(max(place if place < size else 2 * (size - 1) - place, 0), size - 1)
+
+
+@nb.njit(cache=True, nogil=True)
+def _take(image: Image, y: int, begin: int, count: int, row: Float32) -> None:
+    """Copy `count` columns of a row of the image, from `begin` on, mirrored at its ends."""
+    width = image.shape[1]
+    low = min(max(-begin, 0), count)
+    high = max(min(width - begin, count), low)
+    for x in range(_AT(high - low)):
+        row[_AT(low) + x] = image[_AT(y), _AT(begin + low) + x]
+    for x in range(low):
+        row[x] = image[y, _mirrored(begin + x, width)]
+    for x in range(high, count):
+        row[x] = image[y, _mirrored(begin + x, width)]
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _mean_along(row: Float32, begin: Float32, end: Float32, out: Float32) -> None:
-    """One block along a row. Weights are named one by one: the processor then takes many pixels at once."""
-    a0, a1, a2, a3 = begin[0], begin[1], begin[2], begin[3]
-    a4, a5, a6, a7 = begin[4], begin[5], begin[6], begin[7]
-    d0, d1, d2, d3 = end[0] - a0, end[1] - a1, end[2] - a2, end[3] - a3
-    d4, d5, d6, d7 = end[4] - a4, end[5] - a5, end[6] - a6, end[7] - a7
-    for x in range(BLOCK_px):
-        s = np.float32(x) * _PER_BLOCK
-        out[x] = (
-            (a0 + s * d0) * row[x]
-            + (a1 + s * d1) * row[x + 1]
-            + (a2 + s * d2) * row[x + 2]
-            + (a3 + s * d3) * row[x + 3]
-            + (a4 + s * d4) * row[x + 4]
-            + (a5 + s * d5) * row[x + 5]
-            + (a6 + s * d6) * row[x + 6]
-            + (a7 + s * d7) * row[x + 7]
+def _mean_along(
+    row: Float32, shift: int, weights: Float32, down: np.float32, left: int, count: int, held: Float32, slot: int
+) -> None:
+    """Pixels of a source row into their place in `held`, `down` rows below their cells' first one. Weights are named
+    one by one: the processor then takes many pixels at once."""
+    w, d, to = weights[:TAPS], weights[TAPS:], _AT(slot)
+    k0, k1, k2, k3, k4, k5, k6, k7 = _AT(0), _AT(1), _AT(2), _AT(3), _AT(4), _AT(5), _AT(6), _AT(7)
+    for n in range(_AT(left), _AT(left + count)):
+        x = n + _AT(shift)
+        held[to, n] = (
+            (w[k0, n] + down * d[k0, n]) * row[x]
+            + (w[k1, n] + down * d[k1, n]) * row[x + k1]
+            + (w[k2, n] + down * d[k2, n]) * row[x + k2]
+            + (w[k3, n] + down * d[k3, n]) * row[x + k3]
+            + (w[k4, n] + down * d[k4, n]) * row[x + k4]
+            + (w[k5, n] + down * d[k5, n]) * row[x + k5]
+            + (w[k6, n] + down * d[k6, n]) * row[x + k6]
+            + (w[k7, n] + down * d[k7, n]) * row[x + k7]
         )
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _mean_of_rows(kept: Float32, top: int, left: int, begin: Float32, end: Float32, out: Float32) -> None:
-    """One block of a row of the result, from the 8 kept rows that begin with `top`."""
-    right = left + BLOCK_px
-    r0, r1 = kept[top % _KEPT_ROWS, left:right], kept[(top + 1) % _KEPT_ROWS, left:right]
-    r2, r3 = kept[(top + 2) % _KEPT_ROWS, left:right], kept[(top + 3) % _KEPT_ROWS, left:right]
-    r4, r5 = kept[(top + 4) % _KEPT_ROWS, left:right], kept[(top + 5) % _KEPT_ROWS, left:right]
-    r6, r7 = kept[(top + 6) % _KEPT_ROWS, left:right], kept[(top + 7) % _KEPT_ROWS, left:right]
-    a0, a1, a2, a3 = begin[0], begin[1], begin[2], begin[3]
-    a4, a5, a6, a7 = begin[4], begin[5], begin[6], begin[7]
-    d0, d1, d2, d3 = end[0] - a0, end[1] - a1, end[2] - a2, end[3] - a3
-    d4, d5, d6, d7 = end[4] - a4, end[5] - a5, end[6] - a6, end[7] - a7
-    for x in range(BLOCK_px):
-        s = np.float32(x) * _PER_BLOCK
-        out[x] = (
-            (a0 + s * d0) * r0[x]
-            + (a1 + s * d1) * r1[x]
-            + (a2 + s * d2) * r2[x]
-            + (a3 + s * d3) * r3[x]
-            + (a4 + s * d4) * r4[x]
-            + (a5 + s * d5) * r5[x]
-            + (a6 + s * d6) * r6[x]
-            + (a7 + s * d7) * r7[x]
+def _mean_of_rows(
+    held: Float32, top: int, weights: Float32, down: np.float32, left: int, count: int, line: Float32
+) -> None:
+    """Pixels of a row of the result, from the 8 held rows that begin with `top`."""
+    w, d = weights[:TAPS], weights[TAPS:]
+    k0, k1, k2, k3, k4, k5, k6, k7 = _AT(0), _AT(1), _AT(2), _AT(3), _AT(4), _AT(5), _AT(6), _AT(7)
+    r0, r1, r2, r3 = (top % _HELD_ROWS, (top + 1) % _HELD_ROWS, (top + 2) % _HELD_ROWS, (top + 3) % _HELD_ROWS)
+    r4, r5, r6, r7 = ((top + 4) % _HELD_ROWS, (top + 5) % _HELD_ROWS, (top + 6) % _HELD_ROWS, (top + 7) % _HELD_ROWS)
+    h0, h1, h2, h3, h4, h5, h6, h7 = held[r0], held[r1], held[r2], held[r3], held[r4], held[r5], held[r6], held[r7]
+    for n in range(_AT(left), _AT(left + count)):
+        line[n] = (
+            (w[k0, n] + down * d[k0, n]) * h0[n]
+            + (w[k1, n] + down * d[k1, n]) * h1[n]
+            + (w[k2, n] + down * d[k2, n]) * h2[n]
+            + (w[k3, n] + down * d[k3, n]) * h3[n]
+            + (w[k4, n] + down * d[k4, n]) * h4[n]
+            + (w[k5, n] + down * d[k5, n]) * h5[n]
+            + (w[k6, n] + down * d[k6, n]) * h6[n]
+            + (w[k7, n] + down * d[k7, n]) * h7[n]
         )
