@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
+from drivers.framing.aravis_library import AravisError
 from drivers.settings import Identity
-from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_connection import Connection, FrameCount, Shot
 from drivers.wires.camera_errors import device_error, lacks_control
 from drivers.wires.camera_settings import EffectiveSettings, GigeCameraSettings

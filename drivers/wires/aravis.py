@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.wires.aravis_library import Library, library
+from drivers.framing.aravis_library import Library, library
 from drivers.wires.camera_settings import BITS_PER_PIXEL, PixelFormat, frame_bytes
 
 PACKET_SOCKET_DISABLED = 1  # ArvGvStreamOption: else root would get AF_PACKET and everyone else a UDP socket

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable
 from pathlib import Path
 
+from drivers.framing.aravis_library import AravisError
 from drivers.settings import Identity
 from drivers.wires import camera_dialects as words
 from drivers.wires.aravis import FLOAT_KINDS, GigeDevice
-from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_errors import is_silence
 from drivers.wires.camera_line import packet_delay_ns
 from drivers.wires.camera_settings import EffectiveSettings, GigeCameraSettings

@@ -11,6 +11,7 @@ import threading
 from collections import Counter
 from dataclasses import dataclass
 
+from drivers.framing.aravis_library import AravisError
 from drivers.settings import Identity, same_device
 from drivers.wires.aravis import (
     BUFFER_STATUS,
@@ -23,7 +24,6 @@ from drivers.wires.aravis import (
     GigeStream,
     Pixels,
 )
-from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_apply import (
     TICK_FREQUENCY_HIGH,
     TICK_FREQUENCY_LOW,

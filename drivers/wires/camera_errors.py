@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
+from drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from foundation.errors import DeviceError, Refused, Unreachable
 
 # Codes of arv-device-error-quark.

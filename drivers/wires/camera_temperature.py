@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from drivers.framing.aravis_library import AravisError
 from drivers.wires.aravis import GigeDevice
-from drivers.wires.aravis_library import AravisError
 from drivers.wires.camera_dialects import TEMPERATURE_ENTRIES, TEMPERATURES
 from drivers.wires.camera_errors import is_silence
 from drivers.wires.camera_settings import TemperatureFeature

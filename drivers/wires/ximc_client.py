@@ -12,8 +12,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from drivers.framing.ximc import ERROR_SIZES, Damage, Frame, decode, encode
 from drivers.wires.link import ByteLink
-from drivers.wires.ximc import ERROR_SIZES, Damage, Frame, decode, encode
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 READ_RETRIES = 2

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from drivers.devices.camera_gige import Camera
-from drivers.wires.aravis_library import library
+from drivers.framing.aravis_library import library
 from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
 from foundation.errors import StandError

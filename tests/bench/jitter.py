@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
-from drivers.wires.aravis_library import library
+from drivers.framing.aravis_library import library
 from drivers.wires.camera_connection import Connection, Shot
 from foundation.clock import WallClock, seconds_ns
 from foundation.errors import StandError

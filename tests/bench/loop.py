@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-from drivers.wires.aravis_library import library
+from drivers.framing.aravis_library import library
 from foundation.clock import WallClock
 from foundation.errors import StandError
 from foundation.hub import Hub

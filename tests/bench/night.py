@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.wires.aravis_library import library
+from drivers.framing.aravis_library import library
 from foundation.errors import StandError
 from tests.bench.figures import Figure, at_least, at_most, progress, skipped
 from tests.system.protocol_night import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
-from drivers.wires.aravis_library import library
+from drivers.framing.aravis_library import library
 from foundation.errors import StandError
 from stand.assembly import Assembly
 from stand.config.stand_config import StandConfig

@@ -13,7 +13,7 @@ import shutil
 import time
 from pathlib import Path
 
-from drivers.wires.aravis_library import library
+from drivers.framing.aravis_library import library
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import StandError
 from foundation.hub import Hub

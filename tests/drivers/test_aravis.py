@@ -2,8 +2,8 @@ import os
 
 import pytest
 
+from drivers.framing.aravis_library import DEVICE_ERRORS, AravisError, Library, library, load
 from drivers.wires.aravis import GigeDevice
-from drivers.wires.aravis_library import DEVICE_ERRORS, AravisError, Library, library, load
 from foundation.errors import StandError
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.devices.camera_gige import Camera
-from drivers.wires.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
+from drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from drivers.wires.camera_connection import FrameCount
 from drivers.wires.camera_errors import device_error
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature

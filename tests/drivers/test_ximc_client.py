@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from drivers.framing.ximc import encode
 from drivers.sim.faults import LinkFaults
 from drivers.sim.wire import PtyWire, TcpWire
 from drivers.wires.link import ByteLink, SerialSettings, open_link
-from drivers.wires.ximc import encode
 from drivers.wires.ximc_client import XimcClient
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 

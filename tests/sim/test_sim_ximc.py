@@ -7,10 +7,10 @@ from typing import Literal, NamedTuple, cast
 
 import pytest
 
+from drivers.framing.ximc import Damage, decode, encode
 from drivers.sim.motion.ximc import FakeAxis
 from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 from drivers.sim.physics.plant import Plant
-from drivers.wires.ximc import Damage, decode, encode
 from foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from drivers.wires.aravis_library import library
+from drivers.framing.aravis_library import library
 from foundation.documents import load_document, yaml_data
 from foundation.errors import StandError
 from stand.config.recipe import Recipe

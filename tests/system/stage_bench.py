@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Literal, cast
 
 from drivers.devices.stage import Axis, AxisSettings
+from drivers.framing.ximc import encode
 from drivers.sim.faults import LinkFaults
 from drivers.sim.motion.ximc import FakeAxis, XimcEngine
 from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 from drivers.sim.physics.plant import Plant
 from drivers.sim.wire import PtyWire, TcpWire
-from drivers.wires.ximc import encode
 from foundation.clock import FollowedClock, VirtualClock, seconds_ns
 from foundation.readings import Reading
 

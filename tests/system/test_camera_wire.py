@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.devices.camera_gige import Camera
+from drivers.framing.aravis_library import library
 from drivers.sim.gige.camera import FakeCamera
-from drivers.wires.aravis_library import library
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
 from foundation.errors import Refused, StandError, Unreachable

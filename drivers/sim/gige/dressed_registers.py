@@ -10,13 +10,13 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 
+from drivers.framing.aravis_library import AravisError
 from drivers.sim.gige.camera_registers import Registers
 from drivers.sim.gige.genicam import Feature
 from drivers.sim.gige.genicam_file import GenicamFile
 from drivers.sim.gige.genicam_memory import Evaluated
 from drivers.sim.gige.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
 from drivers.sim.gige.gvsp import PixelFormat
-from drivers.wires.aravis_library import AravisError
 
 XML_ADDRESS = 0x7E000000  # no register of the makes known lies there
 _BOOTSTRAP_bytes = 0x1000

@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
+from drivers.framing.ximc import Damage, Frame, decode, encode
 from drivers.sim.motion import ximc_table as table
 from drivers.sim.motion.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Run, Shift, Stepper
 from drivers.sim.motion.ximc_settings import Settings
-from drivers.wires.ximc import Damage, Frame, decode, encode
 from foundation.clock import Now
 
 if TYPE_CHECKING:
