@@ -1,12 +1,16 @@
 """What all tests share: the stock camera, and how they are dealt out to the workers of pytest-xdist."""
 
 import gc
+import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
 import pytest
+
+# Before NumPy is loaded: as the commands and `make test` have it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from recording.writing import notices
 from stand import simulator
