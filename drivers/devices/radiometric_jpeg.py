@@ -43,6 +43,7 @@ class RadiometricImage:
     emissivity: float
     model: str
     serial_number: str
+    software: str
     camera_s: float
     spots: Mapping[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
 
@@ -138,9 +139,8 @@ def _parsed(records: Mapping[int, tuple[int, bytes]]) -> RadiometricImage:
     around = Surroundings(air, real(40), real(48), real(52))
     seconds, milliseconds = struct.unpack_from("<II", info, 900)
     spots = _spots(records[_MEASUREMENTS][1]) if _MEASUREMENTS in records else {}
-    return RadiometricImage(
-        counts, planck, around, real(32), text(212, 32), text(260, 16), seconds + milliseconds / 1000, spots
-    )
+    names = text(212, 32), text(260, 16), text(276, 16)
+    return RadiometricImage(counts, planck, around, real(32), *names, seconds + milliseconds / 1000, spots)
 
 
 def _counts(record: bytes) -> NDArray[np.uint16]:

@@ -252,7 +252,7 @@ class ThermalImager:
     def _credit(self, name: str, digest: str, image: RadiometricImage, first_ns: int, now_ns: int) -> Event:
         """Keep its readings, and say what they were made of."""
         vendor, _, model = image.model.partition(" ")
-        self.identity = Identity(vendor, model, image.serial_number, "")
+        self.identity = Identity(vendor, model, image.serial_number, image.software)
         time_ns = first_ns
         if image.camera_s > 0:
             self._offset_s = min(self._offset_s, first_ns / NS_PER_S - image.camera_s)
@@ -284,7 +284,8 @@ class ThermalImager:
         height, width = image.counts.shape
         for spot, settings in self._settings.spots.items():
             channel = f"{self.name}.{spot}"
-            x, y = image.spots.get(settings.label, (settings.x_px, settings.y_px))
+            here = settings.x_px, settings.y_px
+            x, y = image.spots.get(settings.label, here) if settings.label else here
             if not (1 <= x < width - 1 and 1 <= y < height - 1):
                 yield bad_reading(channel, "degC", time_ns, f"({x}, {y}) is not within the {width} x {height} px")
                 continue

@@ -142,8 +142,13 @@ def _set_modes(device: GigeDevice) -> None:
     """Frames until a stop command, nothing automatic, the exposure timed."""
     pairs = [("AcquisitionMode", "Continuous"), words.TIMED, *((feature, "Off") for feature in words.AUTOMATICS)]
     for feature, entry in pairs:
-        if device.available(feature) and entry in _offered(device, feature) and device.get_string(feature) != entry:
-            device.set_string(feature, entry)
+        _choose(device, feature, entry)
+
+
+def _choose(device: GigeDevice, feature: str, entry: str) -> None:
+    """This entry, where the camera offers it now."""
+    if device.available(feature) and entry in _offered(device, feature) and device.get_string(feature) != entry:
+        device.set_string(feature, entry)
 
 
 def _set_region(name: str, device: GigeDevice, settings: GigeCameraSettings) -> tuple[int, int]:
@@ -210,6 +215,7 @@ def _set_trigger(name: str, device: GigeDevice, settings: GigeCameraSettings) ->
         return _set_software_trigger(name, device), "", settings.frame_rate_hz
     if enable := _found(device, words.FRAME_RATE_ON):  # without it the rate is only a number, or not there
         device.set_boolean(enable, True)
+        _choose(device, words.FRAME_RATE_AUTO, "Off")  # offered from now on only: Point Grey
     _select_frame_trigger(name, device)
     paced = _start_frames_by(name, device, words.FIXED_RATE_SOURCES)
     feature = _found(device, words.FRAME_RATE)

@@ -14,7 +14,8 @@ TIME_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns"
 
 GAIN_DB = ("Gain", "GainAbs")  # a Float; SFNC 2 · Baumer TXG, SVS
 GAIN_RAW = ("GainRaw", "Gain")  # steps: Basler, JAI, PSL, Prosilica GC1280 · Sony
-AUTOMATICS = ("ExposureAuto", "GainAuto", "AcquisitionFrameRateAuto")  # to be "Off"
+FRAME_RATE_AUTO = "AcquisitionFrameRateAuto"
+AUTOMATICS = ("ExposureAuto", "GainAuto", FRAME_RATE_AUTO)  # to be "Off"
 TIMED = ("ExposureMode", "Timed")  # else the trigger's width may be the exposure
 
 FRAME_RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")  # SFNC 2 · Basler, AVT, Prosilica

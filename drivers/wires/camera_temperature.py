@@ -17,7 +17,13 @@ def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> t
 
     AravisError when the camera does not answer: then nothing is known about it.
     """
-    for place in (wanted,) if wanted else _usual(device):
+    try:
+        places = [wanted] if wanted else _usual(device)
+    except AravisError as error:
+        if is_silence(error):
+            raise
+        return None, f"where its temperature is cannot be read ({error})"
+    for place in places:
         try:
             if place.feature is not None and not device.available(place.feature):
                 continue

@@ -14,15 +14,34 @@ from numpy.typing import NDArray
 
 from drivers.devices.camera_gige import Camera
 from drivers.sim.gige.camera import FakeCamera
+from drivers.sim.gige.camera_registers import Registers
 from drivers.sim.gige.genicam_file import GenicamFile, read_genicam
+from drivers.sim.gige.gvcp import Nack, Status
 from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
 from foundation.errors import ConfigError, Refused
 from foundation.readings import Quality
 from tests.addresses import camera_address
-from tests.dialects import DIALECTS, EXPOSURE, HEIGHT, SOURCE, STANDARD, TRIGGER, WIDTH, Dialect, integer
+from tests.dialects import (
+    DIALECTS,
+    EXPOSURE,
+    HEIGHT,
+    IIDC,
+    IMAGE,
+    SOURCE,
+    STANDARD,
+    TRIGGER,
+    WIDTH,
+    Dialect,
+    choice,
+    floating,
+    integer,
+    register,
+)
 from tests.system.conftest import require_aravis
 
+BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16, "Mono10Packed": 10, "Mono12Packed": 12}
+BITS |= {"Mono10p": 10, "Mono12p": 12}
 ADDRESS = camera_address()
 FOLDER = os.environ.get("GENICAM", "")
 
@@ -44,7 +63,7 @@ def scene(rows: int, width: int) -> NDArray[np.uint8]:
 
 
 @contextmanager
-def dressed(file: GenicamFile, size_px: tuple[int, int] = (WIDTH, HEIGHT)) -> Generator[None]:
+def dressed(file: GenicamFile | None, size_px: tuple[int, int] = (WIDTH, HEIGHT)) -> Generator[Registers]:
     def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
         return scene(rows, size_px[0])
 
@@ -53,7 +72,7 @@ def dressed(file: GenicamFile, size_px: tuple[int, int] = (WIDTH, HEIGHT)) -> Ge
     )
     camera.start()
     try:
-        yield
+        yield camera._registers  # pyright: ignore[reportPrivateUsage] - what the client has written
     finally:
         camera.close()
 
@@ -119,6 +138,54 @@ async def test_binned_pixels_are_the_mean_of_those_of_the_sensor():
             frame = await camera.grab()
     four = scene(HEIGHT, WIDTH).reshape(HEIGHT // 2, 2, WIDTH // 2, 2)
     assert (frame.image == four.mean(axis=(1, 3)).round()).all()
+
+
+async def test_our_own_camera_gives_every_pixel_format_that_a_stand_may_ask_for():
+    require_aravis()
+    with dressed(None):
+        for pixel_format, bits in BITS.items():
+            async with opened(pixel_format=pixel_format, width_px=32, height_px=16, offset_x_px=8) as camera:
+                frame = await camera.grab()
+            expected = scene(HEIGHT, WIDTH)[:16, 8:40].astype(np.uint16) << bits - 8
+            assert (frame.image == expected).all(), pixel_format
+
+
+async def test_a_selector_that_the_camera_refuses_costs_the_temperature_and_not_the_camera(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Whether there is one is in a register that cannot be read; the camera works otherwise."""
+    selector = choice("DeviceTemperatureSelector", 0xA0A0, {"Sensor": 0}, "<pIsImplemented>Inquiry</pIsImplemented>")
+    body = STANDARD + TRIGGER + SOURCE + EXPOSURE + selector + register("Inquiry", 0xA0B0, "RO")
+    body += floating("DeviceTemperature", 0xA060)
+    with dressed(GenicamFile(Dialect(body).xml("refusing"), "refusing")) as registers:
+        read = registers.read
+
+        def refusing(address: int, count: int) -> bytes:
+            if address == 0xA0B0:
+                raise Nack(Status.ACCESS_DENIED, "not now")
+            return read(address, count)
+
+        monkeypatch.setattr(registers, "read", refusing)
+        async with opened() as camera:
+            (reading,) = await camera.read()
+            await camera.grab()
+    assert reading.quality is Quality.BAD
+    assert "where its temperature is cannot be read ([DeviceTemperatureSelector]" in reading.reason
+
+
+async def test_a_rate_of_the_cameras_own_choice_is_switched_off_once_the_rate_is_there():
+    """As Point Grey's: the automatic is offered with the rate enabled only."""
+    automatic = choice(
+        "AcquisitionFrameRateAuto",
+        0xF0F00A00,
+        {"Off": 0, "Continuous": 1},
+        "<pIsAvailable>AcquisitionFrameRateEnabled</pIsAvailable>",
+    )
+    file = GenicamFile(Dialect(IMAGE + IIDC + automatic).xml("auto"), "auto")
+    with dressed(file) as registers:
+        registers.write(0xF0F00A00, (1).to_bytes(4, "big"))
+        async with opened(trigger="free_run", frame_rate_hz=10.0):
+            assert int.from_bytes(registers.read(0xF0F00A00, 4), "big") == 0
 
 
 @pytest.mark.parametrize(

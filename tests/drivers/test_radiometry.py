@@ -75,6 +75,20 @@ def test_a_temperature_without_answer_is_nan() -> None:
     assert np.isnan(temperatures_degC(dark, image.planck, image.around, 0.05)).all()
 
 
+def test_counts_in_the_other_byte_order_and_a_tool_that_is_none_are_read_as_such() -> None:
+    """As the fact sheet has them: subtype 1 is big endian, by its header; tool 7 is unused."""
+    data = jpeg_of(Shot(SCENE_DEGC, 0.0, spots=SPOTS))
+    little, sound = struct.pack("<9H", 2, WIDTH, HEIGHT, 0, 0, 0, WIDTH - 1, 0, HEIGHT - 1), parse(data)
+    begin = data.index(little)
+    end = begin + 32 + 2 * WIDTH * HEIGHT
+    words = np.frombuffer(data[begin:end], "<u2").astype(">u2").tobytes()
+    changed = bytearray(data[:begin] + words + data[end:])
+    changed[data.index("lens".encode("utf-16-le")) - 40 + 10] = 7
+    image = parse(bytes(changed))
+    assert np.array_equal(image.counts, sound.counts)
+    assert image.spots == {name: place for name, place in SPOTS.items() if name != "lens"}
+
+
 def one_segment_twice(data: bytes) -> bytes:
     at = data.index(b"\xff\xe1")
     return data[:at] + data[at : at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")] + data[at:]
@@ -88,6 +102,7 @@ def one_segment_twice(data: bytes) -> bytes:
         (one_segment_twice, "twice"),
         (lambda data: data.replace(b"FLIR\0\x01\0\0", b"FLIR\0\x01\0\x01"), "segments up to 1"),
         (lambda data: data.replace(b"FFF\0", b"FFG\0"), "no FFF"),
+        (lambda data: data.replace(b"\0\x20\0\0\0\0\0\x6f", b"\0\0\0\0\0\0\0\x6f"), "lacks the counts or the camera"),
         (lambda data: data.replace(b"\0\0\0\x64", b"\0\0\0\x63", 1), "version"),
         (lambda data: data.replace(struct.pack("<3H", 2, WIDTH, HEIGHT), struct.pack("<3H", 2, 0, HEIGHT)), "px"),
         (lambda data: data.replace(struct.pack("<3H", 2, WIDTH, HEIGHT), struct.pack("<3H", 7, 1, 1)), "header"),

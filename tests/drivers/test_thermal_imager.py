@@ -211,3 +211,15 @@ async def test_a_spot_by_the_imagers_own_label_and_one_outside_the_picture(tmp_p
     assert readings["lens"].value == pytest.approx(41.0, abs=0.2)
     assert readings["far"].reason == "(159, 60) is not within the 160 x 120 px"
     await bench.imager.close()
+
+
+async def test_a_spot_of_the_imager_without_a_label_moves_none_of_ours(bench: Bench) -> None:
+    bench.fake.labels = {"": (5, 5)}
+    readings = await bench.wait(80)
+    assert readings["lens"].value == pytest.approx(41.0, abs=0.2)
+
+
+async def test_the_imager_says_which_software_it_has(bench: Bench) -> None:
+    await bench.wait(80)
+    assert bench.imager.identity is not None
+    assert (bench.imager.identity.model, bench.imager.identity.version) == ("E40", "4.2")

@@ -128,7 +128,7 @@ def _image(width: int, height: int) -> tuple[Feature, ...]:
             0x10120,
             "ImageFormatControl",
             default=PixelFormat.MONO8,
-            entries=tuple((each.name.capitalize(), each) for each in PixelFormat),
+            entries=tuple((each.symbol, each) for each in PixelFormat),
             locked=True,
         ),
     )

@@ -45,6 +45,11 @@ class PixelFormat(IntEnum):
     MONO10P = 0x010A0046
     MONO12P = 0x010C0047
 
+    @property
+    def symbol(self) -> str:
+        """Its name of the PFNC, Mono12Packed."""
+        return self.name.capitalize().replace("packed", "Packed")
+
     def size_bytes(self, pixels: int) -> int:
         """Bytes of an image."""
         return -(-pixels * (self >> 16 & 0xFF) // 8)
