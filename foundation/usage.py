@@ -84,7 +84,8 @@ def _imported(module: str, name: str) -> Any:
     """The command of that name; the whole group when the module has none of that name.
 
     NumPy and SciPy, which it may import, compute with one thread unless the environment says otherwise: their matrices
-    are small here, and two threads that wait for each other took twice as long for a calibration, five times beside load.
+    are small here, and two threads, which wait for each other, took twice as long for a calibration (beside load five
+    times).
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
