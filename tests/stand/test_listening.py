@@ -141,15 +141,15 @@ class Desk(ADesk):
         return super().stop(who)
 
     def pause(self, who, when="now"):
-        self.moving = (used(),)
+        self.moving = (take_all(),)  # what clients that have left since held, too
         return super().pause(who, when)
 
-def used():
+def take_all():
     try:
-        os.close(os.open("/dev/null", os.O_RDONLY))
+        while True:
+            os.open("/dev/null", os.O_RDONLY)
     except OSError as error:
         return error.strerror
-    return "one left"
 
 async def run():
     global ended
@@ -157,13 +157,7 @@ async def run():
     async with served(Desk(), Path(sys.argv[1])):
         print("ready", flush=True)
         await asyncio.to_thread(sys.stdin.readline)
-        for _ in range(5):  # those of a client that has just left are free a moment later
-            await asyncio.sleep(0.1)
-            try:
-                while True:
-                    os.open("/dev/null", os.O_RDONLY)
-            except OSError:
-                pass
+        take_all()
         print("no descriptor left", flush=True)
         await ended.wait()
 
