@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import suppress
+from dataclasses import replace
 from typing import NoReturn, Self
 
 from pydantic import Field, model_validator
@@ -17,7 +18,7 @@ from drivers.settings import Identity, OnBus
 from drivers.wires.modbus_unit import ModbusUnit
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
-from foundation.readings import Reading
+from foundation.readings import Quality, Reading
 
 _TOLERANCE_mA = 0.1  # of what reads back: the modules are good to 0.02 mA
 _TOLERANCE_s = 0.05  # of its watchdog's time, which it keeps in tenths
@@ -79,6 +80,7 @@ class HeatModule:
         self._differed = False  # at the last step it gave other than what it was left at
         self.uncontrolled = ""
         self._last: tuple[Reading, ...] = ()
+        self._unread = ""  # why the last exchange has not given it anew
 
     @property
     def identity(self) -> Identity | None:
@@ -95,16 +97,26 @@ class HeatModule:
         """Nothing to let go of; a module that is left alone goes to its safe value."""
 
     async def read(self) -> tuple[Reading, ...]:
-        """output (mA, what it gives), tripped; while it heats those of the law's last exchange. DeviceError, and the
-        output is at zero, when it gives heat though nothing does."""
+        """output (mA, what it gives), tripped; while it heats those of the law's last exchange, STALE when the law's
+        next one has failed, or is overdue. DeviceError, and the output is at zero, when it gives heat though nothing
+        does."""
         async with self._lock:
             if self._armed_ns is not None and self._last:
-                return self._last
+                return self._exchanged()
             given_mA = await self._given_mA()
             if given_mA > self._settings.zero_mA + _TOLERANCE_mA:
                 await self._zero()
                 raise DeviceFault(self.name, f"gave {given_mA:.2f} mA unasked; it is at its zero again")
             return self._last
+
+    def _exchanged(self) -> tuple[Reading, ...]:
+        age_s = (self._clock.now_ns() - self._last[0].time_ns) / NS_PER_S
+        reason = self._unread
+        if not reason and age_s > self._settings.watchdog_s:
+            reason = f"the law has not asked it for {age_s:.0f} s"
+        return (
+            tuple(replace(each, quality=Quality.STALE, reason=reason) for each in self._last) if reason else self._last
+        )
 
     async def arm(self) -> None:
         """Before control begins: safe values as configured, output at zero, watchdog on and not tripped, all read back.
@@ -270,10 +282,15 @@ class HeatModule:
 
     async def _given_mA(self) -> float:
         """What flows, mA, and whether it has tripped, which become the readings."""
-        snapshot = await self._unit.snapshot([self._present, _TRIPPED])
-        sample, now_ns = snapshot.samples[self._present], self._clock.now_ns()
-        if sample.reason:
-            raise DeviceFault(self.name, f"{self._present}: {sample.reason}")
+        try:
+            snapshot = await self._unit.snapshot([self._present, _TRIPPED])
+            sample, now_ns = snapshot.samples[self._present], self._clock.now_ns()
+            if sample.reason:
+                raise DeviceFault(self.name, f"{self._present}: {sample.reason}")
+        except DeviceError as error:
+            self._unread = error.text
+            raise
+        self._unread = ""
         self._last = (
             Reading(f"{self.name}.output", sample.value, "mA", now_ns),
             Reading(f"{self.name}.tripped", float(snapshot.bits[_TRIPPED]), "1", now_ns),

@@ -32,6 +32,7 @@ _SUFFIXES = (".jpg", ".jpeg")
 _LARGEST_BYTES = 20_000_000
 _MOST_AT_ONCE = 20  # files of one poll: after a pause, hundreds may wait
 _KNOWN_HASHES = 10_000
+_SET_BACK_S = 120.0  # more than a picture takes from the imager into the folder, beyond the quickest of them
 _NONE_YET = "no picture yet"
 
 
@@ -87,7 +88,8 @@ class ThermalImager:
     """Readings `<spot>` in degC, and `clock_offset`, s by which the imager's clock is behind the stand's.
 
     Its own time stays as it is: the instant of a reading is that time plus the offset, the least by which any picture
-    came later than its own clock says. publish: takes each picture as it came, and events.
+    came later than its own clock says, since that clock was last set. publish: takes each picture as it came, and
+    events.
     """
 
     def __init__(
@@ -103,6 +105,9 @@ class ThermalImager:
         self._lost = ""
         self._hashes: dict[str, str] = {}  # of the pictures that were taken, in order -> their names
         self._offset_s = math.inf
+        self._late: tuple[int, float] | None = (
+            None  # when a picture was found that came too late for the offset, and by what
+        )
         self._latest: tuple[Reading, ...] = ()
         self._latest_ns = 0
         self._is_stale = False
@@ -239,8 +244,9 @@ class ThermalImager:
         self._hashes[digest] = name
         while len(self._hashes) > _KNOWN_HASHES:
             del self._hashes[next(iter(self._hashes))]
+        told = self._follow_clock(image.camera_s, seen.first_ns, now_ns) if image.camera_s > 0 else []
         taken = self._credit(name, digest, image, seen.first_ns, now_ns)
-        return [Original(now_ns, self.name, name, data), taken]
+        return [Original(now_ns, self.name, name, data), *told, taken]
 
     def _content(self, name: str) -> bytes:
         with (self._settings.folder / name).open("rb") as file:
@@ -249,13 +255,28 @@ class ThermalImager:
             raise NotRadiometric(f"it has more than {_LARGEST_BYTES} bytes")
         return data
 
+    def _follow_clock(self, camera_s: float, first_ns: int, now_ns: int) -> list[Item]:
+        """The offset with this picture. Old pictures that are copied here come late, too; two that were found as far
+        apart as they were taken are new ones of a clock that was set back, which is an event."""
+        lag_s = first_ns / NS_PER_S - camera_s
+        if lag_s <= self._offset_s + _SET_BACK_S:
+            self._offset_s, self._late = min(self._offset_s, lag_s), None
+            return []
+        apart_s = 2 * self._settings.poll_s + 1.0
+        if self._late is None or abs(lag_s - self._late[1]) > apart_s:
+            self._late = first_ns, lag_s
+        if first_ns - self._late[0] <= seconds_ns(apart_s):
+            return []
+        by_s, self._offset_s, self._late = round(lag_s - self._offset_s), min(lag_s, self._late[1]), None
+        text = f"its clock was set back by {by_s} s, and its pictures are dated accordingly from now on"
+        return [self._event("warning", "clock_set_back", text, {"by_s": by_s}, now_ns)]
+
     def _credit(self, name: str, digest: str, image: RadiometricImage, first_ns: int, now_ns: int) -> Event:
         """Keep its readings, and say what they were made of."""
         vendor, _, model = image.model.partition(" ")
         self.identity = Identity(vendor, model, image.serial_number, image.software)
         time_ns = first_ns
         if image.camera_s > 0:
-            self._offset_s = min(self._offset_s, first_ns / NS_PER_S - image.camera_s)
             time_ns = min(now_ns, seconds_ns(image.camera_s + self._offset_s))
         readings = [*self._spots(image, time_ns), self._offset(time_ns)]
         if time_ns >= self._latest_ns or not self._latest:

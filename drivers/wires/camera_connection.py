@@ -34,7 +34,7 @@ from drivers.wires.camera_apply import (
 )
 from drivers.wires.camera_errors import NO_CONTROL_HINT
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
-from drivers.wires.camera_temperature import find_temperature, read_temperature, temperature_place
+from drivers.wires.camera_temperature import NoTemperature, find_temperature, read_temperature, temperature_place
 from foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
 from foundation.errors import Refused
 from foundation.readings import Cause
@@ -52,6 +52,8 @@ TIMESTAMP_HIGH, TIMESTAMP_LOW = 0x0948, 0x094C
 LATCH_TRIES = 3
 LATCH_GOOD_NS = 5_000_000
 LATCH_AGAIN_S = 60.0  # two quartzes 50 ppm apart: 3 ms
+
+TEMPERATURE_AGAIN_S = 60.0  # between two looks that take the seconds of a time-out
 
 # A time stamp may precede what it belongs to by the error of the latch, and never lies in the future.
 STAMP_SLACK_NS = 20_000_000
@@ -140,7 +142,7 @@ class Connection:
             self._period_ns = seconds_ns(1 / self.effective.frame_rate_hz)
             self._exposure_asked_s = settings.exposure_s
             self._exposure_s = self.effective.exposure_s
-            self._temperature, self._no_temperature = self._find_temperature()
+            self._temperature = self._find_temperature()
             self._latch()
         except BaseException:
             self._device.close()
@@ -236,24 +238,31 @@ class Connection:
 
     def temperature(self) -> tuple[float, str, Cause]:
         """The camera's temperature in degC and "", or NaN, the reason and who says so. A place that was not found is
-        looked for again: a camera may refuse its selector for a while."""
-        try:
-            if self._temperature is None:
-                self._temperature, self._no_temperature = self._find_temperature()
-        except AravisError as error:
-            return math.nan, str(error), "wire"
-        if self._temperature is None:
-            return math.nan, self._no_temperature, "device"
-        return read_temperature(self._device, self._temperature)
+        looked for again, since a camera may refuse its selector for a while; where that had to be waited for, not
+        before a minute has passed."""
+        place = self._temperature
+        is_slow = isinstance(place, NoTemperature) and place.cause == "wire"
+        if not is_slow or self._clock.now_ns() - self._looked_ns >= seconds_ns(TEMPERATURE_AGAIN_S):
+            try:
+                place = self._temperature = self._find_temperature() if isinstance(place, NoTemperature) else place
+            except AravisError as error:
+                return math.nan, str(error), "wire"
+        if isinstance(place, NoTemperature):
+            return math.nan, place.reason, place.cause
+        return read_temperature(self._device, place)
 
     def temperature_place(self) -> str:
         """Where the temperature is read, and what else the camera offers, in words; "" when it was not found."""
-        return "" if self._temperature is None else temperature_place(self._device, self._temperature)
+        place = self._temperature
+        return "" if isinstance(place, NoTemperature) else temperature_place(self._device, place)
 
-    def _find_temperature(self) -> tuple[TemperatureFeature | None, str]:
+    def _find_temperature(self) -> TemperatureFeature | NoTemperature:
         if not self._settings.has_temperature:
-            return None, "the configuration says that this camera has no temperature"
-        return find_temperature(self._device, self._settings.temperature)
+            return NoTemperature("the configuration says that this camera has no temperature")
+        try:
+            return find_temperature(self._device, self._settings.temperature)
+        finally:
+            self._looked_ns = self._clock.now_ns()
 
     def _discard(self) -> None:
         """Give back every finished frame unused."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from drivers.framing.aravis_library import AravisError
 from drivers.wires.aravis import GigeDevice
@@ -11,18 +12,26 @@ from drivers.wires.camera_errors import is_silence
 from drivers.wires.camera_settings import TemperatureFeature
 from foundation.readings import Cause
 
+VERSION = 0x0000  # the bootstrap register that each camera has (GigE Vision 1.2, section 28)
 
-def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> tuple[TemperatureFeature | None, str]:
-    """The place to read the temperature from, its selector set; or None and why there is none.
 
-    AravisError when the camera does not answer: then nothing is known about it.
+@dataclass(frozen=True, slots=True)
+class NoTemperature:
+    """Why a camera's temperature is read nowhere. cause: "wire" when the camera did not answer for it."""
+
+    reason: str
+    cause: Cause = "device"
+
+
+def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> TemperatureFeature | NoTemperature:
+    """The place to read the temperature from, its selector set.
+
+    AravisError when the camera does not answer for anything: then nothing is known about it.
     """
     try:
         places = [wanted] if wanted else _usual(device)
     except AravisError as error:
-        if is_silence(error):
-            raise
-        return None, f"where its temperature is cannot be read ({error})"
+        return _unread(device, "where its temperature is", error)
     for place in places:
         try:
             if place.feature is not None and not device.available(place.feature):
@@ -30,12 +39,22 @@ def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> t
             if place.selector is not None and place.entry is not None:
                 device.set_string(place.selector, place.entry)  # once: selector and value are two transactions
         except AravisError as error:
-            if is_silence(error):
-                raise
-            return None, f"{_named(place)} cannot be read ({error}){_offered(device, place)}"
-        return place, ""
+            return _unread(device, _named(place), error, _offered(device, place))
+        return place
     names = [wanted.feature or ""] if wanted else [feature for feature, _ in TEMPERATURES]
-    return None, f"the camera has no {' and no '.join(names)}"
+    return NoTemperature(f"the camera has no {' and no '.join(names)}")
+
+
+def _unread(device: GigeDevice, what: str, error: AravisError, offered: str = "") -> NoTemperature:
+    """The error again when it is not for these features alone that the camera does not answer."""
+    text = f"{what} cannot be read ({error}){offered}"
+    if not is_silence(error):
+        return NoTemperature(text)
+    try:
+        device.read_register(VERSION)
+    except AravisError:
+        raise error from None
+    return NoTemperature(text, "wire")
 
 
 def _usual(device: GigeDevice) -> list[TemperatureFeature]:

@@ -2,22 +2,29 @@
 or refuses it by the name of what is missing. Small files of our own are always tried; `$GENICAM` is a folder of real
 ones (27 of 12 makes: etc/genicam of the public repository areaDetector/aravisGigE)."""
 
+import asyncio
 import os
 import threading
 from collections.abc import Generator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from drivers.devices.camera_gige import Camera
+from drivers.framing.aravis_library import DEVICE_ERRORS, AravisError
 from drivers.sim.gige.camera import FakeCamera
 from drivers.sim.gige.camera_registers import Registers
 from drivers.sim.gige.genicam_file import GenicamFile, read_genicam
-from drivers.sim.gige.gvcp import Nack, Status
-from drivers.wires.camera_settings import GigeCameraSettings
+from drivers.sim.gige.gvcp import Ack, Nack, Request, Status
+from drivers.sim.gige.gvcp_device import ControlChannel
+from drivers.wires import camera_connection
+from drivers.wires.aravis import GigeDevice
+from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
+from drivers.wires.camera_temperature import NoTemperature, find_temperature
 from foundation.clock import WallClock
 from foundation.errors import ConfigError, Refused
 from foundation.readings import Quality
@@ -171,6 +178,70 @@ async def test_a_selector_that_the_camera_refuses_costs_the_temperature_and_not_
             await camera.grab()
     assert reading.quality is Quality.BAD
     assert "where its temperature is cannot be read ([DeviceTemperatureSelector]" in reading.reason
+
+
+@pytest.mark.nightly  # the three seconds for which Aravis asks again
+async def test_a_selector_that_the_camera_never_answers_for_costs_the_temperature_and_not_the_camera(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    body = STANDARD + TRIGGER + SOURCE + EXPOSURE + floating("DeviceTemperature", 0xA060)
+    body += choice("DeviceTemperatureSelector", 0xA0A0, {"Sensor": 0})
+    execute = ControlChannel._execute  # pyright: ignore[reportPrivateUsage] - it is heard, and not answered
+    is_silent = True
+
+    def unanswered(self: ControlChannel, request: Request, peer: tuple[str, int], now_s: float) -> Ack | None:
+        is_asked = request.payload[:4] == (0xA0A0).to_bytes(4, "big")
+        return None if is_asked and is_silent else execute(self, request, peer, now_s)
+
+    monkeypatch.setattr(ControlChannel, "_execute", unanswered)
+    monkeypatch.setattr(camera_connection, "TEMPERATURE_AGAIN_S", 0.5)
+    with dressed(GenicamFile(Dialect(body).xml("silent"), "silent")):
+        async with opened() as camera:
+            (reading,) = await camera.read()
+            frame = await camera.grab()
+            is_silent = False
+            await asyncio.sleep(0.5)
+            (again,) = await camera.read()
+    assert (reading.quality, reading.cause) == (Quality.BAD, "wire")
+    assert "DeviceTemperature of DeviceTemperatureSelector 'Sensor' cannot be read" in reading.reason
+    assert (frame.image == scene(HEIGHT, WIDTH)).all()
+    assert again.value == pytest.approx(41.5, abs=0.6)
+
+
+class Asked:
+    """A camera that has a temperature behind a selector, for which it answers as told."""
+
+    def __init__(self, selector: int, others: int = 0) -> None:
+        self._selector, self._others = selector, others
+
+    def available(self, feature: str) -> bool:
+        return feature == "DeviceTemperature"
+
+    def entries(self, feature: str) -> tuple[str, ...]:
+        return ()
+
+    def set_string(self, feature: str, value: str) -> None:
+        if self._selector:
+            raise AravisError(DEVICE_ERRORS, self._selector, "as told")
+
+    def read_register(self, address: int) -> int:
+        if self._others:
+            raise AravisError(DEVICE_ERRORS, self._others, "nobody there")
+        return 0x00010002
+
+
+@pytest.mark.parametrize(("code", "cause"), [(5, "wire"), (17, "device")])
+def test_whether_it_is_the_selector_alone_that_is_not_answered_for_decides(code: int, cause: str):
+    wanted = TemperatureFeature(feature="DeviceTemperature", selector="Where", entry="Sensor")
+    assert find_temperature(cast("GigeDevice", Asked(0)), wanted) == wanted
+    found = find_temperature(cast("GigeDevice", Asked(code)), wanted)
+    assert isinstance(found, NoTemperature)
+    assert (found.cause, found.reason) == (
+        cause,
+        "DeviceTemperature of Where 'Sensor' cannot be read (as told)",
+    )
+    with pytest.raises(AravisError, match="as told"):
+        find_temperature(cast("GigeDevice", Asked(5, others=5)), wanted)
 
 
 async def test_a_rate_of_the_cameras_own_choice_is_switched_off_once_the_rate_is_there():

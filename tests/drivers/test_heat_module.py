@@ -22,6 +22,7 @@ from drivers.wires.registers import RegisterMap, load_register_map
 from foundation.clock import VirtualClock, seconds_ns
 from foundation.documents import parse_document
 from foundation.errors import ConfigError, DeviceFault, Unreachable
+from foundation.readings import Quality
 from stand.config.stand_config import packaged
 
 START_NS = 1_700_000_000_000_000_000
@@ -125,6 +126,28 @@ async def test_reading_it_does_not_keep_alive_what_its_law_has_left():
             await module.read()
             await bench.wait(1.0)
         assert bench.heater_W() == 0.0
+
+
+async def test_what_it_gave_last_is_not_shown_as_fresh_when_the_law_cannot_ask_it_or_does_not():
+    """A lost law is not asked for by our polls, so what they show has a time, and a reason from the watchdog's on."""
+    bench = Bench()
+    async with driven(bench) as module:
+        await module.arm()
+        await heating(bench, module, 50, 4.0)
+        assert [each.quality for each in await module.read()] == [Quality.GOOD] * 2
+        bench.fake.silent = True
+        with pytest.raises(Unreachable):
+            await module.give(50)
+        (output, _) = await module.read()
+        assert (output.quality, output.value) == (Quality.STALE, 12.0)
+        assert "no reply" in output.reason
+        bench.fake.silent = False
+        await module.give(50)
+        (output, _) = await module.read()
+        assert (output.quality, output.time_ns) == (Quality.GOOD, bench.clock.now_ns())
+        await bench.wait(6.0)
+        (output, _) = await module.read()
+        assert (output.quality, output.reason) == (Quality.STALE, "the law has not asked it for 6 s")
 
 
 UNSAFE: list[tuple[Callable[[FakeHeatModule], object], str]] = [

@@ -164,6 +164,39 @@ async def test_a_wrong_clock_is_told_and_set_right(bench: Bench, ahead_s: float)
     assert bench.events("picture_taken")[0].data["camera_s"] == pytest.approx(taken_ns / NS_PER_S + ahead_s, abs=2.5)
 
 
+@pytest.mark.parametrize("back_s", [300.0, 7200.0])
+async def test_a_clock_that_is_set_back_on_the_way_costs_one_picture_and_is_told(bench: Bench, back_s: float) -> None:
+    await bench.wait(80)
+    bench.fake.clock_s = -back_s
+    await bench.wait(60)
+    assert bench.events("clock_set_back") == []  # one alone may be an old picture
+    readings = await bench.wait(60)
+    assert [event.data["by_s"] for event in bench.events("clock_set_back")] == [pytest.approx(back_s, abs=3)]
+    assert readings["clock_offset"].value == pytest.approx(back_s, abs=2.5)
+    assert abs(readings["lens"].time_ns - START_NS - seconds_ns(182.0)) < seconds_ns(2.5)
+    assert readings["lens"].quality is Quality.GOOD
+    await bench.wait(600)
+    assert len(bench.events("clock_set_back")) == 1
+    assert bench.events("no_picture") == []
+
+
+async def test_old_pictures_that_are_copied_into_the_folder_do_not_set_its_clock(bench: Bench, tmp_path: Path) -> None:
+    """Three of an hour ago, a minute apart, that come within some seconds."""
+    other = FakeThermalImager(bench.sight, tmp_path / "card", SPOTS, seed=2)
+    other.clock_s = -3600.0
+    await bench.wait(220)
+    bench.fake.stopped = other.stopped = True
+    for number, old in enumerate(sorted(other.folder.iterdir())):
+        (bench.fake.folder / f"OLD_{number}.jpg").write_bytes(old.read_bytes())
+        await bench.wait(6)
+    before = bench.told["clock_offset"].value
+    bench.fake.stopped = False
+    readings = await bench.wait(120)
+    assert len(bench.originals()) >= 7
+    assert bench.events("clock_set_back") == []
+    assert readings["clock_offset"].value == pytest.approx(before, abs=2.5)
+
+
 async def test_without_new_pictures_the_last_ones_become_doubtful(bench: Bench) -> None:
     await bench.wait(80)
     bench.fake.stopped = True
