@@ -32,10 +32,12 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """centres_px: (K, 2) (x, y); areas_px2: (K,), unordered, with clutter and gaps."""
+    """centres_px: (K, 2) (x, y); areas_px2: (K,), holes included; hollow: (K,), which part of it is a hole, looked for
+    in targets with donut markers only. Unordered, with clutter and gaps."""
 
     centres_px: Float
     areas_px2: Float
+    hollow: Float
 
     def __len__(self) -> int:
         return len(self.areas_px2)
@@ -61,10 +63,10 @@ def find_candidates(image: Image, target: Target, size_px: float) -> Candidates:
     coarse = _reduced(image, factor)
     dark = coarse if target.polarity == "dark" else ~coarse
     inside = _darker_than_around(dark, largest / factor, full_scale_DN(image))
-    found = _ellipses(inside, smallest / factor, largest / factor)
+    found = _ellipses(inside, smallest / factor, largest / factor, target.hole_part)
     # Pixel k of the coarse image covers k factor - 0.5 .. (k + 1) factor - 0.5 of the image.
     centres_px = (found.centres_px + 0.5) * factor - 0.5
-    return _like_neighbours(Candidates(centres_px, found.areas_px2 * factor**2), odd**2)
+    return _like_neighbours(Candidates(centres_px, found.areas_px2 * factor**2, found.hollow), odd**2)
 
 
 def _reduced(image: Image, factor: int) -> Image:
@@ -96,21 +98,30 @@ def _darker_than_around(image: Image, largest_px: float, full_scale: int) -> NDA
     return np.asarray(cv2.compare(image, threshold, cv2.CMP_LT), dtype=np.uint8)
 
 
-def _ellipses(inside: NDArray[np.uint8], smallest_px: float, largest_px: float) -> Candidates:
-    """The connected components whose area is that of the ellipse with their second moments."""
+def _ellipses(inside: NDArray[np.uint8], smallest_px: float, largest_px: float, hole: float) -> Candidates:
+    """The connected components whose area is that of the ellipse with their second moments. hole: the part of its area
+    that a component may lack in its middle, 0 when none does."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8, ltype=cv2.CV_32S)
     short, long = np.minimum(stats[:, 2], stats[:, 3]), np.maximum(stats[:, 2], stats[:, 3])
     keep = (short >= smallest_px / 1.5) & (short >= _LEAST_SIDE_PX - 1) & (long <= 1.1 * largest_px + 1)
-    keep &= (long <= _GREATEST_ASPECT * short) & (stats[:, 4] > 0.5 * short * long)
+    keep &= (long <= _GREATEST_ASPECT * short) & (stats[:, 4] > 0.5 * (1 - hole) * short * long)
     keep[0] = False
-    rows: list[tuple[float, float, float]] = []
+    rows: list[tuple[float, float, float, float]] = []
     for label in np.arange(count)[keep]:
-        left, top, width, height, area = stats[label]
-        moments = cv2.moments((labels[top : top + height, left : left + width] == label).astype(np.uint8), True)
-        if _is_ellipse(moments, float(area)):
-            rows.append((left + moments["m10"] / area, top + moments["m01"] / area, float(area)))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    return Candidates(table[:, :2], table[:, 2])
+        left, top, width, height, seen = stats[label]
+        patch = (labels[top : top + height, left : left + width] == label).astype(np.uint8)
+        moments = cv2.moments(_filled(patch) if hole else patch, True)
+        area = moments["m00"]
+        if _is_ellipse(moments, area):
+            rows.append((left + moments["m10"] / area, top + moments["m01"] / area, area, 1 - seen / area))
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    return Candidates(table[:, :2], table[:, 2], table[:, 3])
+
+
+def _filled(patch: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The component without its holes."""
+    outlines, _ = cv2.findContours(patch, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(np.zeros_like(patch), outlines, -1, [1], cv2.FILLED), np.uint8)
 
 
 def _is_ellipse(moments: dict[str, float], area: float) -> bool:
@@ -131,4 +142,4 @@ def _like_neighbours(found: Candidates, odd_area_ratio: float) -> Candidates:
     ratio = found.areas_px2 / np.median(found.areas_px2[nearest], axis=1)
     keep = np.abs(np.log(ratio)) < np.log(_NEIGHBOUR_AREA_RATIO)
     keep |= np.abs(np.log(ratio / odd_area_ratio)) < np.log(_NEIGHBOUR_AREA_RATIO)
-    return Candidates(found.centres_px[keep], found.areas_px2[keep])
+    return Candidates(found.centres_px[keep], found.areas_px2[keep], found.hollow[keep])

@@ -107,7 +107,7 @@ def detect(
     if previous is not None:
         if len(previous.flags) != target.count:
             raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
-        if _still_there(grey, previous):
+        if _still_there(grey, previous, _reach(target)[:, :1]):
             with suppress(DetectionError):
                 tracked = _fit_in_band(grey, target, previous.state, noise, previous.band_sigma)
                 if tracked is not None and _has_followed(tracked[0], previous):
@@ -295,11 +295,12 @@ def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, n
 
 
 def _reach(target: Target) -> Float:
-    """How many radii from its centre a marker's surroundings end: half way to the nearest outline."""
+    """From where to where, in radii, a marker's pixels lie (N, 2): half way to the nearest other edge."""
     centres, radii = target.coordinates_mm(), target.diameters_mm() / 2
     gap = np.linalg.norm(centres[:, None] - centres[None], axis=2) - radii[:, None] - radii[None]
     np.fill_diagonal(gap, np.inf)
-    return 1 + gap.min(axis=1) / (2 * radii)
+    inwards = np.where(target.is_donut(), (1 + np.sqrt(target.hole_part)) / 2, 0.0)
+    return np.stack([inwards, 1 + gap.min(axis=1) / (2 * radii)], axis=1)
 
 
 def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.bool_]:
@@ -328,16 +329,16 @@ def _within_image(state: EdgeState, grey: Image) -> NDArray[np.bool_]:
     return np.all((centres - margin >= -0.5) & (centres + margin <= [width - 0.5, height - 0.5]), axis=1)
 
 
-def _still_there(grey: Image, before: Detection) -> bool:
-    """Whether the markers still look as they did: a glance at 16 pixels on either side of each outline. Much cheaper
-    than a fit that ends nowhere because the target has moved.
+def _still_there(grey: Image, before: Detection, inwards: Float) -> bool:
+    """Whether the markers still look as they did: a glance at 16 pixels on either side of each outline, not nearer to
+    the centre than `inwards` (N, 1) radii. Much cheaper than a fit that ends nowhere because the target has moved.
     """
     state, p = before.state, before.state.parameters
     angle = np.arange(16) * (2 * np.pi / 16)
     towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     bend = p[:, M11, None] * towards[:, 0] ** 2 + p[:, M22, None] * towards[:, 1] ** 2
     radius = state.scale_px[:, None] / np.sqrt(bend + 2 * p[:, M12, None] * towards[:, 0] * towards[:, 1])
-    margin = np.minimum(_GLANCE_BLURS * p[:, SIGMA, None], 0.6 * radius)
+    margin = np.minimum(_GLANCE_BLURS * p[:, SIGMA, None], np.minimum(0.6, 1 - inwards) * radius)
     limits = np.array(grey.shape[::-1]) - 1
     levels: list[Float] = []
     for along in (radius + margin, radius - margin):

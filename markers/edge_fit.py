@@ -82,9 +82,9 @@ class EdgeFit:
 
 
 def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float, band_sigma: float = 9.0) -> EdgeFit:
-    """Fit every marker of `start`. `reach` (N,): how many radii from the centre a marker's pixels may lie, so that its
-    band ends half way to the neighbours. band_sigma: half width of the band, blurs. The image is only read. Raises
-    ValueError for images that are not contiguous.
+    """Fit every marker of `start`. `reach` (N, 2): from where to where, in radii from the centre, a marker's pixels may
+    lie, so that its band ends half way to its hole and to the neighbours. band_sigma: half width of the band, blurs.
+    The image is only read. Raises ValueError for images that are not contiguous.
     """
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()

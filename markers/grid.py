@@ -4,13 +4,13 @@
 2. Placement: every way the target's cells can lie on the lattice; gaps that the growth left are filled. The smallest
    homography residual wins, not the largest count: clutter in line with the grid adds support, but does not fit. Where
    a side of the grid is beyond the frame, the window wins whose missing markers are all beyond it.
-3. Orientation: the odd marker, else the rotation nearest to the previous frame's, else nearest to the nominal roll
-   (0: the rows point to the right, marker 1 is bottom left). Never a guess: what stays open is refused.
+3. Orientation: the marks (marks.py), else the rotation nearest to the previous frame's, else to the nominal roll (0:
+   the rows point to the right, marker 1 is bottom left). Never a guess: what stays open is refused.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from foundation.errors import DetectionError
 from markers.bootstrap import Candidates
 from markers.lattice import largest_lattice
+from markers.marks import with_marks
 from markers.placement import LEAST_SEEN, Placement, placements, settled
 from markers.plane import area_scale, expected_px, fit_homography, pitch_px, project, roll_deg
 from markers.target import Target
@@ -71,7 +72,7 @@ def identify(
         raise _too_many(f"a grid of {len(lattice)} spots", target)
     possible = placements(lattice, points, target)
     _require(max((p.seen for p in possible), default=0), target)
-    possible = _with_odd_marker(possible, candidates, target)
+    possible = with_marks(possible, candidates, target)
     possible = _near_previous(possible, points, target, previous)
     chosen = _by_roll(_by_residual(possible, target, shape), target, previous)
     return _checked(chosen, points, target)
@@ -93,49 +94,6 @@ def _too_few(found: int, target: Target) -> DetectionError:
     return DetectionError(
         f"found {found} of {target.count} markers of {target.name}: {target.least_markers} are needed", found
     )
-
-
-def _with_odd_marker(placements: list[Placement], candidates: Candidates, target: Target) -> list[Placement]:
-    """Those with a disc of the odd size in the odd marker's place; all when the target has none."""
-    if target.odd_marker is None:
-        return placements
-    usual = target.odd_marker.diameter_mm / target.diameter_mm
-    fitting = [p for p in placements if abs(np.log(_odd_size(p, candidates, target))) < 0.5 * abs(np.log(usual))]
-    if not fitting:
-        found = max(p.seen for p in placements)
-        if any(
-            abs(np.log(_odd_size(_mirrored(p, target), candidates, target))) < 0.5 * abs(np.log(usual))
-            for p in placements
-        ):
-            raise DetectionError(
-                f"the image of {target.name} is mirrored: its odd marker {target.odd_marker.number} is where only a "
-                "mirror puts it. Turn mirroring off in the camera or the viewer",
-                found,
-            )
-        raise DetectionError(
-            f"found {found} of {target.count} markers of {target.name}, but not the odd marker "
-            f"{target.odd_marker.number}",
-            found,
-        )
-    return fitting
-
-
-def _mirrored(placement: Placement, target: Target) -> Placement:
-    """The placement of a mirrored target: each marker has the candidate of the one across its row."""
-    row, column = np.divmod(np.arange(target.count), target.columns)
-    across = row * target.columns + target.columns - 1 - column
-    return replace(placement, candidate=placement.candidate[across])
-
-
-def _odd_size(placement: Placement, candidates: Candidates, target: Target) -> float:
-    """Diameter of the disc in the odd marker's place over the expected one; the other markers give the scale."""
-    seen = placement.candidate >= 0
-    odd = target.odd_marker.number - 1 if target.odd_marker else 0
-    if not seen[odd]:
-        return float("inf")
-    expected = target.diameters_mm() * np.sqrt(area_scale(placement.homography, target.coordinates_mm()))
-    size = np.sqrt(candidates.areas_px2[placement.candidate]) / expected
-    return float(size[odd] / np.median(size[seen]))
 
 
 def _near_previous(
@@ -197,7 +155,9 @@ def _same_window(one: Placement, other: Placement, target: Target) -> bool:
 
 
 def _by_roll(placements: list[Placement], target: Target, previous: Float | None) -> Placement:
-    """The rotation nearest to the expected one; refuses when a second is about as near."""
+    """The rotation nearest to the expected one; refuses when a second is about as near, or agrees with the marks."""
+    if len(placements) > 1 and target.donut_markers is not None:
+        raise DetectionError(f"too few of the donut markers of {target.name} are seen", placements[0].seen)
     expected = target.nominal_roll_deg if previous is None else roll_deg(previous, target)
     turns = [abs((roll_deg(p.homography, target) - expected + 180) % 360 - 180) for p in placements]
     order = np.argsort(turns)

@@ -87,7 +87,7 @@ def settle(
     image: Bytes,
     p: Float,
     scale: float,
-    reach: float,
+    reach: Float,
     noise: Variance,
     ceiling: int,
     pixels: Pixels,
@@ -96,7 +96,8 @@ def settle(
     band_sigma: float,
 ) -> Outcome:
     """Fit `p` (12,) to the image in place. The pixels are gathered again when the outline has left them or turned out
-    more blurred than it was thought to be, which also makes the result independent of the start."""
+    more blurred than it was thought to be, which also makes the result independent of the start. reach (2,): from where
+    to where its pixels may lie, in radii."""
     start, gathered_at = p.copy(), p.copy()
     far = math.isnan(p[B0])
     gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
@@ -154,13 +155,13 @@ def add_belief(work: Work, p: Float, belief: Belief) -> None:
 
 
 @compiled
-def band(p: Float, scale: float, reach: float, far: bool, band_sigma: float) -> Limits:
+def band(p: Float, scale: float, reach: Float, far: bool, band_sigma: float) -> Limits:
     """The limits of the pixels that are looked at, in F, along the shorter axis; the longer one has more. far: the
     outline is not known well enough to say what is far from it, so that all belong to the core."""
     least = mean_radius(p, scale) ** 2 / long_axis(p, scale)
     width = max(band_sigma * p[SIGMA], LEAST_BAND_PX) / least
     core = width if far else min(CORE_SIGMA * p[SIGMA] / least, width)
-    return Limits(max(1 - width, 0.0), max(1 - core, 0.0), 1 + core, min(1 + width, reach))
+    return Limits(max(1 - width, reach[0]), max(1 - core, reach[0]), 1 + core, min(1 + width, reach[1]))
 
 
 @compiled

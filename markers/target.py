@@ -24,14 +24,26 @@ from foundation.documents import Document, load_document
 _CMM_TOLERANCE = 0.25
 """A measured centre further than this part of the pitch from its nominal place means a wrong order or a wrong unit."""
 
+_LEAST_HOLE, _GREATEST_HOLE = 0.3, 0.7
+"""Of the diameter: a smaller hole is not seen in a small image, a larger one leaves too little of the disc."""
+
 Positive = Annotated[float, Field(gt=0)]
+Number = Annotated[int, Field(ge=1)]
 
 
 class OddMarker(Document):
     """The one marker printed in another size, which shows which way up the target is."""
 
-    number: Annotated[int, Field(ge=1)]
+    number: Number
     diameter_mm: Positive
+
+
+class DonutMarkers(Document):
+    """Three markers with a hole of the ground's colour in their middle, which show which way up the target is, and
+    whether its image is mirrored."""
+
+    numbers: tuple[Number, Number, Number]
+    hole_mm: Positive
 
 
 class Target(Document):
@@ -43,7 +55,8 @@ class Target(Document):
     marker 1 first, in the object frame. cmm_uncertainty_mm, printing_error_mm: standard uncertainty of a measured and
     of a nominal coordinate; flatness_mm: of a marker's height above the plane. nominal_roll_deg: counter-clockwise
     angle of the rows in the image as the target is mounted; decides between the orientations a symmetrical grid leaves
-    open. minimum_markers: identification is refused below this count (default three quarters of the markers).
+    open; odd_marker or donut_markers settle it. minimum_markers: identification is refused below this count (default
+    three quarters of the markers).
     certificate: what states its measured centres, in words; recorded with each session.
     """
 
@@ -56,6 +69,7 @@ class Target(Document):
     polarity: Literal["dark", "light"] = "dark"
     nominal_roll_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     odd_marker: OddMarker | None = None
+    donut_markers: DonutMarkers | None = None
     minimum_markers: Annotated[int, Field(ge=6)] | None = None
     cmm_mm: tuple[tuple[float, float], ...] | None = None
     cmm_uncertainty_mm: Positive = 0.001
@@ -71,6 +85,8 @@ class Target(Document):
             raise ValueError(f"discs of {self.diameter_mm} mm overlap at a pitch of {self.pitch_mm} mm")
         if self.odd_marker is not None:
             self._check_odd_marker(self.odd_marker)
+        if self.donut_markers is not None:
+            self._check_donut_markers(self.donut_markers)
         if self.minimum_markers is not None and self.minimum_markers > self.count:
             raise ValueError(f"minimum_markers is {self.minimum_markers}, but the target has {self.count}")
         if self.cmm_mm is not None:
@@ -85,6 +101,21 @@ class Target(Document):
             raise ValueError(f"odd_marker.diameter_mm differs too little from diameter_mm (ratio {ratio:.2f})")
         if odd.diameter_mm + self.diameter_mm >= 2 * self.spacing_mm:
             raise ValueError(f"the odd marker of {odd.diameter_mm} mm overlaps its neighbours")
+
+    def _check_donut_markers(self, donuts: DonutMarkers) -> None:
+        if self.odd_marker is not None:
+            raise ValueError("odd_marker and donut_markers both say which way up the target is: give one of them")
+        if max(donuts.numbers) > self.count or len(set(donuts.numbers)) < len(donuts.numbers):
+            raise ValueError(f"donut_markers.numbers are three different ones of 1..{self.count}")
+        if not _LEAST_HOLE <= donuts.hole_mm / self.diameter_mm <= _GREATEST_HOLE:
+            raise ValueError(
+                f"donut_markers.hole_mm is {_LEAST_HOLE:g} to {_GREATEST_HOLE:g} of diameter_mm, not "
+                f"{donuts.hole_mm / self.diameter_mm:.2f}"
+            )
+        for places, is_mirror in self.symmetries():
+            if np.array_equal(self.is_donut()[places], self.is_donut()):
+                how = "in a mirror" if is_mirror else "turned"
+                raise ValueError(f"donut_markers {donuts.numbers} look the same {how}: choose other numbers")
 
     def _check_cmm(self, cmm_mm: tuple[tuple[float, float], ...]) -> None:
         if len(cmm_mm) != self.count:
@@ -111,6 +142,8 @@ class Target(Document):
         """How it is known which way up the target is, in a sentence."""
         if self.odd_marker is not None:
             return f"orientation: by the odd marker {self.odd_marker.number}"
+        if self.donut_markers is not None:
+            return "orientation: by the donut markers {}, {} and {}".format(*self.donut_markers.numbers)
         known = "nominal_roll_deg" in self.model_fields_set
         said = "as the target file says" if known else "assumed, for the target file does not say"
         return (
@@ -150,6 +183,28 @@ class Target(Document):
         if self.odd_marker is not None:
             diameters[self.odd_marker.number - 1] = self.odd_marker.diameter_mm
         return diameters
+
+    @property
+    def hole_part(self) -> float:
+        """Which part of a donut marker's area is its hole; 0 when the target has none."""
+        return (self.donut_markers.hole_mm / self.diameter_mm) ** 2 if self.donut_markers is not None else 0.0
+
+    def is_donut(self) -> NDArray[np.bool_]:
+        """(N,): markers with a hole."""
+        numbers = self.donut_markers.numbers if self.donut_markers is not None else ()
+        return np.isin(np.arange(1, self.count + 1), numbers)
+
+    def symmetries(self) -> list[tuple[NDArray[np.intp], bool]]:
+        """The turns and mirror images, but for the identity, in which the grid without its marks looks the same: which
+        marker (N,), from 0, comes into the place of each, and whether it is a mirror image."""
+        centred = self.nominal_mm() - (self.nominal_mm().min(axis=0) + self.nominal_mm().max(axis=0)) / 2
+        found: list[tuple[NDArray[np.intp], bool]] = []
+        for turns, mirror in [(1, 1), (2, 1), (3, 1), (0, -1), (1, -1), (2, -1), (3, -1)]:
+            moved = centred @ np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), turns) * np.array([mirror, 1])
+            away = np.linalg.norm(centred[:, None] - moved[None], axis=2)
+            if away.min(axis=1).max() < 1e-6 * self.pitch_mm:
+                found.append((away.argmin(axis=1), mirror < 0))
+        return found
 
     def row_column(self, number: int) -> tuple[int, int]:
         """Row and column, both from 0, of marker `number` (1..N); row 0 is the bottom one."""

@@ -57,6 +57,8 @@ class Scene:
     missing: tuple[int, ...] = ()
     clutter_mm: tuple[tuple[float, float, float], ...] = ()
     """Further discs: x, y, diameter in the object frame."""
+    holes_mm: dict[int, float] = field(default_factory=dict[int, float])
+    """Diameters of the holes in donut markers."""
 
     def discs_mm(self) -> Float:
         """Centre x, y and diameter of each marker (N, 3); marker 1 at the origin, X right, Y up."""
@@ -144,11 +146,13 @@ def render(scene: Scene) -> Float:
     image = np.array(np.broadcast_to(image, (height, width)))
     discs = [disc for number, disc in enumerate(scene.discs_mm(), 1) if number not in scene.missing]
     for disc in [*discs, *np.array(scene.clutter_mm).reshape(-1, 3)]:
-        _draw(scene, image, disc)
+        _draw(scene, image, disc, scene.disc_DN - scene.ground_DN)
+    for number, diameter_mm in scene.holes_mm.items():
+        _draw(scene, image, np.append(scene.discs_mm()[number - 1, :2], diameter_mm), scene.ground_DN - scene.disc_DN)
     return image
 
 
-def _draw(scene: Scene, image: Float, disc: Float) -> None:
+def _draw(scene: Scene, image: Float, disc: Float, contrast_DN: float) -> None:
     """Add what one disc takes from, or gives to, the blurred ground."""
     angle = np.arange(64) * (2 * np.pi / 64)
     outline = project(scene, disc[:2] + disc[2] / 2 * np.column_stack([np.cos(angle), np.sin(angle)]))
@@ -159,7 +163,7 @@ def _draw(scene: Scene, image: Float, disc: Float) -> None:
     u, v = u[None, :], v[:, None]
     x, y = back_project(scene, u, v)
     cover = _coverage(np.hypot(x - disc[0], y - disc[1]) - disc[2] / 2)
-    radiance = scene.light(u, v) * (scene.disc_DN - scene.ground_DN) * cover
+    radiance = scene.light(u, v) * contrast_DN * cover
     sigma = scene.psf_px * SUB
     kernel = 2 * int(np.ceil(6 * sigma)) + 1
     blurred = cv2.GaussianBlur(radiance, (kernel, kernel), sigma, borderType=cv2.BORDER_CONSTANT)

@@ -67,7 +67,7 @@ def start_from(scene: Scene, offset_px: float) -> EdgeState:
 
 def fit(scene: Scene, image: np.ndarray, start: EdgeState, noise: Noise | None = None) -> EdgeFit:
     camera = Noise(scene.read_DN**2 + 1 / 12, 1 / scene.electrons_per_DN)
-    return fit_edges(image, start, noise or camera, np.full(len(start.scale_px), 2.3))
+    return fit_edges(image, start, noise or camera, np.tile([0.0, 2.3], (len(start.scale_px), 1)))
 
 
 def rms_mpx(errors_px: Float) -> float:

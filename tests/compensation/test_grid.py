@@ -31,7 +31,7 @@ def seen(scene: Scene, seed: int = 0, missing: Sequence[int] = (), clutter: int 
     points = np.vstack([truth[kept] + rng.normal(0, 0.05, (len(kept), 2)), strewn])
     sizes = np.append(areas[kept], np.full(len(strewn), np.median(areas)))
     order = rng.permutation(len(points))
-    return Candidates(points[order], sizes[order]), truth
+    return Candidates(points[order], sizes[order], np.zeros(len(order))), truth
 
 
 def wrong(found: Identified, candidates: Candidates, truth: Float) -> int:
@@ -172,7 +172,7 @@ def test_targets_of_any_size_are_identified_through_a_wide_lens(columns: int, ro
     )
     truth = true_centres_px(pose)
     order = np.random.default_rng(1).permutation(len(truth))
-    candidates = Candidates(truth[order], np.full(len(truth), 100.0))
+    candidates = Candidates(truth[order], np.full(len(truth), 100.0), np.zeros(len(truth)))
     found = identify(candidates, target)
     assert (found.candidate >= 0).all()
     assert wrong(found, candidates, truth) == 0
@@ -184,4 +184,4 @@ def test_too_few_markers_are_refused_with_their_number():
         identify(candidates, PAPER)
     for points in (np.zeros((0, 2)), np.array([[1.0, 2.0], [3.0, 4.0]])):
         with pytest.raises(DetectionError, match="found 0 of 54"):
-            identify(Candidates(points, np.ones(len(points))), PAPER)
+            identify(Candidates(points, np.ones(len(points)), np.zeros(len(points))), PAPER)

@@ -29,7 +29,9 @@ def scattered() -> Float:
 
 def fits(scene: Scene, clean: Float) -> list[EdgeFit]:
     start = start_from(scene, 0.3)
-    return [fit_edges(photograph(scene, clean, seed), start, CAMERA, np.full(54, 1.5)) for seed in range(FRAMES)]
+    return [
+        fit_edges(photograph(scene, clean, seed), start, CAMERA, np.tile([0.0, 1.5], (54, 1))) for seed in range(FRAMES)
+    ]
 
 
 @pytest.mark.parametrize(

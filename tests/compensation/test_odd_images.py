@@ -47,7 +47,7 @@ def test_spots_in_the_shape_of_a_plane_seen_across_its_horizon_are_refused(horiz
     at_mm = x_mm.min() + horizon * np.ptp(x_mm)
     homography = np.array([[2.0, 0.0, 300.0], [0.0, -2.0, 300.0], [0.01, 0.0, -0.01 * at_mm]])
     mapped = np.column_stack([TARGET.coordinates_mm(), np.ones(TARGET.count)]) @ homography.T
-    spots = Candidates(mapped[:, :2] / mapped[:, 2:], np.full(TARGET.count, 150.0))
+    spots = Candidates(mapped[:, :2] / mapped[:, 2:], np.full(TARGET.count, 150.0), np.zeros(TARGET.count))
     with pytest.raises(DetectionError):
         identify(spots, TARGET)
     with pytest.raises(DetectionError, match="cannot be the markers of a flat target"):

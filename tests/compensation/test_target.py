@@ -50,6 +50,18 @@ def test_measured_coordinates_replace_the_nominal_ones():
         (SMALL + "odd_marker: {number: 13, diameter_mm: 8}\n", "odd_marker.number is 13, but the target has 12"),
         (SMALL + "odd_marker: {number: 1, diameter_mm: 4.5}\n", "differs too little"),
         (SMALL + "odd_marker: {number: 1, diameter_mm: 17}\n", "overlaps its neighbours"),
+        (SMALL + "donut_markers: {numbers: [1, 2, 13], hole_mm: 2}\n", "three different ones of 1..12"),
+        (SMALL + "donut_markers: {numbers: [1, 2, 2], hole_mm: 2}\n", "three different ones of 1..12"),
+        (SMALL + "donut_markers: {numbers: [1, 2], hole_mm: 2}\n", "donut_markers.numbers.2: "),
+        (SMALL + "donut_markers: {numbers: [1, 2, 8], hole_mm: 3.5}\n", "0.3 to 0.7 of diameter_mm, not 0.88"),
+        (
+            SMALL + "donut_markers: {numbers: [1, 5, 9], hole_mm: 2}\n",
+            "look the same in a mirror: choose other numbers",
+        ),
+        (
+            SMALL + "donut_markers: {numbers: [1, 2, 8], hole_mm: 2}\nodd_marker: {number: 1, diameter_mm: 6}\n",
+            "one of",
+        ),
         (SMALL + "minimum_markers: 13\n", "minimum_markers is 13"),
         (SMALL + "cmm_mm: [[0, 0], [10, 0]]\n", "cmm_mm lists 2 centres, but the target has 12"),
         (SMALL + f"cmm_mm: {[[r * 10, c * 10] for c in range(4) for r in range(3)]}\n", "wrong order or unit?"),
@@ -80,3 +92,15 @@ def test_neighbouring_cells_are_the_nearest_markers(layout: str):
     steps = np.abs(cells[:, None] - cells[None]).sum(axis=2)
     away = np.linalg.norm(places[:, None] - places[None], axis=2)
     np.testing.assert_array_equal(steps == 1, np.isclose(away, target.spacing_mm))
+
+
+def test_the_symmetries_of_a_grid_are_those_of_its_rectangle_or_square():
+    def number(columns: int, rows: int, layout: str) -> tuple[int, int]:
+        text = f"name: t\ncolumns: {columns}\nrows: {rows}\npitch_mm: 10\ndiameter_mm: 4\nlayout: {layout}\n"
+        found = parse_document(text, Target, "t").symmetries()
+        return sum(not is_mirror for _, is_mirror in found), sum(is_mirror for _, is_mirror in found)
+
+    assert number(4, 3, "square") == (1, 2)
+    assert number(4, 4, "square") == (3, 4)
+    assert number(4, 3, "staggered") == (0, 1)
+    assert number(4, 6, "staggered") == (1, 0)

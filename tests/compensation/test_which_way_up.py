@@ -11,13 +11,15 @@ import pytest
 
 from markers.detection import DetectionError, Flag, detect
 from markers.image_file import read_image
-from markers.target import OddMarker, Target
+from markers.target import DonutMarkers, OddMarker, Target
 
 from .rendered import Scene, photograph, render, true_centres_px
 from .test_markers import HALF, PAPER, rms_mpx
 
 MARKED = PAPER.model_copy(update={"odd_marker": OddMarker(number=1, diameter_mm=14.0)})
+DONUTS = PAPER.model_copy(update={"donut_markers": DonutMarkers(numbers=(20, 22, 40), hole_mm=4.0)})
 SCENE = replace(HALF, roll_deg=3, distance_mm=1100)
+WITH_HOLES = replace(SCENE, holes_mm=dict.fromkeys((20, 22, 40), 4.0))
 
 
 def shifted(scene: Scene, x_px: float, y_px: float) -> Scene:
@@ -56,12 +58,43 @@ def test_a_mirrored_image_of_a_marked_target_is_refused_and_the_image_itself_is_
     image = photograph(scene, render(scene), 1)
     assert rms_mpx(detect(image, MARKED), scene) < 6
     for mirrored in (image[:, ::-1], image[::-1]):
-        with pytest.raises(DetectionError, match=r"mirrored: its odd marker 1 is where only a mirror puts it"):
+        with pytest.raises(DetectionError, match=r"mirrored, by the place of its odd marker 1"):
             detect(np.ascontiguousarray(mirrored, np.uint8), MARKED)
+
+
+@pytest.mark.parametrize(("roll_deg", "is_light"), [(-100, False), (90, True), (183, False)])
+def test_three_donuts_tell_the_turn_and_are_measured_like_the_others(roll_deg: float, is_light: bool):
+    levels = {"disc_DN": 200.0, "ground_DN": 30.0} if is_light else {}
+    scene = replace(WITH_HOLES, roll_deg=roll_deg, distance_mm=1500, **levels)
+    target = DONUTS.model_copy(update={"polarity": "light" if is_light else "dark"})
+    found = detect(photograph(scene, render(scene), 1), target)
+    assert found.found == 54
+    assert not found.flags.any()
+    sigmas = (found.centres_px - true_centres_px(scene)) / np.sqrt(np.diagonal(found.covariance_px2, axis1=1, axis2=2))
+    assert np.abs(sigmas[target.is_donut()]).max() < 4
+    assert detect(photograph(scene, render(scene), 2), target, found).found == 54
+
+
+def test_a_mirrored_image_of_a_target_with_donuts_is_refused_and_one_filled_by_dirt_or_one_of_glare_is_not():
+    clean = render(WITH_HOLES)
+    image = np.asarray(photograph(WITH_HOLES, clean, 1), np.uint8)
+    for mirrored in (image[:, ::-1], image[::-1]):
+        with pytest.raises(DetectionError, match="mirrored, by the place of its donut markers 20, 22 and 40"):
+            detect(np.ascontiguousarray(mirrored), DONUTS)
+    u, v = np.rint(true_centres_px(WITH_HOLES)[[19, 30]]).astype(int).T
+    dirty, shining = image.copy(), image.copy()
+    dirty[v[0] - 9 : v[0] + 10, u[0] - 9 : u[0] + 10] = 30
+    shining[v[1] - 8 : v[1] + 9, u[1] - 8 : u[1] + 9] = 200
+    for picture in (dirty, shining):
+        assert rms_mpx(detect(picture, DONUTS), WITH_HOLES) < 20
+    bare = photograph(SCENE, render(SCENE), 1)
+    with pytest.raises(DetectionError, match="but not the donut markers 20, 22 and 40"):
+        detect(bare, DONUTS)
 
 
 def test_a_target_says_how_its_orientation_is_known():
     assert MARKED.orientation == "orientation: by the odd marker 1"
+    assert DONUTS.orientation == "orientation: by the donut markers 20, 22 and 40"
     assert "as the target file says" in PAPER.orientation
     silent = Target(name="t", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
     assert "within 75 deg of 0 deg in the image (assumed" in silent.orientation
