@@ -14,7 +14,7 @@ from pathlib import Path
 from drivers.settings import OnBus
 from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
-from foundation.errors import ConfigError, Unreachable
+from foundation.errors import ConfigError, Refused, Unreachable
 from stand.config.simulation import SimulatedCamera
 from stand.config.stand_config import StandConfig
 
@@ -230,7 +230,7 @@ class ControlSocket:
             raise Unreachable("simulator", f"nobody listens at {self._host}:{self._port} ({error})") from error
 
     async def request(self, request: Mapping[str, object]) -> dict[str, object]:
-        """Send one request and return its answer; raises Unreachable when the simulator is gone or refuses."""
+        """Send one request and return its answer; Unreachable when the simulator is gone, Refused when it refuses."""
         if self._reader is None or self._writer is None:
             raise ValueError("the control socket is not open")
         try:
@@ -242,7 +242,7 @@ class ControlSocket:
             raise Unreachable("simulator", "the simulator closed its control socket")
         answer: dict[str, object] = json.loads(line)
         if "error" in answer:
-            raise Unreachable("simulator", str(answer["error"]))
+            raise Refused("simulator", str(answer["error"]))
         return answer
 
     async def advance(self, now_ns: int) -> None:

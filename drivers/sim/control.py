@@ -4,6 +4,9 @@
     {"do": "state"}                             -> {"now_ns": N, "air_degC": ...}   the plant's true state
     {"do": "optics"}                            -> {"centres_px": [[x, y], ...]}   noise-free marker centres
     {"do": "fault", "name": S, "value": V}      -> {"name": S}         one of drivers.sim.laboratory_faults.FAULTS
+    {"do": "faults"}                            -> {"faults": [{"name": S, "worst": V, ...}], "standing": {S: V}}
+    {"do": "break", "name": S, "value": V, "for_s": N or null}  -> {"name": S}    as one that was planned
+    {"do": "mend", "name": S}                   -> {"name": S}
     {"do": "quit"}                              -> {}                  the laboratory ends
 
 Anything wrong is answered with {"error": sentence}.
@@ -17,7 +20,7 @@ from collections.abc import Callable
 from drivers.sim.fault_schedule import FaultSchedule
 from drivers.sim.faults import LinkFaults
 from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_faults import FAULTS, inject
+from drivers.sim.laboratory_faults import FAULTS, inject, table
 from drivers.sim.wire import Lines, TcpWire
 from foundation.addresses import tcp_place
 from foundation.errors import ConfigError
@@ -56,6 +59,14 @@ class Control:
                 return {}
             case {"do": "optics"}:
                 return {"centres_px": self._laboratory.true_centres_px()}
+            case {"do": "faults"}:
+                return {"faults": table(), "standing": self._schedule.standing()}
+            case {"do": "break", "name": str(name), "value": value, "for_s": int() | float() | None as for_s}:
+                self._schedule.break_now(name, value, for_s)
+                return {"name": name}
+            case {"do": "mend", "name": str(name)}:
+                self._schedule.mend(name)
+                return {"name": name}
             case {"do": "fault", "name": str(name), "value": value}:
                 if name not in FAULTS:
                     raise ValueError(f"no fault {name!r}; there are {', '.join(sorted(FAULTS))}")

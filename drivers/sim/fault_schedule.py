@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 from drivers.sim.laboratory import Laboratory
+from drivers.sim.laboratory_fault import Once
 from drivers.sim.laboratory_faults import FAULTS, inject
 from foundation.clock import seconds_ns
 from foundation.errors import ConfigError
@@ -62,21 +63,47 @@ def _value(text: str) -> object:
 
 
 class FaultSchedule:
-    """Breaks and mends one laboratory as planned. `advance` leads virtual time, `tick` follows real time."""
+    """Breaks and mends a laboratory, as planned or by hand. `advance` leads virtual time, `tick` follows real time."""
 
     def __init__(self, laboratory: Laboratory, faults: Iterable[PlannedFault]) -> None:
         """Breaks what is due at the start; ConfigError when this laboratory cannot have it."""
         self._laboratory = laboratory
         self._lock = threading.Lock()
         self._due: list[tuple[int, int, str, object]] = []
-        number, start_ns = itertools.count(), laboratory.now_ns
+        self._number = itertools.count()
+        self._ends: dict[str, int] = {}  # the number of the end of what was broken by hand
+        self._standing: dict[str, object] = {}
+        start_ns = laboratory.now_ns
         for planned in faults:
             at_ns = start_ns + seconds_ns(planned.at_s)
-            heapq.heappush(self._due, (at_ns, next(number), planned.name, planned.value))
+            self._push(at_ns, planned.name, planned.value)
             if planned.for_s is not None:
-                end_ns = at_ns + seconds_ns(planned.for_s)
-                heapq.heappush(self._due, (end_ns, next(number), planned.name, FAULTS[planned.name].mended))
+                self._push(at_ns + seconds_ns(planned.for_s), planned.name, FAULTS[planned.name].mended)
         self._break_until(start_ns)
+
+    def standing(self) -> dict[str, object]:
+        """What is broken now, with its value; what just happens (a restart) is not."""
+        with self._lock:
+            return dict(self._standing)
+
+    def break_now(self, name: str, value: object, for_s: float | None) -> None:
+        """By hand; None: until it is mended. ConfigError when there is no such fault, or this laboratory cannot have
+        it. The end of one that was broken by hand before is forgotten."""
+        if name not in FAULTS:
+            raise ConfigError(f"there is no fault {name}")
+        with self._lock:
+            self._set(name, value)
+            self._forget_end(name)
+            if for_s is not None:
+                self._ends[name] = self._push(self._laboratory.now_ns + seconds_ns(for_s), name, FAULTS[name].mended)
+
+    def mend(self, name: str) -> None:
+        """By hand; ConfigError as in `break_now`."""
+        if name not in FAULTS:
+            raise ConfigError(f"there is no fault {name}")
+        with self._lock:
+            self._set(name, FAULTS[name].mended)
+            self._forget_end(name)
 
     def advance(self, now_ns: int) -> None:
         """Virtual time moves to `now_ns`, with every change at its own instant; ValueError in real time, ConfigError as
@@ -97,9 +124,26 @@ class FaultSchedule:
         while self._due and self._due[0][0] <= now_ns:
             self._change()
 
+    def _push(self, at_ns: int, name: str, value: object) -> int:
+        number = next(self._number)
+        heapq.heappush(self._due, (at_ns, number, name, value))
+        return number
+
+    def _forget_end(self, name: str) -> None:
+        if (number := self._ends.pop(name, None)) is not None:
+            self._due = [due for due in self._due if due[1] != number]
+            heapq.heapify(self._due)
+
     def _change(self) -> None:
         _, _, name, value = heapq.heappop(self._due)
+        self._set(name, value)
+
+    def _set(self, name: str, value: object) -> None:
         try:
             inject(self._laboratory, name, value)
         except (ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"fault {name}={json.dumps(value)}: this laboratory cannot have it ({error})") from error
+        if value == FAULTS[name].mended or isinstance(FAULTS[name].apply, Once):
+            self._standing.pop(name, None)
+        else:
+            self._standing[name] = value

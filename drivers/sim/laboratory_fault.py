@@ -41,11 +41,13 @@ def to(find: Callable[[Laboratory], object], attribute: str, kind: Callable[[obj
     return apply
 
 
-def once(act: Callable[[Laboratory], None]) -> Setter:
+@dataclass(frozen=True, slots=True)
+class Once:
     """Something that happens when the fault is set, and is not undone."""
 
-    def apply(laboratory: Laboratory, value: object) -> None:
-        if value:
-            act(laboratory)
+    act: Callable[[Laboratory], None]
 
-    return apply
+    def __call__(self, laboratory: Laboratory, value: object) -> None:
+        """It happens, unless the value is none."""
+        if value:
+            self.act(laboratory)

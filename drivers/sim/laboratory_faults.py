@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from drivers.sim.axis_faults import AXES, axis_faults
 from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_fault import Fault, Setter, number, number_or_none, once, to
+from drivers.sim.laboratory_fault import Fault, Once, Setter, number, number_or_none, to
 from drivers.sim.link_faults import LINK_FAULTS, set_link_fault
 from drivers.sim.motion.flap import ERROR_FEEDBACK_DISCONNECT, ERROR_HARD_OVER_CURRENT, ERROR_NO_POWER
 from drivers.sim.units.thermal_imager import SERIAL_NUMBER
@@ -163,7 +163,7 @@ FAULTS: dict[str, Fault] = {
     # The regulator and its probe.
     "regulator.silent": Fault(to(lambda lab: lab.regulator, "silent"), True, False, "it does not answer"),
     "regulator.compoway": Fault(to(lambda lab: lab.regulator, "compoway"), True, False, "back to its own protocol"),
-    "regulator.restart": Fault(once(lambda lab: lab.regulator.power_cycle()), True, False, "off and on again"),
+    "regulator.restart": Fault(Once(lambda lab: lab.regulator.power_cycle()), True, False, "off and on again"),
     "regulator.sensor_break": Fault(to(lambda lab: lab.regulator, "sensor_break"), True, False, "open sensor"),
     "regulator.ad_error": Fault(to(lambda lab: lab.regulator, "ad_error"), True, False, "its converter has failed"),
     "regulator.pv_offset_K": Fault(to(lambda lab: lab.regulator, "pv_offset_K", number), 5.0, 0.0, "it reads wrong"),
@@ -181,7 +181,7 @@ FAULTS: dict[str, Fault] = {
     "regulator.set_point_clamp_degC": Fault(
         _clamp_set_point, (15.0, 30.0), None, "[low, high]: it takes no set-point outside, and acknowledges it"
     ),
-    "regulator.stop_key": Fault(once(lambda lab: lab.regulator.press_stop()), True, False, "somebody stops control"),
+    "regulator.stop_key": Fault(Once(lambda lab: lab.regulator.press_stop()), True, False, "somebody stops control"),
     "regulator.manual_percent": Fault(_press_manual, 50.0, None, "somebody dials in a heating output"),
     "regulator.autotune": Fault(
         lambda lab, value: lab.regulator.press_autotune(bool(value)), True, False, "somebody starts it with the keys"
@@ -218,8 +218,8 @@ FAULTS: dict[str, Fault] = {
         to(lambda lab: lab.chamber, "stuck_degC", number_or_none), 24.0, None, "its own sensor stays there"
     ),
     "chamber.set_point_degC": Fault(_press_chamber, 45.0, None, "somebody changes it at the panel"),
-    "chamber.stop_key": Fault(once(lambda lab: lab.chamber.press_stop()), True, False, "somebody stops it"),
-    "chamber.restart": Fault(once(lambda lab: lab.chamber.restart()), True, False, "a power failure: it is stopped"),
+    "chamber.stop_key": Fault(Once(lambda lab: lab.chamber.press_stop()), True, False, "somebody stops it"),
+    "chamber.restart": Fault(Once(lambda lab: lab.chamber.restart()), True, False, "a power failure: it is stopped"),
     # The plant, and the relays.
     "heater.cut_out": Fault(to(lambda lab: lab.plant, "cut_out_open"), True, False, "the thermal cut-out is open"),
     "heater.welded_share": Fault(
@@ -229,7 +229,7 @@ FAULTS: dict[str, Fault] = {
     "relays.silent": Fault(to(lambda lab: lab.relays, "silent"), True, False, "the board does not answer"),
     "relays.silent_s": Fault(_silent_relays, 60.0, 0, "for so long; its timed-on relays time out and drop"),
     "relays.lost_writes": Fault(to(lambda lab: lab.relays, "lost_writes"), True, False, "acknowledged, not done"),
-    "relays.brown_out": Fault(once(lambda lab: lab.relays.power_cycle()), True, False, "every relay opens"),
+    "relays.brown_out": Fault(Once(lambda lab: lab.relays.power_cycle()), True, False, "every relay opens"),
     "relays.welded": Fault(_weld, "heater_enable", None, "this contact conducts regardless of the coil"),
     "relays.no_rearm": Fault(
         to(lambda lab: lab.relays, "rearms", lambda value: not value),
@@ -248,7 +248,7 @@ FAULTS: dict[str, Fault] = {
     "heat_module.lost_writes": Fault(
         to(lambda lab: lab.heat_module, "lost_writes"), True, False, "writes to its outputs are acknowledged, not done"
     ),
-    "heat_module.restart": Fault(once(lambda lab: lab.heat_module.power_cycle()), True, False, "off and on again"),
+    "heat_module.restart": Fault(Once(lambda lab: lab.heat_module.power_cycle()), True, False, "off and on again"),
     "heat_module.refreshed_by": Fault(
         to(lambda lab: lab.heat_module, "refreshed_by", str), "nothing", "requests", "what its watchdog is kept by"
     ),
@@ -264,7 +264,7 @@ FAULTS: dict[str, Fault] = {
     "flap.stall": Fault(to(lambda lab: lab.flap, "stall"), True, False, "its transfers stall (EPIPE)"),
     "flap.timeout": Fault(to(lambda lab: lab.flap, "timeout"), True, False, "its transfers time out"),
     "flap.short_read": Fault(to(lambda lab: lab.flap, "short_read"), True, False, "half of each reply"),
-    "flap.restart": Fault(once(_restart_flap), True, False, "its controller restarts"),
+    "flap.restart": Fault(Once(_restart_flap), True, False, "its controller restarts"),
     # The thermal imager.
     "imager.stopped": Fault(to(lambda lab: lab.imager, "stopped"), True, False, "stores no more pictures"),
     "imager.cut": Fault(to(lambda lab: lab.imager, "cut"), True, False, "its files end too early; mended, they go on"),
@@ -305,7 +305,7 @@ FAULTS: dict[str, Fault] = {
     "camera.control_lost": Fault(
         lambda lab, value: lab.camera.seize(bool(value)), True, False, "another client has taken control of it"
     ),
-    "camera.restart": Fault(once(lambda lab: lab.camera.restart()), True, False, "by itself, its supply on"),
+    "camera.restart": Fault(Once(lambda lab: lab.camera.restart()), True, False, "by itself, its supply on"),
     "camera.no_stream_channel": Fault(_camera_without_stream, True, False, "it restarts, and does not offer one"),
     "camera.sensor_degC": Fault(
         to(lambda lab: lab, "camera_sensor_degC", number_or_none), 75.0, None, "its sensor chip stays at this"

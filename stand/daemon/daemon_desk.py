@@ -13,14 +13,17 @@ from stand.daemon.daemon import Daemon
 from stand.gate import INTERLOCK
 from stand.running.run_desk import RunDesk
 from stand.running.said import Said, keep
+from stand.running.simulated_faults import break_or_mend, simulated_faults
 from stand.serving.desk import (
     Conflict,
     DeviceState,
     Done,
+    FaultRequest,
     FaultState,
     PlanStep,
     QueuedRun,
     RunRequest,
+    SimulatedFaults,
     StandState,
     Verb,
     When,
@@ -150,6 +153,15 @@ class DaemonDesk:
         await keep(said, folder, self._assembly.hub, self._assembly.clock, orders.notes)
         self._tell(who, "note", {"tags": list(tags)})
         return self._done("note", "noted")
+
+    async def known_faults(self) -> SimulatedFaults:
+        """Of the simulated laboratory."""
+        return await simulated_faults(self._assembly)
+
+    async def break_(self, who: Who, request: FaultRequest) -> Done:
+        """Break something of the simulated laboratory, or mend it."""
+        told = request.model_dump(exclude_defaults=True)
+        return self._done("fault", await self._tried(who, "fault", told, break_or_mend(self._assembly, request)))
 
     @property
     def patience(self) -> Patience:

@@ -20,6 +20,7 @@ from stand.gate import INTERLOCK, OPERATOR, Phase
 from stand.running.executor import Executor
 from stand.running.journal import Logbook
 from stand.running.said import Said, keep
+from stand.running.simulated_faults import break_or_mend, simulated_faults
 from stand.running.state import RunState
 from stand.running.status import STATES
 from stand.running.stop import STOPPED_BY_OPERATOR, Stop
@@ -27,6 +28,7 @@ from stand.serving.desk import (
     Conflict,
     DeviceState,
     Done,
+    FaultRequest,
     FaultState,
     Missing,
     PlanStep,
@@ -34,6 +36,7 @@ from stand.serving.desk import (
     QueuedRun,
     RunRequest,
     RunStatus,
+    SimulatedFaults,
     StandState,
     StepStanding,
     Verb,
@@ -202,6 +205,15 @@ class RunDesk:
             raise Missing(f"the session under way is {self.session.name}; others get notes from `stand session`")
         await keep(Said(who, text, tags), self.session, self.assembly.hub, self.assembly.clock, self.notes)
         return self._done(who, "note", {"tags": list(tags)}, "noted")
+
+    async def known_faults(self) -> SimulatedFaults:
+        """Of the simulated laboratory."""
+        return await simulated_faults(self.assembly)
+
+    async def break_(self, who: Who, request: FaultRequest) -> Done:
+        """Conflict when it is no simulated stand."""
+        text = await break_or_mend(self.assembly, request)
+        return self._done(who, "fault", request.model_dump(exclude_defaults=True), text)
 
     def _done(self, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], text: str) -> Done:
         stand = self.assembly.stand

@@ -35,6 +35,7 @@ Verb = Literal[
     "resume",
     "device",
     "note",
+    "fault",
 ]
 # socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. secop: SECoP on this
 # machine. terminal: a signal or key.
@@ -275,6 +276,34 @@ class DeviceState(Value):
     refused: str = ""
 
 
+class KnownFault(Value):
+    """Something that can be broken in the simulated laboratory: with `worst`, unless another value is given."""
+
+    name: str
+    worst: JsonValue
+    mended: JsonValue
+    text: str
+
+
+class SimulatedFaults(Value):
+    """What can be broken, and what is broken now, with its value."""
+
+    faults: tuple[KnownFault, ...]
+    standing: dict[str, JsonValue]
+
+
+class FaultRequest(Value):
+    """What is to be broken in the simulated laboratory: value, null for the worst; for_s: for so long, null until it is
+    mended. mend: it is mended instead."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="forbid")
+
+    name: str = Field(max_length=100)
+    value: JsonValue = None
+    for_s: float | None = Field(default=None, gt=0, le=31_622_400)
+    mend: bool = False
+
+
 class Desk(Protocol):
     """What can be asked of a stand. All of it is called on the control loop and returns quickly: no method waits for a
     wire, and what waits for a disk is `async` and stands in nobody's way.
@@ -346,6 +375,15 @@ class Desk(Protocol):
 
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
         """Add an operator's note and tags to a session, running or finished."""
+        ...
+
+    async def known_faults(self) -> SimulatedFaults:
+        """What can be broken on purpose; Conflict when the stand is no simulated one."""
+        ...
+
+    async def break_(self, who: Who, request: FaultRequest) -> Done:
+        """Break something of a simulated laboratory, or mend it, in a run as well; Conflict when the stand is a real
+        one."""
         ...
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import JsonValue
 
 from foundation.clock import WallClock
+from foundation.errors import ConfigError
 from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
@@ -20,12 +21,15 @@ from stand.serving.desk import (
     Conflict,
     DeviceState,
     Done,
+    FaultRequest,
+    KnownFault,
     Missing,
     PlanStep,
     QueuedRun,
     ReadingState,
     RunRequest,
     RunStatus,
+    SimulatedFaults,
     StandState,
     Verb,
     When,
@@ -35,6 +39,10 @@ from stand.serving.desk import (
 )
 
 STAND = "a stand"
+KNOWN_FAULTS = (
+    KnownFault(name="bus.drop", worst=0.05, mended=0.0, text="share of replies lost"),
+    KnownFault(name="flap.jam", worst=2000, mended=None, text="feedback counts at which it stops"),
+)
 
 
 class ADesk:
@@ -50,6 +58,8 @@ class ADesk:
         self.moving: tuple[str, ...] = ()
         self.orders: list[tuple[Who, Verb, dict[str, JsonValue]]] = []
         self.queue: list[QueuedRun] = []
+        self.is_simulated = True
+        self.standing: dict[str, JsonValue] = {}
         self.requests: dict[str, tuple[RunRequest, QueuedRun]] = {}
         self.hub.publish(self.batch(21.5))
 
@@ -67,7 +77,7 @@ class ADesk:
         return StandState(
             stand=STAND,
             version="0",
-            simulated=True,
+            simulated=self.is_simulated,
             now_ns=self.clock.now_ns(),
             utc_offset_ns=0,
             phase="held" if self.gate.reasons else "idle" if self.run is None else "running",
@@ -154,6 +164,18 @@ class ADesk:
 
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
         return self._done(who, "note", {"session": session, "text": text, "tags": list(tags)})
+
+    async def known_faults(self) -> SimulatedFaults:
+        return SimulatedFaults(faults=KNOWN_FAULTS, standing=dict(self.standing))
+
+    async def break_(self, who: Who, request: FaultRequest) -> Done:
+        if request.name not in {each.name for each in KNOWN_FAULTS}:
+            raise ConfigError(f"there is no fault {request.name}")
+        if request.mend:
+            self.standing.pop(request.name, None)
+        else:
+            self.standing[request.name] = request.value
+        return self._done(who, "fault", request.model_dump())
 
     def _run(self, number: int) -> None:
         if all(run.id != number for run in self.queue):

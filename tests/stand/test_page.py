@@ -297,6 +297,26 @@ async def test_devices_take_orders_only_between_runs(night):
         assert night.orders[-1][2] == {"name": "flap", "verb": "open", "arguments": {}}
 
 
+async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(night):
+    async with a_page(night.chromium, night.port, "devices") as page:
+        faults = page.locator("section", has=page.get_by_role("heading", name="Faults on purpose"))
+        await faults.get_by_label("What to break").select_option("flap.jam")
+        await faults.get_by_text("feedback counts at which it stops").wait_for()
+        await faults.get_by_label("value").fill("1500")
+        await faults.get_by_label("for").fill("60")
+        await faults.get_by_role("button", name="break").click()
+        await faults.get_by_role("button", name="mend flap.jam").click()
+        await until(lambda: len(night.orders) == 2)
+        broken, mended = (order[2] for order in night.orders)
+        assert broken == {"name": "flap.jam", "value": 1500, "for_s": 60.0, "mend": False}
+        assert (mended["name"], mended["mend"]) == ("flap.jam", True)
+        night.is_simulated = False
+    async with a_page(night.chromium, night.port, "devices") as page:
+        await page.get_by_role("heading", name="What wears").wait_for()
+        await page.get_by_role("button", name="Open", exact=True).wait_for()
+        assert await page.get_by_role("heading", name="Faults on purpose").count() == 0
+
+
 @pytest.mark.usefixtures("compiled_fit")
 async def test_markers_and_drift_of_the_last_frame_are_shown(night):
     async with a_page(night.chromium, night.port, "camera") as page:

@@ -15,12 +15,14 @@ from typing import Any
 import pytest
 
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
-from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
+from foundation.errors import ConfigError, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from foundation.readings import Quality, Reading
 from stand.assembly import Assembly, assemble
 from stand.running.order import Order
+from stand.running.simulated_faults import break_or_mend, simulated_faults
+from stand.serving.desk import FaultRequest
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.simulated_orders import simulated_order
@@ -285,6 +287,32 @@ async def test_a_camera_that_gives_no_frame_is_lost_and_returns_with_its_setting
         frame = await camera.grab()
         assert frame.exposure_s == pytest.approx(camera.settings.exposure_s)
         assert frame.image.shape == (2048, 2448)
+
+
+async def test_what_an_operator_breaks_on_the_page_is_broken_for_that_long(laboratory: Order):
+    async with watched(laboratory, ("thermometers",)) as stand:
+        text = await break_or_mend(stand.assembly, FaultRequest(name="thermometer.open", value="air", for_s=5.0))
+        assert text == "thermometer.open is broken for 5 s"
+        known = await simulated_faults(stand.assembly)
+        assert {fault.name for fault in known.faults} > {"thermometer.open", "bus.drop", "camera.restart"}
+        assert known.standing == {"thermometer.open": "air"}
+        await stand.until(lambda: stand.latest["thermometers.air"].quality is BAD, 2.0, "it is open")
+        await stand.until(lambda: stand.latest["thermometers.air"].quality is GOOD, 5.0, "its time is over")
+        assert (await simulated_faults(stand.assembly)).standing == {}
+        await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits", for_s=2.0))
+        await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits", mend=True))
+        await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits"))
+        await stand.clock.sleep_until(stand.clock.now_ns() + seconds_ns(3.0))  # the first one's end is no end of this
+        assert (await simulated_faults(stand.assembly)).standing == {"thermometers.no_fault_bits": True}
+        await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits", mend=True))
+        await break_or_mend(stand.assembly, FaultRequest(name="relays.brown_out"))  # which just happens
+        assert (await simulated_faults(stand.assembly)).standing == {}
+        for name, value, sentence in (
+            ("bus.dorp", 1.0, "there is no fault bus.dorp"),
+            ("thermometer.open", "cellar", 'fault thermometer.open="cellar": this laboratory cannot have it'),
+        ):
+            with pytest.raises(ConfigError, match=sentence):
+                await break_or_mend(stand.assembly, FaultRequest(name=name, value=value))
 
 
 async def broken(stand: Watched, name: str, is_broken: bool) -> None:

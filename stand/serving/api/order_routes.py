@@ -13,8 +13,10 @@ from stand.serving.api.bridge import Bridge
 from stand.serving.desk import (
     DeviceState,
     Done,
+    FaultRequest,
     QueuedRun,
     RunRequest,
+    SimulatedFaults,
     When,
     Who,
     WrittenStep,
@@ -89,6 +91,7 @@ def commands(bridge: Bridge) -> APIRouter:
     _of_the_run(router, bridge)
     _of_the_queue(router, bridge)
     _of_devices(router, bridge)
+    _of_the_simulator(router, bridge)
     return router
 
 
@@ -189,6 +192,19 @@ def _of_devices(router: APIRouter, bridge: Bridge) -> None:
     async def resume(request: Request, name: _Name) -> Response:
         """Resume an interrupted run in its session."""
         return done(await bridge.command(lambda desk: desk.resume(who(request), name)))
+
+
+def _of_the_simulator(router: APIRouter, bridge: Bridge) -> None:
+    @router.get("/simulator/faults", response_model=SimulatedFaults)
+    async def faults() -> Response:
+        """What can be broken in the simulated laboratory, and what is; 409 for a real stand."""
+        known = await bridge.ask(lambda desk: desk.known_faults())
+        return Response(known.model_dump_json(), media_type="application/json")
+
+    @router.post("/simulator/faults", response_model=Done)
+    async def fault(request: Request, body: FaultRequest) -> Response:
+        """Break something on purpose, or mend it; 409 for a real stand."""
+        return done(await bridge.command(lambda desk: desk.break_(who(request), body)))
 
 
 def _list(values: tuple[QueuedRun, ...] | tuple[DeviceState, ...]) -> Response:

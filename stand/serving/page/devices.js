@@ -2,6 +2,7 @@
 import { command, get, tell } from "./api.js";
 import { look_of } from "./channels.js";
 import { fill, h, number, say, unit_of, words } from "./dom.js";
+import { Faults } from "./faults.js";
 
 export class Devices {
   constructor(place, app) {
@@ -11,8 +12,9 @@ export class Devices {
     this.note = h("p", { class: "quiet" });
     this.cards = h("div", { class: "stack" });
     this.counters = h("dl", { class: "facts" });
+    this.faulty = h("section", { class: "panel", hidden: true });
     fill(place, h("div", { class: "grid" }, h("div", { class: "stack" }, this.note, this.answer, this.cards),
-      h("section", { class: "panel" }, h("h2", {}, "What wears"), this.counters)));
+      h("div", { class: "stack" }, h("section", { class: "panel" }, h("h2", {}, "What wears"), this.counters), this.faulty)));
     this.load();
     this.timer = setInterval(() => this.load(), 5000);
   }
@@ -32,6 +34,7 @@ export class Devices {
     devices.forEach((device, index) => this.refuse(this.parts[index], device));
     this.refused = devices.find((device) => device.refused)?.refused;
     if (this.app.state) this.update(this.app.state);
+    this.faults?.load();
   }
 
   card(device) {
@@ -80,6 +83,11 @@ export class Devices {
         const is_idle = channel === "regulator.sp" && state.setpoint_degC === null; // what the regulator remembers is nobody's wish
         say(values.children[2 * index + 1], is_idle ? "none" : reading.value === null ? `no reading: ${reading.reason}` : value_of(channel, reading));
       });
+    }
+    if (state.simulated && !this.faults) {
+      this.faults = new Faults(this.faulty);
+      this.faulty.hidden = false;
+      this.faults.load();
     }
     const counters = Object.entries(state.counters);
     if (counters.length !== this.counters.children.length / 2) fill(this.counters, counters.map(([name]) => [h("dt", {}, words(name.replace(".", ", "))), h("dd", {}, "")]));

@@ -1,0 +1,50 @@
+"""Faults on purpose while a stand is served, by the simulator that its file names: a real stand has none."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+
+from foundation.errors import ConfigError, Refused
+from stand.assembly import Assembly
+from stand.serving.desk import Conflict, FaultRequest, SimulatedFaults
+from stand.simulator import ControlSocket
+
+
+async def simulated_faults(assembly: Assembly) -> SimulatedFaults:
+    """What can be broken, and what is. Conflict when this is a real stand, Unreachable when nobody simulates it."""
+    async with _simulator(assembly) as simulator:
+        return SimulatedFaults.model_validate(await simulator.request({"do": "faults"}))
+
+
+async def break_or_mend(assembly: Assembly, request: FaultRequest) -> str:
+    """What came of it, as a sentence. ConfigError when there is no such fault, or the laboratory cannot have it; else
+    as `simulated_faults`."""
+    name, value = request.name, request.value
+    async with _simulator(assembly) as simulator:
+        try:
+            if request.mend:
+                await simulator.request({"do": "mend", "name": name})
+                return f"{name} is mended"
+            if value is None:
+                known = SimulatedFaults.model_validate(await simulator.request({"do": "faults"})).faults
+                value = next((each.worst for each in known if each.name == name), None)
+            await simulator.request({"do": "break", "name": name, "value": value, "for_s": request.for_s})
+        except Refused as error:
+            raise ConfigError(error.text) from error
+    return f"{name} is broken{f' for {request.for_s:g} s' if request.for_s else ''}"
+
+
+@asynccontextmanager
+async def _simulator(assembly: Assembly) -> AsyncGenerator[ControlSocket]:
+    """Virtual time stands still meanwhile."""
+    simulation = assembly.config.simulation
+    if simulation is None:
+        raise Conflict(f"{assembly.config.name} is no simulated stand: nothing of it is broken on purpose")
+    control = ControlSocket(simulation.control)
+    with assembly.clock.hold():
+        await control.open()
+        try:
+            yield control
+        finally:
+            await control.close()
