@@ -70,6 +70,7 @@ _OF_KIND = {
     "no_camera_temperature": "name the camera's temperature in the stand's file, if it has one: `stand check`",
     "no_control": "Ctrl-C where it was begun still stops the run",
     "no_dead_man": "see that a hard-wired cut-out is in the heater's line: docs/safety.md",
+    "clock_set_back": "nothing to do: its pictures are dated by the new offset; set its clock between two nights",
     "no_picture": "see that the imager takes pictures, and that its folder is the one of the stand's file",
     "not_at_ambient": "`stand status` shows when the air is as warm as the laboratory",
     "not_confirmed_safe": "switch the stand off by hand; `stand status` says when it is safe",
