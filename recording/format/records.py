@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -131,14 +132,21 @@ def _head(path: Path, file: BinaryIO) -> Head:
             attachment = Attachment.read(stream(content))
             attachments[attachment.name] = attachment.data.decode()
         elif opcode == Opcode.METADATA:
-            metadata = Metadata.read(stream(content))
-            found[metadata.name] = metadata.metadata
+            name, values = _metadata(content)
+            found[name] = dict(values)
     session = found.get(SESSION_METADATA)
     if session is None:
         raise SessionError(f"{path}: not a segment of a thermostand session")
     if contradicts(found.get(SEGMENT_METADATA, {}), session):
         raise ValueError("the session's metadata do not fit their CRC")
     return Head(session, attachments, found.get(SEGMENT_METADATA, {}), found.get(SALVAGE_METADATA, {}))
+
+
+@lru_cache(16)  # each segment of a session has the session's
+def _metadata(content: bytes) -> tuple[str, Mapping[str, str]]:
+    """Its name, and what it says."""
+    metadata = Metadata.read(stream(content))
+    return metadata.name, metadata.metadata
 
 
 def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[Message]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
@@ -61,10 +62,10 @@ class Summary:
         channels: list[Channel] = []
         for opcode, record in records(self.content):
             if opcode == Opcode.SCHEMA:
-                schema = Schema.read(stream(record))
-                schemas[schema.id] = schema.name
+                number, name = _schema(bytes(record))
+                schemas[number] = name
             elif opcode == Opcode.CHANNEL:
-                channels.append(Channel.read(stream(record)))
+                channels.append(_channel(bytes(record)))
             elif opcode == Opcode.CHUNK_INDEX:
                 break  # of these there may be thousands, and no more channels behind them
         return {channel.id: (channel, schemas[channel.schema_id]) for channel in channels}
@@ -75,6 +76,20 @@ class Summary:
             if opcode == Opcode.CHUNK_INDEX:
                 first_ns, last_ns, offset, length, map_bytes = _CHUNK_INDEX.unpack_from(record)
                 yield ChunkPlace(first_ns, last_ns, offset, length, tuple(_map(record, _CHUNK_INDEX.size, map_bytes)))
+
+
+# Segments of one session, and mostly of all, have the same schemas and channels: a list of sessions decodes them once.
+@lru_cache(256)
+def _schema(record: bytes) -> tuple[int, str]:
+    """Its number and its name."""
+    schema = Schema.read(stream(record))
+    return schema.id, schema.name
+
+
+@lru_cache(1024)
+def _channel(record: bytes) -> Channel:
+    """Shared by all that ask, so not to be changed."""
+    return Channel.read(stream(record))
 
 
 def read_summary(file: BinaryIO, size_bytes: int) -> Summary:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 INDEX_NAME = ".sessions.sqlite"
 DELETED = ".deleted"  # of a folder that is being deleted, behind a dot and its name
-_VERSION = 1  # of the index; the program's version counts, too, for what it says of a session
+_VERSION = 2  # of the index; the program's version counts, too, for what it says of a session
 _BUSY_S = 1.0  # how long another one that writes the index is waited for
 _SCHEMA = "CREATE TABLE sessions (name BLOB PRIMARY KEY, files TEXT NOT NULL, entry TEXT NOT NULL)"
 _File = tuple[str, int, int, bool]  # name, size, time of its last change in ns, whether a recorder has it open
@@ -39,7 +39,7 @@ _INSTANT, _TEXT = (int, type(None)), (str,)
 _KINDS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("frames", "size_bytes"), (int,)),
     **dict.fromkeys(("begin_ns", "end_ns", "start_ns", "end_utc_ns"), _INSTANT),
-    **dict.fromkeys(("run", "files", "state_text", "lacks", "contents"), _TEXT),
+    **dict.fromkeys(("run", "files", "state_text", "lacks", "segments_json", "contents"), _TEXT),
     "has_camera_degC": (bool, type(None)),
 }  # of an index that somebody else has written, too
 _SUFFIXES = (FINISHED, UNFINISHED, DAMAGED)
@@ -52,6 +52,7 @@ class Entry:
     """A session at a glance (`glance.Glance` has the meanings), with what people said of it.
 
     start_ns: begin_ns as UTC, end_utc_ns: end_ns. run, files: words of Run and Files. state_text, lacks: in words.
+    segments_json: those of `segments`, which a list does not show and so need not be read.
     contents: names and sizes of the segments and the journal as a digest, which a copy elsewhere shares.
     """
 
@@ -69,7 +70,7 @@ class Entry:
     state_text: str
     lacks: str
     has_camera_degC: bool | None
-    segments: tuple[tuple[str, str, int], ...]
+    segments_json: str
     troubles: tuple[str, ...]
     missing: tuple[str, ...]
     contents: str = ""
@@ -81,6 +82,11 @@ class Entry:
     def name(self) -> str:
         """Of its folder."""
         return self.path.name or self.path.resolve().name
+
+    @property
+    def segments(self) -> tuple[tuple[str, str, int], ...]:
+        """Name, state and size in bytes of each."""
+        return tuple((str(name), str(state), int(size)) for name, state, size in json.loads(self.segments_json))
 
     @property
     def simulated(self) -> bool:
@@ -111,7 +117,7 @@ def entry_of(seen: Glance, contents: str = "") -> Entry:
         seen.state_text,
         seen.lacks,
         seen.has_camera_degC,
-        tuple((file.name, str(file.state), file.size_bytes) for file in seen.files),
+        json.dumps([(file.name, str(file.state), file.size_bytes) for file in seen.files]),
         seen.troubles,
         seen.missing,
         contents or contents_of(seen.path),
@@ -128,7 +134,7 @@ def catalogue(folder: Path, report: Callable[[int], Report] | None = None, memor
     """The sessions in `folder`, the oldest first. `report`: called with how many must be looked at, gives what is
     called with the progress. memory: takes what is new in place of the index, for who must not wait for a disk that
     hangs. Blocking; OSError when the folder cannot be read."""
-    found = {path: files for path in _folders(folder) if (files := _files(path)) is not None}
+    found = {path: (inode, files) for path, inode in _folders(folder) if (files := _files(path)) is not None}
     digests = {path: _digest(files) for path, files in found.items()}
     with closing(_Index(folder, memory)) as index:
         known = {path: entry for path in found if (entry := index.get(path, digests[path])) is not None}
@@ -161,33 +167,42 @@ def contents_of(path: Path) -> str:
     )
 
 
-def _folders(folder: Path) -> Iterator[Path]:
+def _folders(folder: Path) -> Iterator[tuple[Path, int]]:
+    """Each with its number: another folder of the same name has another one."""
     with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if entry.is_dir()]
-    yield from (folder / name for name in names if not (name.startswith(".") and name.endswith(DELETED)))
+        found = [(entry.name, entry.inode()) for entry in entries if entry.is_dir()]
+    yield from ((folder / name, number) for name, number in found if not _is_deleted(name))
+
+
+def _is_deleted(name: str) -> bool:
+    return name.startswith(".") and name.endswith(DELETED)
 
 
 def _files(path: Path) -> list[_File] | None:
     """Those that a session consists of; None when there is no segment. One that a living recorder has open counts as
-    another file, and so does one in another folder of the same name."""
+    another file."""
     found: list[_File] = []
-    place = os.fspath(path)
+    place = os.fspath(path)  # path objects, and context managers but for the folders, would double the time of a list
     for series in (TELEMETRY, FRAMES):
-        with suppress(OSError), os.scandir(f"{place}/{series}") as entries:
-            for entry in entries:
-                if entry.name.endswith(_SUFFIXES):
-                    told = entry.stat()
-                    is_open = entry.name.endswith(UNFINISHED) and is_locked(Path(entry.path))
-                    found.append((f"{series}/{entry.name}", told.st_size, told.st_mtime_ns, is_open))
+        try:
+            with os.scandir(f"{place}/{series}") as entries:
+                for entry in entries:
+                    name = entry.name
+                    if name.endswith(_SUFFIXES):
+                        told = entry.stat()
+                        is_open = name.endswith(UNFINISHED) and is_locked(Path(entry.path))
+                        found.append((f"{series}/{name}", told.st_size, told.st_mtime_ns, is_open))
+        except OSError:  # not there, or removed meanwhile
+            continue
     if not found:
         return None
     found.sort()
     for name in (JOURNAL_NAME, NOTES_NAME):
-        with suppress(OSError):
-            told = os.stat(f"{place}/{name}")  # path objects would double the time of a list
-            found.append((name, told.st_size, told.st_mtime_ns, False))
-    with suppress(OSError):
-        found.append((".", os.stat(place).st_ino, 0, False))
+        try:
+            told = os.stat(f"{place}/{name}")
+        except OSError:
+            continue
+        found.append((name, told.st_size, told.st_mtime_ns, False))
     return found
 
 
@@ -289,7 +304,6 @@ def _encoded(entry: Entry) -> str:
 def _decoded(path: Path, text: str) -> Entry:
     """ValueError, TypeError, KeyError or AttributeError when the text is none."""
     values = cast("dict[str, Any]", json.loads(text))
-    segments = tuple((str(name), str(state), int(size)) for name, state, size in values.pop("segments"))
     notes = tuple(Note(**each) for each in values.pop("notes"))
     copies = tuple(Archived(**each) for each in values.pop("copies"))
     lists = {name: tuple(map(str, values.pop(name))) for name in ("attachments", "troubles", "missing", "tags")}
@@ -297,4 +311,4 @@ def _decoded(path: Path, text: str) -> Entry:
     for name, value in values.items():
         if type(value) not in _KINDS[name]:
             raise TypeError(name)
-    return Entry(path=path, metadata=metadata, segments=segments, notes=notes, copies=copies, **lists, **values)
+    return Entry(path=path, metadata=metadata, notes=notes, copies=copies, **lists, **values)
