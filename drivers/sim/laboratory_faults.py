@@ -291,6 +291,12 @@ FAULTS: dict[str, Fault] = {
         f"camera.{name}": Fault(to(lambda lab: lab.camera.faults, name, number), 0.05, 0.0, f"share of packets {text}")
         for name, text in (("truncated", "cut in half"), ("doubled", "sent twice"), ("reordered", "sent late"))
     },
+    "camera.leader_early_s": Fault(
+        to(lambda lab: lab.camera.faults, "leader_early_s", number), 0.4, 0.0, "leaders are so far ahead of the payload"
+    ),
+    "camera.stretch_s": Fault(
+        to(lambda lab: lab.camera.faults, "stretch_s", number), 0.4, 0.0, "the payload takes so long"
+    ),
     "camera.unpaced": Fault(to(lambda lab: lab.camera.faults, "unpaced"), True, False, "packets leave in one burst"),
     "camera.acks_twice": Fault(to(lambda lab: lab.camera.faults, "acks_twice"), True, False, "each answer twice"),
     "camera.pending": Fault(

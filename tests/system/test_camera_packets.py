@@ -10,10 +10,10 @@ from drivers.devices.camera_gige import Camera
 from drivers.sim.gige.camera import FakeCamera
 from drivers.sim.gige.gvsp_sender import StreamSender
 from drivers.wires import camera_connection
-from foundation.clock import NS_PER_S, VirtualClock
+from foundation.clock import NS_PER_S, VirtualClock, WallClock
 from foundation.errors import Unreachable
 from foundation.readings import Frame
-from tests.system.test_camera_wire import WarmPlant, noise, opened, virtual
+from tests.system.test_camera_wire import WarmPlant, noise, opened, simulated, virtual
 
 FRAMES = 5
 
@@ -68,6 +68,18 @@ async def test_packets_that_come_twice_or_late_make_the_same_frame(wired: tuple[
         setattr(fake.faults, fault, 0.2)
         assert all(map(is_right, await grabbed(camera, clock)))
         assert camera.counters().get("lost", 0) == 0
+
+
+@pytest.mark.parametrize("fault", ["leader_early_s", "stretch_s"])
+async def test_a_frame_is_waited_for_until_the_next_one_is_due(plant: WarmPlant, fault: str):
+    """In real time: Aravis' own patience, 0.1 s behind the last packet, would give up a camera that sends its leader
+    with the begin of the exposure."""
+    with simulated(WallClock(), plant) as fake:
+        async with opened(packet_size=1500, frame_rate_hz=0.5) as camera:
+            setattr(fake.faults, fault, 0.4)
+            assert (await camera.grab()).dropped == 0
+            counters = camera.counters()
+    assert {name: count for name, count in counters.items() if name.startswith(("incomplete", "lost", "miss"))} == {}
 
 
 async def test_a_frame_with_a_packet_cut_short_is_never_used(wired: tuple[VirtualClock, FakeCamera]):

@@ -31,7 +31,8 @@ class CameraFaults:
     truncated, doubled, reordered: probabilities that a packet arrives without its second half, twice, or after the one
     behind it. no_resend: capability bit off and requests ignored (the bit is read by clients at connect). silent_gvcp:
     the camera neither hears nor answers. silent_gvsp: no stream packet leaves. unpaced: packets leave as fast as they
-    can. drop_leader, drop_trailer: missing from every frame until asked for again. trigger_twice: every software
+    can. leader_early_s: the leader is so long ahead of the payload; stretch_s: which takes so long. drop_leader,
+    drop_trailer: missing from every frame until asked for again. trigger_twice: every software
     trigger gives two frames. no_stream_channel: it says that it has none, as one that is not ready yet. temperature:
     DeviceTemperature reads 0, is refused, or keeps its last value; temperature_offset_K: it is wrong by so much.
     payload_short_bytes: PayloadSize is too small by so much from the next change of region on.
@@ -48,6 +49,8 @@ class CameraFaults:
     silent_gvcp: bool = False
     silent_gvsp: bool = False
     unpaced: bool = False
+    leader_early_s: float = 0.0
+    stretch_s: float = 0.0
     drop_leader: bool = False
     drop_trailer: bool = False
     trigger_twice: bool = False
@@ -134,6 +137,7 @@ class StreamSender:
         self._held: tuple[bytes, bytes | memoryview] | None = None  # until the next packet has left
         self._free_at_s = 0.0
         self._gap_s = 0.0
+        self._left = -1  # the last packet of the current block that has left, or was skipped
         self._wake = threading.Condition()
         self._closed = threading.Event()
         self._queue = _Queue()
@@ -165,13 +169,14 @@ class StreamSender:
                 return self._closed
             self._queue.jobs = self._jobs(block, destination)
             self._kept.append((block, destination))
-            self._gap_s = gap_s
+            self._gap_s = gap_s + self._faults.stretch_s / block.trailer_id
+            self._left = -1
             self.counts.blocks += 1
             self._wake.notify_all()
             return self._queue.sent
 
     def resend(self, resend: Resend) -> None:
-        """Queue packets once more; a block that is gone is answered by one UNAVAILABLE packet."""
+        """Queue packets once more, those that have left; a block that is gone is answered by one UNAVAILABLE packet."""
         if self._faults.no_resend:
             return
         with self._wake:
@@ -198,7 +203,9 @@ class StreamSender:
         return (_Job(block, packet_id, destination) for packet_id in packet_ids)
 
     def _repeat(self, block: Block, destination: Destination, resend: Resend) -> None:
-        for packet_id in range(resend.first, min(resend.last, block.trailer_id) + 1):
+        is_sent = self._queue.jobs is None or block is not self._kept[-1][0] or self._left >= block.trailer_id - 1
+        last = block.trailer_id if is_sent else self._left
+        for packet_id in range(resend.first, min(resend.last, last) + 1):
             job = _Job(block, packet_id, destination, gvsp.RESENT)
             self._queue.resends.setdefault((block.block_id, packet_id), job)
 
@@ -229,6 +236,10 @@ class StreamSender:
             for job in jobs:
                 self.counts.resent += job.status == gvsp.RESENT
                 self._mangle(job.block.packet(job.packet_id, job.status), job.destination)
+                if job.status != gvsp.RESENT:
+                    self._left = job.packet_id
+                    if job.packet_id == 0 and self._faults.leader_early_s > 0:
+                        self._closed.wait(self._faults.leader_early_s)
             self._pace(sum(job.block.packet_size for job in jobs), len(jobs))
 
     def _mangle(self, parts: tuple[bytes, bytes | memoryview], destination: Destination) -> None:
