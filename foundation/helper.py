@@ -1,147 +1,29 @@
-"""A small process that makes calls for a daemon: the daemon's end, the process's, and the messages between the two.
+"""A small process that makes calls for a daemon, from its start to its end; the calls themselves are in calls.py.
 
 Each line to the daemon is a socket with a thread of its own in the process, which answers one request after the other:
 a call that hangs does not stop those of the other lines. When the daemon has closed its ends, or is dead, each thread
 ends with the request it is at, and then the process. It is for calls that may hang in the kernel, or take long.
-
-A request is a function and its arguments, pickled by reference. What it returns stays there under `keep` and is called
-by its methods' names later; else it goes back, as an exception does.
 """
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import importlib
 import os
-import pickle
 import signal
 import socket
-import struct
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock, Thread
-from typing import Any
+from threading import Thread
 
+from foundation.calls import Line, answer_all
 from foundation.patience import Patience
 
 _END_WITHIN_S = 0.5
 _LOOK_S = 0.01
-_LENGTH = struct.Struct("<Q")
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """`function(*args)`, or the method of that name of what is kept under `target`. keep: the name for the result."""
-
-    function: Callable[..., object] | str
-    args: tuple[object, ...] = ()
-    target: str = ""
-    keep: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What the request returned, or raised."""
-
-    result: object = None
-    error: BaseException | None = None
-
-
-def send(connection: socket.socket, message: Request | Answer) -> None:
-    """One message; OSError when the other end is gone."""
-    data = pickle.dumps(message, protocol=5)
-    connection.sendall(_LENGTH.pack(len(data)))
-    connection.sendall(data)
-
-
-def receive(connection: socket.socket) -> Any:
-    """The next message; None when the other end is gone."""
-    head = _exactly(connection, _LENGTH.size)
-    data = None if head is None else _exactly(connection, _LENGTH.unpack(head)[0])
-    return None if data is None else pickle.loads(data)
-
-
-def _exactly(connection: socket.socket, size_bytes: int) -> bytearray | None:
-    data = bytearray(size_bytes)
-    view, got = memoryview(data), 0
-    while got < size_bytes:
-        try:
-            count = connection.recv_into(view[got:])
-        except OSError:
-            return None
-        if not count:
-            return None
-        got += count
-    return data
-
-
-def answer(request: Request, kept: dict[str, object]) -> Answer:
-    """What comes of the request."""
-    try:
-        if isinstance(request.function, str):
-            return Answer(getattr(kept[request.target], request.function)(*request.args))
-        result = request.function(*request.args)
-        if request.keep:
-            kept[request.keep] = result
-            return Answer()
-        return Answer(result)
-    except BaseException as error:  # noqa: BLE001 - the daemon waits for any error
-        return Answer(error=error)
-
-
-def _serve(connection: socket.socket, kept: dict[str, object]) -> None:
-    while (request := receive(connection)) is not None:
-        found = answer(request, kept)
-        try:
-            send(connection, found)
-        except OSError:
-            return  # the daemon has gone
-
-
-class Line:
-    """One thread of the process; requests are answered one after the other. Blocking: used from a lane. `ended` is the
-    sentence for a process that has ended."""
-
-    def __init__(self, connection: socket.socket, ended: str) -> None:
-        self._connection = connection
-        self._ended = ended
-        self._lock = Lock()
-
-    def run(self, function: Callable[..., object], *args: object) -> Any:
-        """`function(*args)` there; both are pickled. Raises what it raises, and OSError when the process is gone."""
-        return self._asked(Request(function, args))
-
-    def make(self, name: str, function: Callable[..., object], *args: object) -> None:
-        """Keep what `function(*args)` returns there under this name, which every line then knows."""
-        self._asked(Request(function, args, keep=name))
-
-    def call(self, name: str, method: str, *args: object) -> Any:
-        """The method of what is kept under this name."""
-        return self._asked(Request(method, args, name))
-
-    def close(self) -> None:
-        """No more requests; the one under way is completed."""
-        with suppress(OSError):
-            self._connection.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for an answer
-        self._connection.close()
-
-    def _asked(self, request: Request) -> Any:
-        with self._lock:
-            try:
-                send(self._connection, request)
-                found = receive(self._connection)
-            except OSError:
-                found = None
-        if found is None:
-            raise OSError(errno.EPIPE, self._ended)
-        if found.error is not None:
-            raise found.error
-        return found.result
 
 
 class Helper:
@@ -238,10 +120,11 @@ def main() -> None:
     getattr(module, "prepare", _nothing)()
     kept: dict[str, object] = {}
     life, *connections = [socket.socket(fileno=int(number)) for number in sys.argv[3:]]
-    threads = [Thread(target=_serve, args=(each, kept), daemon=True) for each in connections]
+    threads = [Thread(target=answer_all, args=(each, kept), daemon=True) for each in connections]
     for thread in threads:
         thread.start()
-    receive(life)
+    with suppress(OSError):
+        life.recv(1)
     Path("/proc/self/comm").write_text(module.LEFT_NAME)
     for thread in threads:
         thread.join()
@@ -261,6 +144,4 @@ def _nothing() -> None:
 
 
 if __name__ == "__main__":
-    import foundation.helper  # under this name its messages are known
-
-    foundation.helper.main()
+    main()

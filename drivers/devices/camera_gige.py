@@ -14,9 +14,9 @@ from drivers.settings import Identity
 from drivers.wires.camera_connection import Connection, FrameCount, Shot
 from drivers.wires.camera_errors import device_error, lacks_control
 from drivers.wires.camera_settings import EffectiveSettings, GigeCameraSettings
+from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
-from foundation.lane import Lane, Result
 from foundation.readings import Frame, Reading, bad_reading
 
 Settings = GigeCameraSettings

@@ -15,9 +15,9 @@ from typing import Protocol, cast
 from drivers.devices.chamber_language import ChamberLanguage, ChamberState
 from drivers.devices.chamber_settings import ChamberUnitSettings
 from drivers.settings import Identity, same_device
+from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
-from foundation.lane import Lane, Result
 from foundation.readings import Reading
 
 _LOOKS = 3  # at a state that follows its command a scan of the unit later

@@ -17,9 +17,9 @@ from drivers.devices.flap_travel import POLL_S, Travel
 from drivers.devices.motion import Motion, Turn
 from drivers.settings import Identity, Polled, same_device
 from foundation.addresses import TcpAddress
+from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Superseded, Unreachable
-from foundation.lane import Lane, Result
 from foundation.readings import Quality, Reading, bad_reading
 
 _VENDOR_POLOLU = 0x1FFB

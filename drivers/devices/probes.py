@@ -22,9 +22,9 @@ from drivers.settings import Identity, Polled, PollPeriod_s, same_device
 from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.addresses import ByteAddress
+from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import Refused, Unreachable
-from foundation.lane import Lane
 from foundation.readings import Reading, bad_reading
 
 _GAP_S = 0.02

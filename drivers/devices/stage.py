@@ -21,9 +21,9 @@ from drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
 from drivers.wires.link import SerialSettings, open_link
 from drivers.wires.ximc_client import XimcClient
 from foundation.addresses import ByteAddress
+from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
-from foundation.lane import Lane, Result
 from foundation.readings import Quality, Reading
 
 _LINE = SerialSettings(baud=115200, stopbits=2)

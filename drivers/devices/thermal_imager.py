@@ -21,11 +21,11 @@ from pydantic import AfterValidator, Field
 from drivers.devices.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
 from drivers.devices.radiometry import temperatures_degC
 from drivers.settings import DeviceName, Identity, Polled
+from foundation.calls import Lane
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.documents import Document
 from foundation.errors import Unreachable
 from foundation.items import Event, Item, Original
-from foundation.lane import Lane
 from foundation.readings import Quality, Reading, bad_reading
 
 _SUFFIXES = (".jpg", ".jpeg")

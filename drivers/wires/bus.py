@@ -15,9 +15,9 @@ from typing import TypeVar
 
 from drivers.wires.modbus_client import BusSettings, FaultKind, ModbusClient, WireFault
 from drivers.wires.registers import Space
+from foundation.calls import Lane
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
-from foundation.lane import Lane
 
 __all__ = ["Bus", "BusCounters", "BusSettings"]
 

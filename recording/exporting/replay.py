@@ -15,12 +15,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from foundation.calls import Lane
 from foundation.clock import Clock, VirtualClock, WallClock
 from foundation.errors import SessionError
 from foundation.files import new_folder
 from foundation.hub import Hub
 from foundation.items import Item
-from foundation.lane import Lane
 from foundation.readings import Frame
 from recording.exporting.topics import recorded_devices
 from recording.format.decoded_items import Description

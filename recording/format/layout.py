@@ -15,6 +15,7 @@ SESSION_METADATA = "session"
 SEGMENT_METADATA = "segment"
 SALVAGE_METADATA = "salvage"  # of a segment that a salvage has made
 DEVICES = "devices"  # key of a channel's metadata: the names of the devices on its topic, with commas between
+SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; FrameMeta has all 64
 SESSION_CRC = "session_crc32"
 # Of the files, in the record `session`. 2 (2026-11-22): the record says so; events have data; how the run ended is in
 # that of `run.end`, how long its plan is in that of `run.start` and `run.resume`; a copy says of what extent it is and

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import SessionError
 from foundation.helper import Helper
-from foundation.lane import Lane
 
 MODULE = "recording.writing.disk"
 LEFT_NAME = "stand-disk-left"  # of a process whose daemon has gone

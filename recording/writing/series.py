@@ -1,24 +1,28 @@
-"""The segments of one folder, one after the other, and the two such series of a session."""
+"""The segments of one folder, one after the other; the two such series of a session, and the daemon's end of each."""
 
 from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from foundation.files import sync_folder
 from recording.format.chain import foreign_numbers
 from recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
+from recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
 from recording.writing.forms import SessionForm
 from recording.writing.home import Home
 from recording.writing.notices import Notice, SpaceWatch
 from recording.writing.segment import CommitSink, Record, Segment, SeriesForm
 
 Item = TypeVar("Item")
+
+_KEPT = "series"  # the name of the SessionSeries in the disk process
 
 
 class Series:
@@ -221,3 +225,96 @@ def _taken(waiting: deque[Item]) -> tuple[Item, ...]:
         while True:
             taken.append(waiting.popleft())
     return tuple(taken)
+
+
+class DiskSpace:
+    """What the last look at the disk found, whichever series asked; `tell` takes its notices."""
+
+    def __init__(self, tell: Callable[[Notice], None]) -> None:
+        self.last = SpaceFound()
+        self._tell = tell
+
+    def found(self, space: SpaceFound) -> None:
+        """As of now."""
+        self.last = space
+        for notice in space.notices:
+            self._tell(notice)
+
+
+class DiskSeries:
+    """One series of a session, in the disk process or in this one: a line for each, so that one that hangs leaves the
+    other. Its methods are those of Series. `ask` calls a method of the SessionSeries."""
+
+    def __init__(self, name: str, ask: Callable[..., Any], space: DiskSpace) -> None:
+        self.is_open = False
+        self.troubles: deque[str] = deque()
+        self.space = space
+        self._name = name
+        self._ask = ask
+
+    def check_space(self) -> None:
+        """See SpaceWatch.check."""
+        self.space.found(self._ask("check_space"))
+
+    def check(self) -> None:
+        """As in Series, like all below."""
+        self._do("check")
+
+    def commit(self, records: Sequence[Record], time_ns: int) -> None:
+        """All of `records` on the disk."""
+        self._do("commit", list(records), time_ns)
+
+    def probe(self, size_bytes: int, time_ns: int) -> None:
+        """OSError while the disk would refuse a block."""
+        self._do("probe", size_bytes, time_ns)
+
+    def refound(self) -> bool:
+        """Whether the folder is back."""
+        return bool(self._do("refound"))
+
+    def finish_full(self, time_ns: int) -> None:
+        """Close a segment that has its size or age."""
+        if self.is_open:
+            self._do("finish_full", time_ns)
+
+    def finish(self) -> bool:
+        """Close the open segment; False, and a trouble, also when the process has ended."""
+        try:
+            return bool(self._do("finish"))
+        except OSError as error:
+            self.is_open = False
+            self.troubles.append(f"a segment of {self._name} stays unfinished ({error})")
+            return False
+
+    def close(self) -> None:
+        """Let go of the folder; a process that has ended has."""
+        with suppress(OSError):
+            self._do("close")
+
+    def _do(self, method: str, *args: object) -> object:
+        done: Done = self._ask("do", self._name, method, *args)
+        self.is_open = done.is_open
+        self.troubles.extend(done.troubles)
+        if done.error is not None:
+            raise done.error
+        return done.result
+
+
+def open_series(
+    disk: Disk | None, directory: Path, form: SessionForm, time_ns: int, tell: Callable[[Notice], None]
+) -> tuple[DiskSeries, DiskSeries]:
+    """Frames and telemetry of a session, made or continued; raises OSError. disk: the process that has them, None: this
+    one."""
+    space = DiskSpace(tell)
+    if disk is None:
+        both = SessionSeries(directory, form, time_ns)
+        asks: list[Callable[..., Any]] = [partial(_called, both)] * 2
+    else:
+        lines = disk.line(FRAMES_LINE), disk.line(TELEMETRY_LINE)
+        lines[1].make(_KEPT, SessionSeries, directory.absolute(), form, time_ns)
+        asks = [partial(line.call, _KEPT) for line in lines]
+    return DiskSeries(FRAMES, asks[0], space), DiskSeries(TELEMETRY, asks[1], space)
+
+
+def _called(series: SessionSeries, method: str, *args: object) -> Any:
+    return getattr(series, method)(*args)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 
 
@@ -9,7 +10,8 @@ class Waiting:
     """Instants of publication of what is not durable yet; used from the event loop.
 
     A frame that the disk refused, or was too slow for, waits until frames can be written again, although it is lost:
-    a run must not continue as if its next one were safe.
+    a run must not continue as if its next one were safe. `change` is set, and replaced, when something has been saved
+    or lost.
     """
 
     def __init__(self) -> None:
@@ -18,6 +20,7 @@ class Waiting:
         self._commits = 0
         self._frames_ns: deque[int] = deque()
         self._refused_ns: int | None = None
+        self.change = asyncio.Event()
 
     @property
     def since_ns(self) -> int | None:
@@ -63,6 +66,11 @@ class Waiting:
     def frames_work(self) -> None:
         """A frame was written, or could have been."""
         self._refused_ns = None
+
+    def changed(self) -> None:
+        """Something has been saved or lost."""
+        self.change.set()
+        self.change = asyncio.Event()
 
 
 def _earliest(*times_ns: int | None) -> int | None:

@@ -6,10 +6,10 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
+from foundation.calls import Lane
 from foundation.clock import Clock, boot_of
 from foundation.hub import Hub
 from foundation.items import Event
-from foundation.lane import Lane
 from foundation.patience import Patience
 from stand.chamber.compressor import CompressorState, keep
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.files import replace_file
 from foundation.hub import Hub
 from foundation.items import Event
-from foundation.lane import Lane
 from foundation.patience import Patience
 
 NAME = "daemon.json"

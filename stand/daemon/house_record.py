@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from foundation.calls import Lane
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub, Subscriber
 from foundation.items import Event, Item
-from foundation.lane import Lane
 from foundation.patience import Patience
 from foundation.tasks import cancelled
 from recording.reading.contents import RUN_END

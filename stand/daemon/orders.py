@@ -16,9 +16,9 @@ from functools import partial
 from pathlib import Path
 
 from experiments.steps import Capture
+from foundation.calls import Lane
 from foundation.errors import ConfigError, SessionError, StandError
 from foundation.hub import Hub
-from foundation.lane import Lane
 from foundation.readings import Quality
 from recording.reading.session import Session
 from recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, Disk, DiskCalls

@@ -7,12 +7,12 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
+from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import StandError
 from foundation.helper import Helper
 from foundation.hub import Hub
 from foundation.items import Event
-from foundation.lane import Lane
 from foundation.tasks import cancelled, failure_text
 from stand.running.session_report import report_session
 from stand.serving.preview_process import MODULE

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from threading import Lock
 
+from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.helper import Helper
-from foundation.lane import Lane
 from stand.guarding.notify_process import KILLED_LIMIT_S, MODULE, run_command
 
 _LINES = ("tell-1", "tell-2", "tell-3")  # so many commands at once: a slow one delays no other

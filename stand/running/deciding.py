@@ -17,10 +17,10 @@ from typing import Any
 
 from experiments.known import Answer, Enough, Undecided, Visit, after_decision, fixed_visits
 from experiments.steps import Decide, PlannedStep, kind_of, parameters_of
+from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import StandError
 from foundation.helper import Helper
-from foundation.lane import Lane
 from stand.running.entries import Edited, edited
 from stand.running.state import RunState
 

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from foundation.calls import Lane
 from foundation.clock import Clock, VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
 from foundation.errors import StandError, StandTripped
 from foundation.hub import Hub
 from foundation.instants import duration, utc_text
 from foundation.items import Event, Item
-from foundation.lane import Lane
 from foundation.tasks import cause_of, failure_text, watched
 from markers.target import Target
 from recording.reading.contents import RUN_END

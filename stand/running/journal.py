@@ -16,13 +16,12 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
+from foundation.calls import Lane, Line
 from foundation.clock import Clock
 from foundation.errors import SessionError
 from foundation.files import replace_file, sync_folder
-from foundation.helper import Line
 from foundation.hub import Hub
 from foundation.items import Event
-from foundation.lane import Lane
 from foundation.patience import Patience
 from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, lines_of
 from recording.writing.disk import JOURNAL_LINE, Disk

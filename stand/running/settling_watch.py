@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from experiments.steps import PlannedStep, SoakUntilSettled
+from foundation.calls import Lane
 from foundation.clock import Clock, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
-from foundation.lane import Lane
 from foundation.readings import Frame, Reading
 from markers.target import Target
 from stand.estimating.chamber_model import BAND_K

@@ -14,9 +14,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from foundation.calls import Line
 from foundation.clock import Clock
 from foundation.errors import StandError
-from foundation.helper import Helper, Line
+from foundation.helper import Helper
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame

@@ -8,8 +8,9 @@ from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
+from foundation.calls import Line
 from foundation.errors import StandError
-from foundation.helper import Helper, Line
+from foundation.helper import Helper
 from foundation.hub import Hub
 from foundation.items import Item, StepMark, StepState
 from foundation.readings import Frame

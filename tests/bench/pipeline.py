@@ -32,7 +32,7 @@ from recording.reading.session import Session
 from recording.writing.forms import telemetry_topics
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.writers import TelemetryEncoder
+from recording.writing.telemetry import TelemetryEncoder
 from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, photograph, render

@@ -31,7 +31,7 @@ from recording.reading.session import Session
 from recording.writing.forms import telemetry_topics
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.writers import TelemetryEncoder
+from recording.writing.telemetry import TelemetryEncoder
 from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
 
 ROUNDS = 50

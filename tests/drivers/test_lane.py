@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
+from foundation.calls import Lane
 from foundation.clock import Clock, VirtualClock, WallClock
-from foundation.lane import Lane
 
 
 @pytest.fixture(params=[WallClock(), VirtualClock(0)], ids=["real", "virtual"])
@@ -82,7 +82,7 @@ async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goe
 HANGS = """
 import asyncio, threading
 from foundation.clock import WallClock
-from foundation.lane import Lane
+from foundation.calls import Lane
 
 async def main():
     asyncio.create_task(Lane("hangs", WallClock(), patient=False).call(threading.Event().wait))
@@ -99,7 +99,7 @@ def test_a_call_that_never_ends_does_not_keep_the_process_from_its_end():
 async def test_a_thread_that_memory_does_not_suffice_for_fails_its_calls_and_the_loop_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    monkeypatch.setattr("foundation.lane._BEGIN_LIMIT_S", 0.01)
+    monkeypatch.setattr("foundation.calls._BEGIN_LIMIT_S", 0.01)
     monkeypatch.setattr("_thread.start_new_thread", lambda function, args: 0)  # it ends before its first step
     died = Lane("disk", WallClock())
     with pytest.raises(MemoryError, match="no memory for the thread of disk"):

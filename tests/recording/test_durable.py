@@ -127,8 +127,8 @@ async def test_what_a_disk_refuses_grows_old_and_recording_goes_on_by_itself(tmp
     with ext4(tmp_path / "disk", 64 << 20) as disk:
         async with recording(disk / "s") as stand:
             await stand.seconds(4, frames)
-            stand.recorder._image_series.finish()  # nothing open that could be written on
-            stand.recorder._telemetry_series.finish()
+            stand.recorder._frames.series.finish()  # nothing open that could be written on
+            stand.recorder._telemetry.series.finish()
             with refuses(disk):
                 ages_s = await stand.seconds(10, frames)
             assert stand.recorder.disk_free_bytes > 10_000_000

@@ -26,7 +26,7 @@ from recording.repair.verify import verify
 from recording.writing.forms import telemetry_topics
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.writers import TelemetryEncoder
+from recording.writing.telemetry import TelemetryEncoder
 from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
 
 START_NS = 1_767_290_400 * NS_PER_S

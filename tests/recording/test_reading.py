@@ -24,7 +24,7 @@ from recording.writing.forms import telemetry_topics
 from recording.writing.recorder import Recorder
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.writers import TelemetryEncoder
+from recording.writing.telemetry import TelemetryEncoder
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
 

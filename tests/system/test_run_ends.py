@@ -16,7 +16,7 @@ from types import FrameType
 
 import pytest
 
-from foundation import lane
+from foundation import calls
 from foundation.errors import DeviceFault, StandTripped
 from foundation.items import Item, StepMark, StepState
 from recording.reading.session import Session
@@ -132,7 +132,7 @@ def held_now() -> Counter[str]:
 def is_of_lane(frame: FrameType | None) -> bool:
     """Whether the thread that is there now serves a lane; such threads are not the threading module's."""
     while frame is not None:
-        if frame.f_code is lane._serve.__code__:
+        if frame.f_code is calls._serve.__code__:
             return True
         frame = frame.f_back
     return False

@@ -1,15 +1,25 @@
-"""Blocking calls of one wire, in order: in a thread of their own in real time, on the spot in virtual time."""
+"""Blocking calls made elsewhere, one after the other: by a thread of this process (Lane), or by another one (Line).
+
+A wire has a lane; what may hang in the kernel, such as a disk, has a line to a helper process, which is waited for in a
+lane. A request to a process is a function and its arguments, pickled by reference. What it returns stays there under
+`keep` and is called by its methods' names later; else it goes back, as an exception does.
+"""
 
 from __future__ import annotations
 
 import _thread
 import asyncio
+import errno
+import pickle
+import socket
+import struct
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
-from threading import Event
+from threading import Event, Lock
 from typing import Any, TypeVar
 
 from foundation.clock import Clock, VirtualClock
@@ -20,6 +30,7 @@ Result = TypeVar("Result")
 # would make frames late by as much.
 _SWITCH_S = 0.0005
 _BEGIN_LIMIT_S = 3.0  # for a new thread's first step
+_LENGTH = struct.Struct("<Q")
 
 
 class Lane:
@@ -141,3 +152,114 @@ def _seen(future: asyncio.Future[Any]) -> None:
     """The caller has gone; asyncio need not report the exception as never retrieved."""
     if not future.cancelled():
         future.exception()
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """`function(*args)`, or the method of that name of what is kept under `target`. keep: the name for the result."""
+
+    function: Callable[..., object] | str
+    args: tuple[object, ...] = ()
+    target: str = ""
+    keep: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the request returned, or raised."""
+
+    result: object = None
+    error: BaseException | None = None
+
+
+def send(connection: socket.socket, message: Request | Answer) -> None:
+    """One message; OSError when the other end is gone."""
+    data = pickle.dumps(message, protocol=5)
+    connection.sendall(_LENGTH.pack(len(data)))
+    connection.sendall(data)
+
+
+def receive(connection: socket.socket) -> Any:
+    """The next message; None when the other end is gone."""
+    head = _exactly(connection, _LENGTH.size)
+    data = None if head is None else _exactly(connection, _LENGTH.unpack(head)[0])
+    return None if data is None else pickle.loads(data)
+
+
+def _exactly(connection: socket.socket, size_bytes: int) -> bytearray | None:
+    data = bytearray(size_bytes)
+    view, got = memoryview(data), 0
+    while got < size_bytes:
+        try:
+            count = connection.recv_into(view[got:])
+        except OSError:
+            return None
+        if not count:
+            return None
+        got += count
+    return data
+
+
+def answer(request: Request, kept: dict[str, object]) -> Answer:
+    """What comes of the request."""
+    try:
+        if isinstance(request.function, str):
+            return Answer(getattr(kept[request.target], request.function)(*request.args))
+        result = request.function(*request.args)
+        if request.keep:
+            kept[request.keep] = result
+            return Answer()
+        return Answer(result)
+    except BaseException as error:  # noqa: BLE001 - the daemon waits for any error
+        return Answer(error=error)
+
+
+def answer_all(connection: socket.socket, kept: dict[str, object]) -> None:
+    """In the process: one request after the other, until the other end is gone."""
+    while (request := receive(connection)) is not None:
+        found = answer(request, kept)
+        try:
+            send(connection, found)
+        except OSError:
+            return  # the daemon has gone
+
+
+class Line:
+    """One thread of the process; requests are answered one after the other. Blocking: used from a lane. `ended` is the
+    sentence for a process that has ended."""
+
+    def __init__(self, connection: socket.socket, ended: str) -> None:
+        self._connection = connection
+        self._ended = ended
+        self._lock = Lock()
+
+    def run(self, function: Callable[..., object], *args: object) -> Any:
+        """`function(*args)` there; both are pickled. Raises what it raises, and OSError when the process is gone."""
+        return self._asked(Request(function, args))
+
+    def make(self, name: str, function: Callable[..., object], *args: object) -> None:
+        """Keep what `function(*args)` returns there under this name, which every line then knows."""
+        self._asked(Request(function, args, keep=name))
+
+    def call(self, name: str, method: str, *args: object) -> Any:
+        """The method of what is kept under this name."""
+        return self._asked(Request(method, args, name))
+
+    def close(self) -> None:
+        """No more requests; the one under way is completed."""
+        with suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for an answer
+        self._connection.close()
+
+    def _asked(self, request: Request) -> Any:
+        with self._lock:
+            try:
+                send(self._connection, request)
+                found = receive(self._connection)
+            except OSError:
+                found = None
+        if found is None:
+            raise OSError(errno.EPIPE, self._ended)
+        if found.error is not None:
+            raise found.error
+        return found.result

@@ -1,0 +1,209 @@
+"""Frames, from the hub to the disk: each by itself, in order, through a bounded queue.
+
+They are encoded and committed by a lane's thread, off the loop. A slow disk fills the queue and then loses frames; one
+that is nearly full is left to the telemetry. A frame whose folder has gone waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from enum import Enum
+
+import cv2  # noqa: F401  # pyright: ignore[reportUnusedImport] - here, so that no frame waits for it
+
+from foundation.calls import Lane
+from foundation.clock import Clock
+from foundation.items import Event, Item
+from foundation.readings import Frame
+from recording.format.images import CAMERA_IMAGE, encode_image
+from recording.format.layout import FRAMES, SEQUENCE_MASK
+from recording.format.restarts import restarted_step
+from recording.writing.home import FolderLost
+from recording.writing.homes import Homes, Kept
+from recording.writing.notices import Losses
+from recording.writing.recorder_settings import RecordingSettings
+from recording.writing.segment import Record
+from recording.writing.series import DiskSeries
+from recording.writing.waiting import Waiting
+
+_OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
+
+
+class Frames:
+    """The frames of one session; `receive` is the hub's subscriber from `begin` on. kept: what their folder holds of
+    this run. `encode` makes an image message, in a thread of its own and in order of the frames."""
+
+    def __init__(
+        self,
+        settings: RecordingSettings,
+        encode: Callable[[Frame], bytes] | None,
+        clock: Clock,
+        waiting: Waiting,
+        homes: Homes,
+    ) -> None:
+        self._settings = settings
+        self._encode = encode or self._encode_alone
+        self._clock = clock
+        self._waiting = waiting
+        self._homes = homes
+        self._queue: asyncio.Queue[Frame] = asyncio.Queue(settings.queue_frames)
+        self._taking = False
+        self.losses = Losses()
+        self.taken = 0
+
+    def begin(self, series: DiskSeries) -> None:
+        """Take what is published, into this series."""
+        self.series = series
+        self.lane = Lane("record-frames", self._clock, patient=False)
+        self._writer = ImageWriter(series, self._encode, self.losses)
+        self.kept = Kept(self._clock.now_ns(), 0)
+        self._taking = True
+
+    @property
+    def saved(self) -> int:
+        """On the disk."""
+        return self._writer.saved
+
+    @property
+    def done(self) -> int:
+        """Of those taken: on the disk, or lost."""
+        return self._writer.done
+
+    @property
+    def waiting(self) -> int:
+        """In the queue."""
+        return self._queue.qsize()
+
+    def _encode_alone(self, frame: Frame) -> bytes:
+        return encode_image(frame, self._settings.frame_encoding)
+
+    def receive(self, item: Item) -> None:
+        """Queue a frame, or count it as lost when there is no room."""
+        if not self._taking:
+            return
+        if isinstance(item, Event) and (step_id := restarted_step(item)):
+            self.losses.supersede(step_id, item.time_ns)
+        if isinstance(item, Frame):
+            now_ns = self._clock.now_ns()
+            try:
+                self._queue.put_nowait(item)
+            except asyncio.QueueFull:
+                self.losses.count(item, "the disk is too slow")
+                self._waiting.frame_refused(now_ns)
+            else:
+                self.taken += 1
+                self._waiting.frame_published(now_ns)
+
+    async def record(self) -> None:
+        """One after the other, until cancelled."""
+        while True:
+            await self._homes.there.wait()
+            frame = self._writer.homeless or await self._queue.get()
+            fate, reason = await self.lane.call(self._writer.save, frame)
+            if fate is Fate.HOMELESS:
+                self._homes.follow(FRAMES, reason, self.kept)
+                continue
+            published_ns = self._waiting.frame_done()
+            if fate is Fate.REFUSED:
+                self._waiting.frame_refused(published_ns)
+            elif fate is Fate.SAVED:
+                self._waiting.frames_work()
+                self.kept = Kept(published_ns, self._writer.saved)
+            self._waiting.changed()
+
+    async def tend(self, now_ns: int) -> None:
+        """A soak is long: its last frames are not left unfinished, nor their reserve taken, until the next ones. Nor
+        does anybody take a frame while the disk is thought to refuse them: whether it still does is tried."""
+        failure = await self.lane.call(self._writer.tend, now_ns, self._waiting.frames_refused)
+        if failure is None:
+            self._waiting.frames_work()
+        self._homes.follow(FRAMES, failure, self.kept)
+
+    async def finish(self) -> None:
+        """Those that wait; the first may be one that found its folder gone when the recording was ended. None is taken
+        from then on."""
+        frame = await self.lane.call(lambda: self._writer.homeless)
+        while frame is not None or not self._queue.empty():
+            frame = frame or self._queue.get_nowait()
+            fate, reason = await self.lane.call(self._writer.save, frame)
+            if fate is Fate.HOMELESS:
+                self._writer.give_up(frame, reason)
+            frame = None
+        self._taking = False
+
+
+class Fate(Enum):
+    """What became of a frame. LOST: for a reason that is not the disk's, or on a nearly full one, which is reported by
+    itself. REFUSED: lost because the disk refuses it. HOMELESS: its folder is gone, and it may be saved later."""
+
+    SAVED = "saved"
+    LOST = "lost"
+    REFUSED = "refused"
+    HOMELESS = "homeless"
+
+
+class ImageWriter:
+    """Encodes and commits frames one by one. `done` frames are `saved` or counted as lost."""
+
+    def __init__(self, series: DiskSeries, encode: Callable[[Frame], bytes], losses: Losses) -> None:
+        self._series = series
+        self._encode = encode
+        self._losses = losses
+        self._block_bytes = 0  # of the last frame that was offered to the disk
+        self.homeless: Frame | None = None  # found its folder gone; it is the first to be saved again
+        self.saved = 0
+        self.done = 0
+
+    def save(self, frame: Frame) -> tuple[Fate, str]:
+        """The frame on the disk; or why it is not, and it is counted as lost: the disk refuses it twice, it is nearly
+        full, or the frame cannot be encoded. One whose folder is gone is not lost."""
+        fate, reason = self._fate(frame)
+        self.homeless = frame if fate is Fate.HOMELESS else None
+        if self.homeless is not None:
+            return fate, reason
+        if fate is Fate.SAVED:
+            self.saved += 1
+        else:
+            self._losses.count(frame, reason)
+        self.done += 1
+        return fate, reason
+
+    def give_up(self, frame: Frame, reason: str) -> None:
+        """A frame that found no folder to the end."""
+        self.homeless = None
+        self._losses.count(frame, reason)
+        self.done += 1
+
+    def _fate(self, frame: Frame) -> tuple[Fate, str]:
+        try:
+            self._series.finish_full(frame.time_ns)
+            if not self._series.is_open:
+                self._series.check_space()
+            if (space := self._series.space.last).frames_stopped:
+                self._series.finish()  # for as long as that takes nothing is left open, or reserved
+                return Fate.LOST, space.stop_reason
+            data = self._encode(frame)
+            self._block_bytes = len(data)
+            self._series.commit(
+                [Record(CAMERA_IMAGE, frame.time_ns, data, frame.block_id & SEQUENCE_MASK)], frame.time_ns
+            )
+        except FolderLost as error:
+            return Fate.HOMELESS, str(error.strerror)
+        except OSError as error:
+            return Fate.REFUSED, str(error)
+        except Exception as error:  # noqa: BLE001 - an encoder that fails on one frame must not end the run
+            return Fate.LOST, f"{type(error).__name__}: {error}"
+        return Fate.SAVED, ""
+
+    def tend(self, now_ns: int, refused: bool) -> OSError | None:
+        """Without a frame: close the segment when it is old, and say whether frames could be written; `refused`: the
+        last one could not, and so a block as large is tried."""
+        try:
+            self._series.check()
+            self._series.finish_full(now_ns)
+            if refused:
+                self._series.probe(self._block_bytes + _OPENING_BYTES, now_ns)
+        except OSError as error:
+            return error
+        return None

@@ -1,0 +1,219 @@
+"""Readings, events and what belongs to a frame beside its image: from the hub to the disk, committed on ticks.
+
+What is published waits in memory until it is on the disk; when that holds too much, readings are the first to go. They
+are encoded and committed by a lane's thread, off the loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from foundation.calls import Lane
+from foundation.clock import Clock
+from foundation.errors import SessionError
+from foundation.items import Batch, Event, Item, Original, StepMark
+from foundation.readings import Frame, Quality
+from recording.format import messages
+from recording.format.decoded_items import Description, UndescribedFrame
+from recording.format.layout import SEQUENCE_MASK, TELEMETRY
+from recording.writing.homes import Homes, Kept
+from recording.writing.notices import DroppedReadings, Notice, telemetry_notice
+from recording.writing.recorder_settings import RecordingSettings
+from recording.writing.segment import Record
+from recording.writing.series import DiskSeries
+from recording.writing.waiting import Waiting
+
+NO_IMAGE = np.empty((0, 0), np.uint8)
+PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second
+
+
+class Telemetry:
+    """The telemetry of one session; `receive` is the hub's subscriber from `begin` on. taking: until the
+    end of the recording. takes_frames: whether frames are being recorded, whose descriptions are telemetry. kept: what
+    its folder holds of this run."""
+
+    def __init__(
+        self,
+        directory: Path,
+        devices: Mapping[str, str],
+        settings: RecordingSettings,
+        clock: Clock,
+        waiting: Waiting,
+        homes: Homes,
+        tell: Callable[[Notice], None],
+    ) -> None:
+        self._directory = directory
+        self._encoder = TelemetryEncoder(devices)
+        self._most_waiting = settings.waiting_messages
+        self._clock = clock
+        self._waiting = waiting
+        self._homes = homes
+        self._tell = tell
+        self._items: list[Item | Description] = []  # since the last commit
+        self._dropped = DroppedReadings()
+        self._is_failing = self.taking = self.takes_frames = False
+        self.items_taken = 0
+
+    def begin(self, series: DiskSeries) -> None:
+        """Take what is published, into this series."""
+        self.series = series
+        self.lane = Lane("record-telemetry", self._clock, patient=False)
+        self._writer = TelemetryWriter(series, self._encoder)
+        self.kept = Kept(self._clock.now_ns(), 0)
+        self.taking = self.takes_frames = True
+
+    @property
+    def items_saved(self) -> int:
+        """Of the items taken."""
+        return self._writer.items_saved
+
+    @property
+    def messages_saved(self) -> int:
+        """On the disk."""
+        return self._writer.messages_saved
+
+    @property
+    def messages_waiting(self) -> int:
+        """Published, and not on the disk."""
+        return len(self._items) + self._writer.waiting
+
+    def receive(self, item: Item) -> None:
+        """Keep the item for the next commit, or count what does not fit; ValueError for a batch of a device that was
+        not declared."""
+        if not self.taking:
+            return
+        self._encoder.check(item)
+        if isinstance(item, Frame):
+            if not self.takes_frames:
+                return
+            item = replace(item, image=NO_IMAGE)  # the image itself waits in one place only
+        if isinstance(item, Batch) and self.messages_waiting >= self._most_waiting:
+            self._dropped.count(item, self._tell)
+            return
+        self.keep(item)
+
+    def keep(self, item: Item | Description) -> None:
+        """For the next commit, in any case but when the recording has ended."""
+        if self.taking:
+            self._items.append(item)
+            self.items_taken += 1
+            self._waiting.item_published(self._clock.now_ns())
+
+    async def save(self) -> OSError | None:
+        """Commit what was published since the last time and what failed before; the error when the disk refuses."""
+        items, self._items = self._items, []
+        commit, now_ns = self._waiting.items_taken(), self._clock.now_ns()
+        failure = await self.lane.call(self._writer.save, items, now_ns)
+        if failure is None:
+            self._waiting.items_saved(commit)
+            self.kept = Kept(now_ns, self._writer.messages_saved)
+            self._dropped.end(self._tell)
+        self._homes.follow(TELEMETRY, failure, self.kept)
+        self._waiting.changed()
+        if (failure is not None) != self._is_failing:
+            self._is_failing = failure is not None
+            self._tell(telemetry_notice(failure))
+        return failure
+
+    async def finish(self) -> None:
+        """Nothing published from now on is taken; the rest is saved and the segment completed. SessionError when one of
+        them fails."""
+        self.taking = False
+        failure = await self.save()
+        is_complete = await self.lane.call(self.series.finish)
+        if failure is not None:
+            raise SessionError(f"{self._directory}: {self._writer.waiting} messages were not saved ({failure})")
+        if not is_complete:
+            raise SessionError(f"{self._directory}: {self.series.troubles.pop()}")
+
+
+class TelemetryEncoder:
+    """Items of the hub to records of the telemetry series; `devices` maps a device's name to its kind."""
+
+    def __init__(self, devices: Mapping[str, str]) -> None:
+        unknown = sorted({kind for kind in devices.values() if kind not in messages.KINDS})
+        if unknown:
+            raise ValueError(f"no device kind {', '.join(unknown)}; there are {', '.join(messages.KINDS)}")
+        self._devices = dict(devices)
+        self._encoders = {
+            name: messages.BatchEncoder(name, messages.KINDS[kind]) for name, kind in self._devices.items()
+        }
+        self._table: dict[str, float] = {}  # unit -> last position of the axis in that unit
+
+    def check(self, item: Item) -> None:
+        """ValueError when the item is a batch of a device that was not declared."""
+        if isinstance(item, Batch) and item.device not in self._encoders:
+            raise ValueError(f"{item.device} is not among the recorded devices {', '.join(self._encoders)}")
+
+    def encode(self, item: Item | Description) -> Iterator[Record]:
+        """The item's records, most often one."""
+        match item:
+            case Batch():
+                encoder = self._encoders[item.device]
+                yield Record(encoder.topic, item.time_ns, encoder.encode(item))
+                if self._devices[item.device] == "axis":
+                    yield from self._pose(item)
+            case Description():
+                yield Record(messages.CAMERA_META, item.time_ns, item.data, item.sequence)
+            case UndescribedFrame():
+                pass  # a description is never invented
+            case Frame():
+                yield Record(
+                    messages.CAMERA_META, item.time_ns, messages.encode_frame_meta(item), item.block_id & SEQUENCE_MASK
+                )
+            case Original():
+                yield Record(messages.ORIGINAL, item.time_ns, messages.encode_original(item))
+            case StepMark():
+                yield Record(messages.STEP, item.time_ns, messages.encode_step(item))
+            case Event():
+                yield Record(messages.EVENT, item.time_ns, messages.encode_event(item))
+                yield Record(messages.LOG, item.time_ns, messages.encode_log(item))
+
+    def _pose(self, batch: Batch) -> Iterator[Record]:
+        """The table's pose for viewers, once both axes have reported their positions; none while one has none."""
+        for reading in batch.readings:
+            if reading.channel == f"{batch.device}.position":
+                self._table.pop(reading.unit, None)
+                if reading.quality is not Quality.BAD:
+                    self._table[reading.unit] = reading.value
+        if "mm" in self._table and "deg" in self._table:
+            pose = messages.encode_table_pose(batch.time_ns, self._table["mm"], self._table["deg"])
+            yield Record(messages.TABLE_POSE, batch.time_ns, pose)
+
+
+class TelemetryWriter:
+    """Encodes and commits items; what the disk refuses waits in memory and goes first the next time."""
+
+    def __init__(self, series: DiskSeries, encoder: TelemetryEncoder) -> None:
+        self._series = series
+        self._encoder = encoder
+        self._backlog: list[Record] = []
+        self._items_encoded = 0
+        self.items_saved = 0
+        self.messages_saved = 0
+
+    @property
+    def waiting(self) -> int:
+        """Messages that are not on the disk yet."""
+        return len(self._backlog)
+
+    def save(self, items: Sequence[Item | Description], now_ns: int) -> OSError | None:
+        """All items so far on the disk, or why they are not; FolderLost also when there was nothing to write."""
+        for item in items:
+            self._backlog.extend(self._encoder.encode(item))
+            self._items_encoded += 1
+        try:
+            self._series.check_space()
+            self._series.check()
+            while portion := self._backlog[:PORTION_RECORDS]:
+                self._series.commit(portion, now_ns)
+                del self._backlog[: len(portion)]
+                self.messages_saved += len(portion)
+        except OSError as error:
+            return error
+        self.items_saved = self._items_encoded
+        return None
