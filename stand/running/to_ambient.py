@@ -34,9 +34,14 @@ async def to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandConfig) 
     text = f"the plan is done; back to {set_point_degC:.1f} degC: {lacks}"
     hub.publish(Event(clock.now_ns(), "info", "to_ambient", text, {"ambient_degC": set_point_degC}))
     until_ns, running_degC = clock.now_ns() + seconds_ns(config.ending.max_s), math.nan
+
+    def held(reason: str, _: bool) -> None:
+        nonlocal running_degC
+        if reason == INTERLOCK:  # the guard stops the chamber, be it for a moment between two looks
+            running_degC = math.nan
+
+    stand.gate.subscribe(held)
     while (lacks := _lacks(hub, config)) and clock.now_ns() < until_ns:
-        if INTERLOCK in stand.gate.reasons:
-            running_degC = math.nan  # the guard has stopped the chamber
         await stand.gate.passed()
         set_point_degC, wait_s = _ambient_degC(hub, config), _LOOK_S
         if not abs(set_point_degC - running_degC) <= _FOLLOWS_K:
@@ -64,12 +69,12 @@ def _ambient_degC(hub: Hub, config: StandConfig) -> float:
 
 
 def _lacks(hub: Hub, config: StandConfig) -> str:
-    """What has not reached the laboratory's temperature yet, in words; "" when all has. What cannot be read is not
-    waited for."""
+    """What has not reached the laboratory's temperature yet, in words; "" when all has. Air that
+    cannot be read may be anywhere: the guard ends that; other parts that cannot be read are not waited for."""
     ambient_degC, band_K = _ambient_degC(hub, config), config.ending.band_K
     air_degC = value_of(hub, AIR)
-    if abs(air_degC - ambient_degC) > band_K:
-        return f"the air is {air_degC:.1f} degC"
+    if not abs(air_degC - ambient_degC) <= band_K:
+        return "the air's temperature is not known" if math.isnan(air_degC) else f"the air is {air_degC:.1f} degC"
     dew_degC = dew_limit_degC(config, hub)
     lowest_degC = ambient_degC - band_K if math.isnan(dew_degC) else min(dew_degC, ambient_degC)
     cold = [(value_of(hub, channel), channel) for channel in cold_parts(config)]

@@ -1,17 +1,28 @@
 """The end of a run: the chamber comes back to the laboratory's temperature before the run is complete."""
 
+import asyncio
+import os
+import signal
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from foundation.errors import SessionError, StandTripped
 from foundation.hub import Hub
-from foundation.items import Event, Item
+from foundation.items import Batch, Event, Item, StepState
 from recording.reading.run_word import Run
 from recording.reading.session import Session
 from stand.config.stand_config import packaged
-from stand.running.order import load_order
-from stand.running.run import run_virtual
+from stand.running.order import Order, load_order
+from stand.running.resume import interruption
+from stand.running.run import Interrupted, resume, run_virtual
+from stand.serving.client import ask
+from tests.system.test_run import fault
 
 RECIPE = "name: away\nsteps:\n  - start_chamber: {set_point}\n  - soak: {soak_s}\n  - stop_chamber\n"
 
@@ -66,3 +77,101 @@ async def test_nothing_happens_where_it_is_there_or_not_wanted(
 ):
     _, seen = await night(tmp_path, set_point, 300, **ending)
     assert not {"to_ambient", "at_ambient", "not_at_ambient"} & {event.kind for event in seen}
+
+
+def on_the_way(do: Callable[[], object], batches: int = 5) -> Callable[[Hub], None]:
+    """Do it once the chamber has been on its way back for so many polls."""
+    left: list[int] = []
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Event) and item.kind == "to_ambient":
+            left[:] = [batches]
+        if isinstance(item, Batch) and left:
+            left[0] -= 1
+            if left[0] == 0:
+                do()
+
+    return lambda hub: hub.subscribe(follow)
+
+
+def far(folder: Path) -> Order:
+    """Of a stand that knows its laboratory's temperature from its file only: 18 degC, where a new simulated chamber is
+    at 24, so that a resumed run has a way to go, too."""
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["cameras"], data["axes"] = {}, {}
+    data["thermometers"].pop("laboratory")
+    data["ending"] = {"to_ambient": True, "ambient_degC": 18.0}
+    (folder / "stand.yaml").write_text(yaml.safe_dump(data))
+    (folder / "away.yaml").write_text(RECIPE.format(set_point=30.0, soak_s=300))
+    return load_order(str(folder / "away.yaml"), str(folder / "stand.yaml"))
+
+
+def check_ended(directory: Path, *ends: str) -> list[str]:
+    """Safe, and ended so each time; the kinds of its events."""
+    session = Session.open(directory)
+    for channel in ("relays.heater_enable", "relays.compressor", "regulator.running"):
+        assert session.readings(channel)[1][-1] == 0.0
+    events = session.events()
+    assert [event.text.partition(":")[0] for event in events if event.kind == "run.end"] == list(ends)
+    return [event.kind for event in events]
+
+
+def test_a_stop_on_the_way_back_leaves_the_stand_safe_and_a_resume_goes_on_with_the_way(tmp_path: Path):
+    with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
+        asyncio.run(run_virtual(far(tmp_path), tmp_path / "out", None, on_the_way(interrupt)))
+    (directory,) = (tmp_path / "out").glob("*-away")
+    assert "at_ambient" not in check_ended(directory, "aborted")
+    assert asyncio.run(resume(interruption(directory), lambda hub: None)) == directory
+    kinds = check_ended(directory, "aborted", "complete")
+    assert kinds.count("to_ambient") == 2
+    assert kinds.index("at_ambient") > kinds.index("run.resume")
+    session = Session.open(directory)
+    assert session.run is Run.COMPLETE
+    done = Counter(mark.step_id for mark in session.steps() if mark.state is StepState.DONE)
+    assert set(done.values()) == {1}
+    assert session.readings("thermometers.air")[1][-1] == pytest.approx(18.0, abs=3.5)
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+async def test_a_trip_on_the_way_back_ends_it_and_it_goes_on_when_that_is_cleared(tmp_path: Path):
+    order, works = replace(far(tmp_path), at_configured_addresses=True), list[asyncio.Task[None]]()
+
+    def broken() -> None:
+        works.append(asyncio.create_task(fault(order, "thermometer.open", "air")))
+
+    with pytest.raises(StandTripped, match=r"thermometers\.air is BAD"):
+        await run_virtual(order, tmp_path / "out", None, on_the_way(broken))
+    (directory,) = (tmp_path / "out").glob("*-away")
+    check_ended(directory, "aborted")
+    with pytest.raises(SessionError, match="resume with --clear"):
+        interruption(directory)
+    await resume(interruption(directory, clear=True), lambda hub: None)
+    assert "at_ambient" in check_ended(directory, "aborted", "complete")
+
+
+async def test_a_hold_on_the_way_back_stops_the_chamber_which_goes_on_after_it(tmp_path: Path):
+    """Somebody stops the regulator with its keys, and an operator clears that."""
+    order, works, seen = replace(far(tmp_path), at_configured_addresses=True), list[asyncio.Task[Any]](), list[Event]()
+
+    async def clear() -> None:
+        (directory,) = (tmp_path / "out").glob("*-away")
+        await asyncio.to_thread(ask, directory, "clear")
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Event):
+            seen.append(item)
+            if item.kind == "held":
+                works.append(asyncio.create_task(clear()))
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(follow)
+        on_the_way(lambda: works.append(asyncio.create_task(fault(order, "regulator.stop_key", True))))(hub)
+
+    directory = await run_virtual(order, tmp_path / "out", None, watch)
+    await asyncio.gather(*works)
+    kinds = [event.kind for event in seen]
+    assert kinds.index("to_ambient") < kinds.index("held") < kinds.index("released") < kinds.index("at_ambient")
+    check_ended(directory, "complete")
