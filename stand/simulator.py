@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 
 from drivers.settings import OnBus
@@ -19,6 +20,8 @@ from stand.config.simulation import SimulatedCamera
 from stand.config.stand_config import StandConfig
 
 _STOP_LIMIT_S = 5.0
+_CONNECT_S = 5.0
+_TURN_US = 10_000  # how long the event loop may wait for an answer
 _CAMERA_BOOT_S = 3.0  # a stand that waits for less has a camera that takes less
 _FREE_TCP, _FREE_SERIAL = "tcp:127.0.0.1:0", "serial:"
 
@@ -215,35 +218,51 @@ class Simulator:
 
 
 class ControlSocket:
-    """The simulator's control socket: one JSON object a line in, one out."""
+    """The simulator's control socket: one JSON object a line in, one out. An answer is waited for on the spot, since it
+    comes within a ms; the event loop has its turn every 10 ms of one that takes longer."""
 
     def __init__(self, address: str) -> None:
-        self._host, self._port = tcp_place(address)
-        self._reader: asyncio.StreamReader | None = None
-        self._writer: asyncio.StreamWriter | None = None
+        self._place = tcp_place(address)
+        self._socket: socket.socket | None = None
 
     async def open(self) -> None:
         """Connect; raises Unreachable."""
         try:
-            self._reader, self._writer = await asyncio.open_connection(self._host, self._port)
+            opened = await asyncio.to_thread(socket.create_connection, self._place, _CONNECT_S)
         except OSError as error:
-            raise Unreachable("simulator", f"nobody listens at {self._host}:{self._port} ({error})") from error
+            host, port = self._place
+            raise Unreachable("simulator", f"nobody listens at {host}:{port} ({error})") from error
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        opened.settimeout(None)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, _TURN_US))
+        self._socket = opened
 
     async def request(self, request: Mapping[str, object]) -> dict[str, object]:
         """Send one request and return its answer; Unreachable when the simulator is gone, Refused when it refuses."""
-        if self._reader is None or self._writer is None:
+        if self._socket is None:
             raise ValueError("the control socket is not open")
         try:
-            self._writer.write(json.dumps(request).encode() + b"\n")
-            line = await self._reader.readline()
+            self._socket.sendall(json.dumps(request).encode() + b"\n")
+            line = b""
+            while not line.endswith(b"\n"):
+                line += await self._received(self._socket)
         except OSError as error:
             raise Unreachable("simulator", f"the control socket broke ({error})") from error
-        if not line:
-            raise Unreachable("simulator", "the simulator closed its control socket")
         answer: dict[str, object] = json.loads(line)
         if "error" in answer:
             raise Refused("simulator", str(answer["error"]))
         return answer
+
+    async def _received(self, opened: socket.socket) -> bytes:
+        while True:
+            try:
+                data = opened.recv(65536)
+            except BlockingIOError:
+                await asyncio.sleep(0)
+                continue
+            if not data:
+                raise Unreachable("simulator", "the simulator closed its control socket")
+            return data
 
     async def advance(self, now_ns: int) -> None:
         """Put the simulated laboratory at `now_ns`."""
@@ -251,8 +270,6 @@ class ControlSocket:
 
     async def close(self) -> None:
         """Let go; may be called twice."""
-        if self._writer is not None:
-            self._writer.close()
-            with suppress(OSError):
-                await self._writer.wait_closed()
-        self._writer = None
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None

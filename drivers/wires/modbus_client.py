@@ -174,15 +174,32 @@ class _SerialClient(ModbusSerialClient):
 
 
 class _TcpClient(ModbusTcpClient):
-    """pymodbus over TCP."""
+    """pymodbus over TCP. The kernel keeps the time-out: a reply then costs one call of it instead of three."""
 
     def connect(self) -> bool:
         """Connect; raises OSError with the reason."""
         if self.socket is None:
             peer = self.comm_params
-            self.socket = socket.create_connection((peer.host, peer.port), timeout=peer.timeout_connect)
+            timeout_s = peer.timeout_connect or 0.0
+            self.socket = socket.create_connection((peer.host, peer.port), timeout=timeout_s)
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self.socket.settimeout(None)
+            limit_s = struct.pack("@ll", int(timeout_s), round(timeout_s % 1 * 1e6))
+            for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
+                self.socket.setsockopt(socket.SOL_SOCKET, option, limit_s)
         return True
+
+    def recv(self, size: int | None) -> bytes:
+        """What has come; b"" after the time-out."""
+        if self.socket is None:
+            raise ConnectionException("connection closed")
+        try:
+            data = self.socket.recv(4096)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise ConnectionException("the connection was closed")
+        return data
 
 
 class ModbusClient:
