@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 
 from recording.exporting.sidecar import StandTemperatures
 from recording.exporting.tables import Cell, Column
-from recording.format import messages
-from recording.format.records import telemetry_messages
 from recording.reading.session import Session
 
 _FIRST = (
@@ -21,15 +19,14 @@ _FIRST = (
     Column("set_point_degC", "value"),
     Column("camera_temperature_degC", "value"),
 )
-_AXIS = messages.KINDS["axis"]
 
 
 def frames_rows(session: Session, file_of: Sequence[str] | None) -> tuple[tuple[Column, ...], Iterator[Sequence[Cell]]]:
     """The columns and the rows of F frames in order of time. file_of: F names of exported images; without them `file`
     is the segment that has the image."""
     table, stand = session.frames_table(), StandTemperatures(session)
-    units = _axis_units(session, len(table.positions))
-    axes = [Column(f"{axis}_position{'_' + units[axis] if axis in units else ''}", "value") for axis in table.positions]
+    units = session.units()
+    axes = [Column(f"{axis}_position_{units[f'{axis}.position']}", "value") for axis in table.positions]
 
     def rows() -> Iterator[Sequence[Cell]]:
         for place in range(len(table)):
@@ -49,17 +46,3 @@ def frames_rows(session: Session, file_of: Sequence[str] | None) -> tuple[tuple[
             )
 
     return (*_FIRST, *stand.columns, *axes), rows()
-
-
-def _axis_units(session: Session, count: int) -> dict[str, str]:
-    """The unit of each axis's position, mm or deg, as it was recorded first; read until those of `count` are known."""
-    units: dict[str, str] = {}
-    for path in session.telemetry_segments if count else ():
-        for message in telemetry_messages(path, lambda channel: channel.topic == _AXIS.topic):
-            batch = messages.decode_batch(message.topic, message.data, message.time_ns)
-            found = {reading.channel.partition(".")[2]: reading.unit for reading in batch.readings}
-            if "position" in found:
-                units.setdefault(batch.device, found["position"])
-            if len(units) == count:
-                return units
-    return units

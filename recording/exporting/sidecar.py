@@ -63,18 +63,18 @@ def sidecar_text(stand_columns: Sequence[Column], facts: Sequence[Cell]) -> str:
 class StandTemperatures:
     """The temperatures of the stand as they were last read at an instant, each with its age.
 
-    `columns` are a value and an age for each channel in degC; NaN is a channel whose last reading was BAD, or that had
-    not been read yet, which has no age.
+    `columns` are a value and an age for each channel in degC, those of a kind's own names before others; NaN is a
+    channel whose last reading was BAD, or that had not been read yet, which has no age.
     """
 
     def __init__(self, session: Session) -> None:
-        recorded = set(session.channels())
-        names = [
+        warm = [channel for channel, unit in session.units().items() if unit == "degC"]
+        usual = [
             f"{device}.{quantity.name}"
             for device, kind in recorded_devices(session).items()
             for quantity in messages.KINDS[kind].quantities
-            if quantity.unit == "degC" and f"{device}.{quantity.name}" in recorded
         ]
+        names = [*(name for name in usual if name in warm), *(name for name in warm if name not in usual)]
         self._readings = [session.readings(name) for name in names]
         self.columns = tuple(
             column for name in names for column in (Column(f"{name}_degC", "value"), Column(f"{name}_age_s", "value"))

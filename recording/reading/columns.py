@@ -54,6 +54,7 @@ class TopicColumns:
         self._single: dict[
             tuple[str, str], list[tuple[int, int, float]]
         ] = {}  # (device, channel) -> number, time, value
+        self.units: dict[str, str] = {}  # by channel, as it was recorded first
         self._count = 0
 
     def add(self, data: bytes, log_time_ns: int) -> None:
@@ -76,6 +77,7 @@ class TopicColumns:
 
     def _add_singly(self, batch: Batch) -> None:
         for reading in batch.readings:
+            self.units.setdefault(reading.channel, reading.unit)
             single = self._single.setdefault((batch.device, reading.channel), [])
             single.append((self._count, reading.time_ns, reading.value))
 
@@ -109,6 +111,7 @@ class TopicColumns:
                 value, quality = values[is_wrong][0], qualities[is_wrong][0]
                 raise SessionError(f"{channel}: the recorded value {value} does not fit its quality {quality}")
             if len(values):
+                self.units[channel] = quantity.unit
                 yield channel, (numbers[is_given], times_ns[is_given], values)
 
 

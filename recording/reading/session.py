@@ -90,6 +90,7 @@ class Session:
                 self._check(segment)
         self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
         self._all_columns_read = False
+        self._units: dict[str, str] = {}
         self._places_of: dict[Path, list[FramePlace]] = {}
         self._metas_of: dict[Path, dict[tuple[int, int], bytes]] = {}
 
@@ -132,6 +133,10 @@ class Session:
         """The channels that have readings, sorted."""
         return sorted(self._all_columns())
 
+    def units(self) -> Mapping[str, str]:
+        """The unit of each channel that has readings, as it was recorded first."""
+        return {channel: self._units[channel] for channel in self.channels()}
+
     def readings(self, channel: str) -> Column:
         """(time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD. SessionError when the
         session has no such channel."""
@@ -170,6 +175,7 @@ class Session:
             with naming(self.path / TELEMETRY):
                 for name, of_device in topic.columns().items():
                     columns.setdefault(name, {}).update(of_device)
+                self._units |= topic.units
         return columns
 
     def steps(self) -> list[StepMark]:

@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 from drivers.settings import CameraSettings, OnBus
 from foundation.errors import ConfigError
@@ -44,7 +45,8 @@ class Difference:
     stand: object
 
     def __str__(self) -> str:
-        return f"{self.path} is {_shown(self.stand)} as on this stand, not {_shown(self.session)} as in the session"
+        other = "and not given in" if self.session is None else f"not {_shown(self.session)} as in"
+        return f"{self.path} is {_shown(self.stand)} as on this stand, {other} the session"
 
     def data(self) -> dict[str, object]:
         """For the recording."""
@@ -77,9 +79,7 @@ def on_this_stand(
                 ),
             }
         )
-    before, now = (dict(_leaves(each.model_dump(mode="json"))) for each in (recorded, config))
-    found = (Difference(path, before.get(path), now.get(path)) for path in dict.fromkeys((*before, *now)))
-    return config, tuple(each for each in found if each.session != each.stand)
+    return config, tuple(_differing(recorded.model_dump(mode="json"), config.model_dump(mode="json")))
 
 
 def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
@@ -131,14 +131,15 @@ def _check_kind(recorded: StandConfig, own: StandConfig, session: Path) -> None:
         )
 
 
-def _leaves(values: Mapping[str, object], above: str = "") -> Iterator[tuple[str, object]]:
-    """Every value that is no mapping, by its path; an empty mapping counts as one."""
-    for name, value in values.items():
-        path = f"{above}{name}"
-        if isinstance(value, dict) and value:
-            yield from _leaves(value, f"{path}.")  # pyright: ignore[reportUnknownArgumentType]
-        else:
-            yield path, value
+def _differing(before: Mapping[str, Any], now: Mapping[str, Any], above: str = "") -> Iterator[Difference]:
+    """Every value that is not the same, by its path; what one of both has not at all, such as a thermometer of that
+    name, as a whole."""
+    for name in dict.fromkeys((*before, *now)):
+        value, own, path = before.get(name), now.get(name), f"{above}{name}"
+        if isinstance(value, dict) and isinstance(own, dict):
+            yield from _differing(cast("dict[str, Any]", value), cast("dict[str, Any]", own), f"{path}.")
+        elif value != own:
+            yield Difference(path, value, own)
 
 
 def _shown(value: object) -> str:

@@ -402,6 +402,26 @@ async def test_role_set_point_and_stages_are_those_of_the_step(tmp_path):
     assert {"linear_position_mm", "rotary_position_deg"} <= rows[0].keys()
 
 
+async def test_each_frame_has_the_thermometers_of_all_names(tmp_path):
+    """Of names of the laboratory's own, from a poll on or until a resume, and nothing that is no temperature."""
+
+    def items(time_ns, index):
+        yield from half_second(time_ns, index)
+        if index > 1:
+            readings = (
+                Reading("thermometers.pt100_7", 30.0 + index, "degC", time_ns),
+                Reading("thermometers.pt100_7_raw", 7.0, "1", time_ns),
+            )
+            yield Batch("thermometers", time_ns, readings)
+
+    _, out = await exported(tmp_path, count=4, items=items)
+    rows = csv_rows(out / "frames.csv")
+    assert [float(row["thermometers.pt100_7_degC"]) for row in rows] == pytest.approx(
+        [math.nan] * 3 + [32], nan_ok=True
+    )
+    assert not [name for name in rows[0] if "_raw" in name]
+
+
 async def test_notes_and_tags_are_exported(tmp_path):
     await record(tmp_path / "s", 2)
     add_note(tmp_path / "s", "=SUM(A1)", "eva", START_NS)

@@ -171,6 +171,18 @@ def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp
     assert 'guard.notify is [] as on this stand, not ["/bin/rm", "-r", "/"] as in the session' in said
 
 
+def test_a_thermometer_that_was_renamed_is_told_as_one_that_came_and_one_that_went(tmp_path: Path):
+    session = config_of(tmp_path)
+    named = {"lens" if name == "artifact" else name: each for name, each in session.thermometers.items()}
+    own = session.model_copy(update={"thermometers": named})
+    config, differences = on_this_stand(session, own, tmp_path, is_virtual=False)
+    assert list(config.sensors) == list(own.sensors)
+    went, came = map(str, differences)
+    assert went.startswith('thermometers.artifact is not given as on this stand, not {"')
+    assert came.startswith('thermometers.lens is {"')
+    assert came.endswith("as on this stand, and not given in the session")
+
+
 def test_the_same_configuration_does_not_differ(tmp_path: Path):
     own = config_of(tmp_path)
     assert on_this_stand(own, own, tmp_path, is_virtual=False) == (own, ())
