@@ -111,7 +111,8 @@ def _without_daemon(config: str, name: str, verb: str, arguments: dict[str, obje
     devices = [each for each in known_devices(stand) if name in ("", each.name)]
     if not devices:
         raise ConfigError(f"there is no device {name}; `stand device` lists them")
-    show([each.model_dump(mode="json") for each in devices], _device_lines(devices))
+    note = "no daemon has this stand: a device is opened for each command, and left safe at its end"
+    show([each.model_dump(mode="json") for each in devices], [note, *_device_lines(devices)])
 
 
 def _show_devices(server: Server, name: str) -> None:

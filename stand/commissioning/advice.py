@@ -7,10 +7,12 @@ from foundation.errors import DeviceError, GarbledReply, InUse, Refused, Unreach
 from stand.config.stand_config import StandConfig
 
 
-def for_bus(error: DeviceError) -> str:
+def for_bus(error: DeviceError, *, is_simulated: bool) -> str:
     """The line that all units share."""
     if isinstance(error, InUse):
         return "end the other program"
+    if is_simulated:
+        return "this stand is simulated: start its laboratory with `stand simulate FILE` in another terminal"
     return (
         "is the adapter plugged in, its address right, and no other program using it? `stand devices` lists the ports"
     )

@@ -44,7 +44,8 @@ class Links:
         try:
             await bus.open()
         except DeviceError as error:
-            self._add(Finding("bus", "link", "failed", error.text, advice.for_bus(error)))
+            is_simulated = self._assembly.config.simulation is not None
+            self._add(Finding("bus", "link", "failed", error.text, advice.for_bus(error, is_simulated=is_simulated)))
             return
         self._is_bus_up = True
         self._add(Finding("bus", "link", "ok", f"{bus.address} is open"))
@@ -103,7 +104,8 @@ class Links:
             return
         await self._unit(module, unit)
         used = [f"{each}_{unit.channel}" for each in ("output", "present", "safe", "power_on", "type_code")]
-        await self._points(module.name, module.name, unit, used)
+        watchdog = ("watchdog_mode", "watchdog_on", "watchdog_s", "tripped", "data_format")
+        await self._points(module.name, module.name, unit, (*used, *watchdog))
 
     async def inputs(self) -> None:
         """The contacts, where there are any."""

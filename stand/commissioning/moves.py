@@ -121,8 +121,8 @@ class Moves:
         """Frames as fast as they come, and the temperature behind them; a supply that was off is off again at the
         end, also when an operator breaks the check off: it is then made safe with what moved."""
         stand = self._assembly.stand
-        if not self._assembly.devices.cameras:
-            return
+        if not self._assembly.devices.cameras or self._assembly.devices.relays.name not in self._links.opened:
+            return  # there are none, or that their relay does not answer was told
         try:
             await self._supplied_cameras()
         finally:

@@ -8,7 +8,7 @@ stand still, the cameras' supply is as it was. Nothing is heated: heat needs a r
 from __future__ import annotations
 
 import math
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ from stand.running.claim import claimed
 from stand.running.house import close_devices, made_safe
 from stand.running.run_desk import device_kinds
 from stand.running.stop import Stop
-from stand.serving.desk import Conflict, DeviceState
+from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb
 
 COMMAND = "stand device"
 READ, REGISTERS, GRAB = "read", "registers", "grab"
@@ -49,7 +49,18 @@ class Done:
 
 def known_devices(config: StandConfig) -> tuple[DeviceState, ...]:
     """What there is, and what it takes; nothing is opened."""
-    return ByHand(assemble(config, Hub(), WallClock()), _no_heat).devices("no daemon has this stand")
+    devices = ByHand(assemble(config, Hub(), WallClock()), _no_heat).devices("")
+    return tuple(each.model_copy(update={"verbs": (*_looks(config, each), *each.verbs)}) for each in devices)
+
+
+def _looks(config: StandConfig, device: DeviceState) -> Iterator[DeviceVerb]:
+    """What a device takes by hand besides what it takes of a daemon."""
+    yield DeviceVerb(verb=READ, text="what it reads")
+    if _unit_of(config, device.name) is not None:
+        yield DeviceVerb(verb=REGISTERS, text="every point of its register map")
+    if device.kind == "camera":
+        exposure, flap = Argument(name="exposure_s", unit="s"), Argument(name="flap", choices=("open",))
+        yield DeviceVerb(verb=GRAB, text="one frame, kept with -o FILE", arguments=(exposure, flap))
 
 
 async def by_hand(
@@ -60,6 +71,7 @@ async def by_hand(
     arguments = dict(arguments)
     open_s = float(str(arguments.pop("open_s", _OPEN_S))) if verb == "open" else 0.0
     async with _session(config) as hands:
+        hands.check(name, verb)
         device = await hands.opened(name)
         match verb:
             case "read":
@@ -88,17 +100,23 @@ class _Hands:
         self.assembly = assembly
         self._kinds = device_kinds(assembly)
 
+    def check(self, name: str, verb: str) -> None:
+        """ConfigError when there is no such device, or it does not know that; nothing was opened then."""
+        known = {each.name: each for each in known_devices(self.assembly.config)}
+        if name not in known:
+            raise ConfigError(f"this stand has no device {name}; there are {', '.join(known)}")
+        verbs = [each.verb for each in known[name].verbs]
+        if verb not in (*verbs, REGISTERS, GRAB):  # which say more themselves
+            raise ConfigError(f"{name} does not know {verb}; it takes {', '.join(verbs)}")
+
     async def opened(self, name: str) -> Sensor:
         """The device, with what it needs."""
         assembly, devices = self.assembly, self.assembly.devices
-        if name not in self._kinds:
-            raise ConfigError(f"this stand has no device {name}; there are {', '.join(self._kinds)}")
         kind = self._kinds[name]
-        on_bus: dict[str, Sensor] = {
-            "relays": devices.relays,
-            "thermometers": devices.thermometers,
-            "regulator": devices.regulator,
-        }
+        units = (devices.relays, devices.thermometers, devices.regulator, devices.heat_module, devices.inputs)
+        on_bus: dict[str, Sensor] = {unit.name: unit for unit in units if unit is not None}
+        if devices.imager is not None and name == devices.imager.name:
+            return await self._open(devices.imager)
         if kind == "camera":
             await assembly.bus.open()
             await self._open(devices.relays)
@@ -183,13 +201,17 @@ def _readings(readings: Sequence[Reading]) -> Done:
     return Done(lines or ["it reads nothing"], [asdict(each) for each in readings])
 
 
+def _unit_of(config: StandConfig, name: str) -> OnBus | None:
+    settings = getattr(config, _KEYS.get(name, name), None)
+    return settings if isinstance(settings, OnBus) else None
+
+
 async def _registers(assembly: Assembly, name: str) -> Done:
     """Every point of the unit's register map, read one by one; what cannot be read says why."""
-    key = _KEYS.get(name, name)
-    settings = getattr(assembly.config, key, None)
-    if not isinstance(settings, OnBus):
+    settings = _unit_of(assembly.config, name)
+    if settings is None:
         raise ConfigError(f"{name} has no registers; the units on the bus have")
-    found = register_map(key, settings)
+    found = register_map(_KEYS.get(name, name), settings)
     unit = ModbusUnit(name, assembly.bus, found)
     lines: list[str] = []
     data: dict[str, object] = {}

@@ -288,7 +288,10 @@ def device_kinds(assembly: Assembly) -> dict[str, str]:
     return {
         "regulator": "regulator",
         "relays": "relays",
+        **({} if devices.heat_module is None else {"heat_module": "output"}),
         "thermometers": "thermometers",
+        **({} if devices.inputs is None else {"inputs": "contacts"}),
+        **({} if devices.imager is None else {"imager": "imager"}),
         **({} if assembly.config.flap is None else {"flap": "flap"}),
         **dict.fromkeys(devices.probes, "thermometers"),
         **dict.fromkeys(devices.axes, "axis"),

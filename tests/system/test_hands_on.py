@@ -30,7 +30,10 @@ def tell(tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., S
 
 
 def test_devices_are_told_things_by_hand_and_left_safe(tell: Callable[..., Result], tmp_path: Path):
-    assert [each["name"] for each in json.loads(tell().stdout)][:2] == ["regulator", "relays"]
+    devices = {each["name"]: [verb["verb"] for verb in each["verbs"]] for each in json.loads(tell().stdout)}
+    assert list(devices)[:2] == ["regulator", "relays"]
+    assert (devices["thermometers"], devices["flap"]) == (["read", "registers"], ["read", "open", "close"])
+    assert "grab" in devices["camera"]
     readings = {each["channel"]: each["value"] for each in json.loads(tell("thermometers", "read").stdout)}
     assert readings["thermometers.air"] == pytest.approx(24, abs=0.5)
     assert json.loads(tell("relays", "registers").stdout)["relay_0"] == {"raw": 0, "value": 0.0}
@@ -49,6 +52,7 @@ def test_what_is_not_done_by_hand_is_said(tell: Callable[..., Result]):
         (("regulator", "set", "setpoint_degC=30"), "heat needs a recording and a guard"),
         (("linear", "move", "position=500"), "outside the limits"),
         (("linear", "registers"), "linear has no registers"),
+        (("linear", "mvoe", "position=1"), "linear does not know mvoe; it takes read, move, stop, home"),
         (("lid", "open"), "this stand has no device lid; there are regulator"),
     ):
         done = tell(*words)

@@ -21,6 +21,7 @@ from recording.reading.session import Session
 from stand.assembly import assemble
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, packaged
+from stand.daemon.hands_on import known_devices
 from stand.estimating.absent import absences
 from stand.running.order import Order, check_plan
 from stand.running.run import run_virtual
@@ -240,6 +241,10 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
     assert [device is not None for device in (devices.heat_module, devices.inputs, devices.imager)] == [
         name in data for name in ("heat_module", "inputs", "imager")
     ]
+    assert {each.name for each in known_devices(config)} >= {
+        *(name for name in ("flap", "heat_module", "inputs", "imager") if name in data),
+        *(name for key in ("axes", "cameras", "probes") for name in data.get(key, {})),
+    }
     channels = laboratory_of(config, virtual=True, seed=1)["thermometer_channels"]
     assert channels == {name: each.channel for name, each in config.sensors.items()}
     assert len(config.sensors) == len(data["thermometers"])
