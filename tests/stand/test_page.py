@@ -11,7 +11,7 @@ from foundation.clock import NS_PER_S
 from foundation.documents import parse_document
 from stand.config.recipe import Recipe
 from stand.config.stand_config import packaged
-from stand.gate import OPERATOR
+from stand.gate import NOT_RECORDED, OPERATOR
 from tests.stand.browser import DESKTOP, PHONE, a_page, browser, needs_chromium
 from tests.stand.page_desk import a_night, frame_of, free_port, target_image
 
@@ -119,6 +119,9 @@ async def test_pause_and_continue_make_the_round(night):
         await page.locator("main").get_by_role("button", name="Continue").click()
         await page.locator("#phase", has_text="Running").wait_for()
         assert [verb for _, verb, _ in night.orders] == ["pause", "continue"]
+        night.gate.hold(NOT_RECORDED)
+        await page.get_by_text("The run is held: the disk takes no telemetry").wait_for()
+        await page.get_by_text("It goes on when the disk takes what waits").wait_for()
 
 
 async def test_stop_is_immediate_and_asks_nothing(night):

@@ -12,6 +12,7 @@ import pytest
 import pytest_asyncio
 
 from foundation.items import Batch, Event, StepMark, StepState
+from stand.gate import IN_WORDS
 from stand.serving.page_room import PAGE
 from tests.recording.recorded import half_second, record
 from tests.stand.page_desk import TARGET, a_night, frame_of, free_port, target_image
@@ -68,6 +69,11 @@ async def test_the_page_is_whole_and_lets_nothing_in_from_elsewhere(night):
     assert all("http://" not in path.read_text().replace("http://www.w3.org/2000/svg", "") for path in own)
     assert all("https://" not in path.read_text() for path in own)
     assert all("innerHTML" not in path.read_text() for path in own)
+
+
+def test_each_reason_to_hold_has_its_words():
+    text = (PAGE / "notices.js").read_text("utf-8")
+    assert [reason for reason in IN_WORDS if f"{reason}: " not in text] == []
 
 
 @pytest.mark.parametrize("name", ["../page_room.py", "..%2Fpage_room.py", "%2e%2e%2fdesk.py", "nothing.js", ".", "%00"])

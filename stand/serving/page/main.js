@@ -60,7 +60,7 @@ function lost() {
   document.body.classList.add("lost");
   at("phase").dataset.phase = "lost";
   say(at("phase"), PHASE.lost);
-  const since = app.state ? `What is shown is of ${clock(app.now_s(), true)}. ` : "";
+  const since = app.state ? `What is shown is of ${clock(seconds(app.state.now_ns, app.state.utc_offset_ns), true)}. ` : "";
   notices.lost(`${since}Trying again. The stand guards itself; to stop it now, press STOP or its emergency stop.`);
 }
 

@@ -3,7 +3,16 @@ import { command } from "./api.js";
 import { temperatures, look_of } from "./channels.js";
 import { clock, day_clock, fill, h, number, say, seconds, unit_of, words } from "./dom.js";
 
-const REASON = { operator: "paused by an operator", interlock: "a fault has tripped", recording: "the recording does not keep up", disk: "the disk" };
+// What holds a run (stand/gate.py), and what ends that by itself.
+const REASON = {
+  operator: "paused by an operator", interlock: "a fault has tripped", camera_lost: "a camera does not answer",
+  disk_low: "the disk takes no frames", not_recorded: "the disk takes no telemetry", stopping: "the run is being ended",
+};
+const ENDS = {
+  camera_lost: "It goes on when the camera answers: look at its cable and supply.",
+  disk_low: "It goes on when there is room: stand session archive copies what is finished elsewhere.",
+  not_recorded: "It goes on when the disk takes what waits: see that it is there, has room and answers.",
+};
 export const reason = (name) => REASON[name] ?? words(name);
 
 export class Notices {
@@ -84,8 +93,9 @@ export class Notices {
     const answer = h("p", { class: "answer", role: "status" });
     const is_mine = state.reasons.includes("operator");
     const button = h("button", { type: "button", class: "main", onclick: () => command(answer, "continue", "POST", "/run/continue") }, "Continue");
-    return { element: h("section", { class: "notice warning" }, h("h2", {}, "The run is held"),
-      h("p", {}, `${state.reasons.map(reason).join("; ")}. ${state.setpoint_degC === null ? "The chamber is stopped." : "The chamber keeps its set-point."}`), is_mine ? h("div", { class: "row" }, button) : null, answer) };
+    const chamber = state.setpoint_degC === null ? "The chamber is stopped." : "The chamber keeps its set-point.";
+    return { element: h("section", { class: "notice warning" }, h("h2", {}, `The run is held: ${state.reasons.map(reason).join("; ")}`),
+      h("p", {}, [...state.reasons.map((name) => ENDS[name]), chamber].filter(Boolean).join(" ")), is_mine ? h("div", { class: "row" }, button) : null, answer) };
   }
 }
 

@@ -48,7 +48,8 @@ export class Plan {
     const first = this.steps.findIndex((step) => step.standing === "waiting" && this.steps.slice(step.index).every((later) => later.standing === "waiting"));
     if (first < 0) return tell(this.answer, "no step is to come that was not begun", true);
     const from_index = this.steps[first].index;
-    const text = h("textarea", { rows: 14, "aria-label": "Steps to come, one a line", spellcheck: "false", class: "wide" });
+    const rows = Math.min(14, Math.max(5, this.steps.length - first + 1));
+    const text = h("textarea", { rows, "aria-label": "Steps to come, one a line", spellcheck: "false", class: "wide" });
     text.value = this.steps.slice(first).map(({ kind, parameters }) => JSON.stringify({ kind, parameters })).join("\n");
     const done = () => fill(this.asks);
     const replace = async () => {
@@ -59,7 +60,7 @@ export class Plan {
       }
       if (await command(this.answer, "edit the plan", "PUT", "/run/plan", { from_index, steps })) { done(); this.refresh(); }
     };
-    fill(this.asks, h("div", { class: "ask" }, h("p", {}, `Steps from number ${from_index + 1} on, one a line. The stand checks them all before it takes any.`), text,
+    fill(this.asks, h("div", { class: "ask" }, h("p", {}, `Steps from number ${from_index + 1} on, one a line, in JSON: change, remove, move or add lines. The stand checks them all before it takes any.`), text,
       h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: replace }, "Replace them"), h("button", { type: "button", onclick: done }, "Leave them"))));
     text.focus();
   }
