@@ -71,7 +71,7 @@ async def test_the_page_is_whole_and_lets_nothing_in_from_elsewhere(night):
     assert all("innerHTML" not in path.read_text() for path in own)
 
 
-def test_each_reason_to_hold_has_its_words():
+async def test_each_reason_to_hold_has_its_words():
     text = (PAGE / "notices.js").read_text("utf-8")
     assert [reason for reason in IN_WORDS if f"{reason}: " not in text] == []
 
