@@ -10,19 +10,19 @@ from typing import Protocol, cast
 import usb.backend
 
 from drivers.devices.absent_devices import NoFlap, NoRelays
-from drivers.devices.cameras_by_protocol import make_camera
-from drivers.devices.climate_chamber import ClimateChamber
-from drivers.devices.flap import Flap, FlapSettings
-from drivers.devices.heat_module import HeatModule
-from drivers.devices.heat_pulses import HeatPulses
+from drivers.devices.cameras.cameras_by_protocol import make_camera
+from drivers.devices.chambers.climate_chamber import ClimateChamber
+from drivers.devices.imager.thermal_imager import ThermalImager
 from drivers.devices.inputs import Inputs
+from drivers.devices.motion.flap import Flap, FlapSettings
+from drivers.devices.motion.stage import Axis
 from drivers.devices.probes import Probe
 from drivers.devices.protocols import Controller, Sensor, Shutter, Switches
-from drivers.devices.regulator import Regulator
+from drivers.devices.regulators.heat_module import HeatModule
+from drivers.devices.regulators.heat_pulses import HeatPulses
+from drivers.devices.regulators.regulator import Regulator
+from drivers.devices.regulators.software_regulator import SoftwareRegulator, SoftwareRegulatorSettings
 from drivers.devices.relays import Relays, RelaysSettings
-from drivers.devices.software_regulator import SoftwareRegulator, SoftwareRegulatorSettings
-from drivers.devices.stage import Axis
-from drivers.devices.thermal_imager import ThermalImager
 from drivers.devices.thermometers import SeveralModules, Thermometers
 from drivers.settings import EquilibriumSettings, OnBus
 from drivers.wires.bus import Bus

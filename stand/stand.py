@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from drivers.devices.heat_module import HeatModule
+from drivers.devices.imager.thermal_imager import ThermalImager
 from drivers.devices.inputs import Inputs
+from drivers.devices.motion.stage import Axis
 from drivers.devices.probes import Probe
 from drivers.devices.protocols import Actuator, Camera, Controller, Shutter, Switches
-from drivers.devices.stage import Axis
-from drivers.devices.thermal_imager import ThermalImager
+from drivers.devices.regulators.heat_module import HeatModule
 from drivers.devices.thermometers import SeveralModules, Thermometers
 from foundation.clock import Clock
 from foundation.hub import Hub

@@ -8,9 +8,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.devices.climate_chamber import ClimateChamber
+from drivers.devices.chambers.climate_chamber import ClimateChamber
 from drivers.devices.protocols import Controller, Switches
-from drivers.devices.software_regulator import SoftwareRegulator
+from drivers.devices.regulators.software_regulator import SoftwareRegulator
 from foundation.clock import Clock, boot_of, seconds_ns
 from foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied
 from foundation.hub import Hub

@@ -23,8 +23,8 @@ from stand.commissioning.finding import Finding, worst
 from stand.commissioning.genicam_rehearsal import rehearse
 from stand.commissioning.record import Record
 from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.running.opening.stop import Interrupted
 from stand.running.order import register_texts
-from stand.running.stop import Interrupted
 
 app = App()
 

@@ -21,7 +21,7 @@ from stand.queueing import queue
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_run import conclude, run_entry
 from stand.queueing.queue_work import Notes, work
-from stand.running.stop import Interrupted
+from stand.running.opening.stop import Interrupted
 from stand.serving.desk import QueuedRun
 
 app = App(

@@ -26,11 +26,11 @@ from stand.config.checked import load_checked
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.learned import learn
 from stand.estimating.run_estimate import existing, price_night, small_disk
+from stand.running.opening.stop import Interrupted
 from stand.running.order import Order, load_order
 from stand.running.resume import interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
-from stand.running.stop import Interrupted
 from stand.serving.client import Server
 from stand.watching.live import followed
 

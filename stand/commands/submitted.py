@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from foundation.documents import read_document
 from foundation.errors import ConfigError, SessionError, StandError
 from stand.config.stand_config import StandConfig
-from stand.running.claim import daemon_pid
+from stand.running.opening.claim import daemon_pid
+from stand.running.opening.stop import Interrupted
 from stand.running.order import Order
-from stand.running.stop import Interrupted
 from stand.serving.client import API, Server
 from stand.serving.desk import QueuedRun, StandState
 from stand.serving.presence import living

@@ -19,8 +19,8 @@ from foundation.errors import DeviceError
 from foundation.hub import Hub
 from stand.assembly import Assembly, assemble, register_map
 from stand.config.stand_config import StandConfig
-from stand.running.claim import claimed
-from stand.running.house import close_devices
+from stand.running.opening.claim import claimed
+from stand.running.opening.house import close_devices
 
 COMMAND = "stand queue add"
 _CAMERA_WAIT_S = 1.0  # for its answer to GVCP's discovery

@@ -23,9 +23,9 @@ from stand.commissioning.finding import Finding
 from stand.commissioning.links import Links
 from stand.commissioning.moves import Moves
 from stand.config.stand_config import StandConfig
-from stand.running.claim import claimed
-from stand.running.house import close_devices, made_safe
-from stand.running.stop import Stop
+from stand.running.opening.claim import claimed
+from stand.running.opening.house import close_devices, made_safe
+from stand.running.opening.stop import Stop
 
 COMMAND = "stand check"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.devices.camera_gige import Camera
-from drivers.devices.camera_gige import Settings as GigeSettings
+from drivers.devices.cameras.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Settings as GigeSettings
 from foundation.clock import WallClock
 from foundation.errors import DeviceError
 from stand.config.simulation import SimulatedCamera

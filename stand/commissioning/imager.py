@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.devices.radiometric_jpeg import NotRadiometric, RadiometricImage, parse
-from drivers.devices.radiometry import temperatures_degC
-from drivers.devices.thermal_imager import ThermalImagerSettings
+from drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, parse
+from drivers.devices.imager.radiometry import temperatures_degC
+from drivers.devices.imager.thermal_imager import ThermalImagerSettings
 from stand.commissioning.finding import Finding
 
 _NAME = "imager"

@@ -11,8 +11,8 @@ from dataclasses import asdict, is_dataclass
 from typing import Any, cast
 
 from drivers.devices.protocols import Camera, Device, Sensor
+from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from drivers.devices.relays import CAMERA_POWER, HEAT
-from drivers.devices.software_regulator import SoftwareRegulatorSettings
 from drivers.settings import OnBus
 from foundation.errors import DeviceError, StandError, Unreachable
 from foundation.readings import Quality, Reading

@@ -13,17 +13,17 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
-from drivers.devices.cameras_by_protocol import AnyCameraSettings
-from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
-from drivers.devices.flap import FlapSettings
-from drivers.devices.heat_module import HeatModuleSettings
+from drivers.devices.cameras.cameras_by_protocol import AnyCameraSettings
+from drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
+from drivers.devices.imager.thermal_imager import ThermalImagerSettings
 from drivers.devices.inputs import InputsSettings
-from drivers.devices.pid import split
+from drivers.devices.motion.flap import FlapSettings
+from drivers.devices.motion.stage import AxisSettings
 from drivers.devices.probes import ProbeSettings
+from drivers.devices.regulators.heat_module import HeatModuleSettings
+from drivers.devices.regulators.pid import split
+from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from drivers.devices.relays import HEAT, RelaysSettings
-from drivers.devices.software_regulator import SoftwareRegulatorSettings
-from drivers.devices.stage import AxisSettings
-from drivers.devices.thermal_imager import ThermalImagerSettings
 from drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings, by_channel
 from drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
 from drivers.wires.bus import BusSettings

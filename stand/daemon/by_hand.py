@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from pydantic import JsonValue
 
-from drivers.devices.software_regulator import SoftwareRegulator
+from drivers.devices.regulators.software_regulator import SoftwareRegulator
 from experiments.steps import MoveTo, SetTemperature, Step, number_steps
 from foundation.errors import ConfigError, DeviceError
 from foundation.items import Batch

@@ -31,8 +31,8 @@ from stand.fault import Fault
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
-from stand.running.house import House
-from stand.running.stop import STOPPED, Interrupted, catch_signals
+from stand.running.opening.house import House
+from stand.running.opening.stop import STOPPED, Interrupted, catch_signals
 from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 

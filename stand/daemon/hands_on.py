@@ -27,10 +27,10 @@ from recording.format.images import encode_png
 from stand.assembly import Assembly, assemble, register_map
 from stand.config.stand_config import StandConfig
 from stand.daemon.by_hand import ByHand
-from stand.running.claim import claimed
-from stand.running.house import close_devices, made_safe
+from stand.running.opening.claim import claimed
+from stand.running.opening.house import close_devices, made_safe
+from stand.running.opening.stop import Stop
 from stand.running.run_desk import device_kinds
-from stand.running.stop import Stop
 from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb
 
 COMMAND = "stand device"

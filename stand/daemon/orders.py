@@ -31,14 +31,14 @@ from stand.queueing.queue import Asked, order_of
 from stand.queueing.queue_file import Entry, Queue, State, worked_on
 from stand.queueing.queue_run import Watch, interruption_of, is_complete
 from stand.queueing.queue_work import Halt, Notes, Stopped
+from stand.running.executing.settling_watch import load_for
 from stand.running.guest import Job
-from stand.running.house import House
+from stand.running.opening.house import House
+from stand.running.opening.stop import Interrupted, Stop
 from stand.running.order import Order, check_plan, parse_order
 from stand.running.resume import Interruption, repaired
 from stand.running.run import run_in
 from stand.running.said import Said, keep
-from stand.running.settling_watch import load_for
-from stand.running.stop import Interrupted, Stop
 from stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended

@@ -23,10 +23,10 @@ from stand.daemon.daemon_file import KeptFile, kept_in
 from stand.daemon.house_record import HouseRecord
 from stand.daemon.orders import Orders
 from stand.daemon.reports import Reports
-from stand.running.claim import claimed
-from stand.running.clock_watch import ClockWatch
-from stand.running.house import opened
-from stand.running.stop import Stop
+from stand.running.opening.claim import claimed
+from stand.running.opening.clock_watch import ClockWatch
+from stand.running.opening.house import opened
+from stand.running.opening.stop import Stop
 from stand.serving.alerts import alerting
 
 # What answers the clients of the stand's desk while inside.

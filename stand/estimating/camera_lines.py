@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.devices.camera_gige import Settings as GigeSettings
+from drivers.devices.cameras.camera_gige import Settings as GigeSettings
 from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
 from drivers.wires.camera_settings import frame_bytes
 from stand.config.stand_config import StandConfig

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from drivers.devices.stage import AxisSettings
-from drivers.devices.stage_profiles import StageProfile
+from drivers.devices.motion.stage import AxisSettings
+from drivers.devices.motion.stage_profiles import StageProfile
 from experiments.steps import (
     Capture,
     CheckHome,

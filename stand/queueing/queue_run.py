@@ -15,12 +15,12 @@ from stand.estimating.run_estimate import price_night
 from stand.queueing.queue import order_of
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Halt, Notes
-from stand.running.entries import Ended
-from stand.running.journal import Journal
+from stand.running.memory.entries import Ended
+from stand.running.memory.journal import Journal
+from stand.running.opening.stop import Interrupted
 from stand.running.resume import Interruption, interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.session_report import NotReported, check_reportable, report_session
-from stand.running.stop import Interrupted
 from stand.watching.live import followed
 
 

@@ -27,21 +27,21 @@ from stand.assembly import Assembly
 from stand.estimating.run_estimate import price_night
 from stand.fault import Fault
 from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
-from stand.running.camera_gap import OffsetGap, OffsetWatch, doubt
-from stand.running.deciding import Decider
-from stand.running.entries import Cleared, Ended, Gap, Written
-from stand.running.executor import Executor
-from stand.running.fold import fold
-from stand.running.holds import end_endless_holds
-from stand.running.house import House
-from stand.running.journal import Journal, Logbook
+from stand.running.executing.camera_gap import OffsetGap, OffsetWatch, doubt
+from stand.running.executing.deciding import Decider
+from stand.running.executing.executor import Executor
+from stand.running.executing.settling_watch import SettlingWatch, load_for
+from stand.running.memory.entries import Cleared, Ended, Gap, Written
+from stand.running.memory.fold import fold
+from stand.running.memory.journal import Journal, Logbook
+from stand.running.opening.holds import end_endless_holds
+from stand.running.opening.house import House
+from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
+from stand.running.opening.to_ambient import to_ambient
 from stand.running.order import Order, check_plan
 from stand.running.resume import Interruption, begun, plan_hash
 from stand.running.run_desk import RunDesk
-from stand.running.settling_watch import SettlingWatch, load_for
 from stand.running.status import StatusBoard
-from stand.running.stop import STOPPED_BY_OPERATOR, Stop
-from stand.running.to_ambient import to_ambient
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import preload, serve
 from stand.serving.eta_slip import EtaSlip

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from drivers.devices.flap import FlapSettings
+from drivers.devices.motion.flap import FlapSettings
 from drivers.settings import CameraSettings, OnBus
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig, load_config, packaged

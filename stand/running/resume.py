@@ -3,7 +3,7 @@
 The journal says what was done, the recording what it produced: a step whose end is recorded is done, and a frame
 counts when its image and its description are both on the disk. What only the recording proves is put between the
 journal's entries, and all of them are folded into the state from which the run is resumed. Recipe, seed and target are
-those of the session, not today's files; the stand is this one (stand.running.own_stand).
+those of the session, not today's files; the stand is this one (stand.running.opening.own_stand).
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from recording.reading.session import Session
 from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
 from recording.writing.recorder_settings import SessionInfo
 from stand.config.stand_config import StandConfig
-from stand.running.actions import cold_start
-from stand.running.camera_gap import CameraBefore, camera_before
-from stand.running.entries import Again, Begun, Ended, Entry, Step, Taken, Tripped, Written, change_of
-from stand.running.fold import after, fold
-from stand.running.journal import JOURNAL_NAME, Journal
+from stand.running.executing.actions import cold_start
+from stand.running.executing.camera_gap import CameraBefore, camera_before
+from stand.running.memory.entries import Again, Begun, Ended, Entry, Step, Taken, Tripped, Written, change_of
+from stand.running.memory.fold import after, fold
+from stand.running.memory.journal import JOURNAL_NAME, Journal
+from stand.running.memory.state import RunState
+from stand.running.opening.own_stand import Difference, default_stand, on_this_stand
 from stand.running.order import Order, parse_order
-from stand.running.own_stand import Difference, default_stand, on_this_stand
-from stand.running.state import RunState
 
 
 def begun(order: Order, run: str, time_ns: int, seed: int | None) -> Begun:

@@ -20,17 +20,17 @@ from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recor
 from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly, assemble
 from stand.config.safe_ranges import accepted_text
-from stand.running.claim import claimed
-from stand.running.clock_watch import ClockWatch
 from stand.running.guest import Guest, Job
-from stand.running.house import House, Time, opened
-from stand.running.one_cpu import one_cpu
+from stand.running.opening.claim import claimed
+from stand.running.opening.clock_watch import ClockWatch
+from stand.running.opening.house import House, Time, opened
+from stand.running.opening.one_cpu import one_cpu
+from stand.running.opening.stop import Interrupted, Stop
+from stand.running.opening.temperature_check import check_temperature
 from stand.running.order import Order
 from stand.running.rehearsal import rehearsed
 from stand.running.resume import Interruption, is_of_virtual_time
 from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory, tell_identities
-from stand.running.stop import Interrupted, Stop
-from stand.running.temperature_check import check_temperature
 from stand.serving.alerts import alerting
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 

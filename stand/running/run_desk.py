@@ -17,13 +17,13 @@ from recording.writing.disk import DiskCalls
 from stand.assembly import Assembly
 from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR, Phase
-from stand.running.executor import Executor
-from stand.running.journal import Logbook
+from stand.running.executing.executor import Executor
+from stand.running.memory.journal import Logbook
+from stand.running.memory.state import RunState
+from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
 from stand.running.said import Said, keep
 from stand.running.simulated_faults import break_or_mend, simulated_faults
-from stand.running.state import RunState
 from stand.running.status import STATES
-from stand.running.stop import STOPPED_BY_OPERATOR, Stop
 from stand.serving.desk import (
     Conflict,
     DeviceState,

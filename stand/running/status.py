@@ -14,8 +14,8 @@ from stand.estimating.eta import Eta
 from stand.estimating.run_estimate import Night
 from stand.fault import Fault
 from stand.gate import Gate, Phase
-from stand.running.state import RunState
-from stand.running.stop import STOPPED_BY_OPERATOR, Stop
+from stand.running.memory.state import RunState
+from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
 from stand.serving.desk import RunStatus
 
 State = Literal["running", "held", "stopping"]

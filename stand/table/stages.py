@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.devices.stage import Axis
+from drivers.devices.motion.stage import Axis
 from foundation.clock import Clock
 from foundation.errors import ConfigError
 from foundation.hub import Hub

@@ -32,7 +32,7 @@ from stand.config.stand_config import StandConfig, packaged
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Watch, over_temperature
 from stand.imaging.camera_supply import SupplyLimits
-from stand.running.stop import Interrupted, Stop
+from stand.running.opening.stop import Interrupted, Stop
 from stand.simulator import ControlSocket, Simulator, laboratory_of
 from stand.stand import Devices, Stand
 from tests.bench.figures import Figure, at_most, progress

@@ -12,7 +12,7 @@ import math
 import time
 from pathlib import Path
 
-from drivers.devices.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Camera
 from drivers.framing.aravis_library import library
 from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock

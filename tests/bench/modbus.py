@@ -15,7 +15,7 @@ from pathlib import Path
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.client.base import ModbusBaseSyncClient
 
-from drivers.devices.regulator import Regulator
+from drivers.devices.regulators.regulator import Regulator
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.modbus_unit import Block, plan_blocks
 from drivers.wires.registers import RegisterMap, load_register_map

@@ -21,10 +21,10 @@ from drivers.framing.aravis_library import library
 from foundation.errors import StandError
 from stand.assembly import Assembly
 from stand.config.stand_config import StandConfig
-from stand.running.fold import fold
-from stand.running.journal import Logbook
+from stand.running.memory.fold import fold
+from stand.running.memory.journal import Logbook
+from stand.running.opening.stop import Interrupted, Stop
 from stand.running.run_desk import RunDesk
-from stand.running.stop import Interrupted, Stop
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve
 from stand.serving.client import Server, server_of

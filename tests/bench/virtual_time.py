@@ -18,7 +18,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import StandError
 from foundation.hub import Hub
 from foundation.items import Item, StepMark, StepState
-from stand.running.one_cpu import one_cpu
+from stand.running.opening.one_cpu import one_cpu
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from stand.simulator import ControlSocket, Simulator, laboratory_of

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-from drivers.devices.stage import Axis, AxisSettings
+from drivers.devices.motion.stage import Axis, AxisSettings
 from drivers.wires.link import SerialSettings, open_link
 from drivers.wires.ximc_client import XimcClient
 from foundation.clock import WallClock

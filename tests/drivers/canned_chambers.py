@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from drivers.devices import chamber_ascii2, chamber_cts, chamber_espec
-from drivers.devices.chamber_settings import Ascii2Settings, CtsSettings, EspecSettings
+from drivers.devices.chambers import chamber_ascii2, chamber_cts, chamber_espec
+from drivers.devices.chambers.chamber_settings import Ascii2Settings, CtsSettings, EspecSettings
 from drivers.wires.line_client import LineClient
 from foundation.errors import GarbledReply, Refused, Unreachable
 from tests.drivers.canned_line import Feed, Line, Parser

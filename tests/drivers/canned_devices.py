@@ -9,7 +9,7 @@ from typing import Any
 
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
-from drivers.devices.flap import Flap, FlapSettings
+from drivers.devices.motion.flap import Flap, FlapSettings
 from drivers.wires.modbus_client import BusSettings, ModbusClient, WireFault
 from drivers.wires.ximc_client import XimcClient
 from foundation.clock import VirtualClock

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.devices.radiometric_jpeg import NotRadiometric, is_whole, parse
-from drivers.devices.radiometry import temperatures_degC
+from drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
+from drivers.devices.imager.radiometry import temperatures_degC
 from drivers.sim.units.radiometric import Shot, counts_of, jpeg_of
 from tests.drivers.canned_line import Feed, Parser
 

@@ -9,7 +9,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from drivers.devices.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Camera
 from drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from drivers.wires.camera_connection import FrameCount
 from drivers.wires.camera_errors import device_error

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.devices.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Camera
 from drivers.framing.aravis_library import DEVICE_ERRORS, AravisError
 from drivers.sim.gige.camera import FakeCamera
 from drivers.sim.gige.camera_registers import Registers

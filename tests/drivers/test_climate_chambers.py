@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from drivers.devices.chamber_ascii2 import number, parse
-from drivers.devices.chamber_cts import framed, unframed
-from drivers.devices.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
-from drivers.devices.climate_chamber import ClimateChamber
+from drivers.devices.chambers.chamber_ascii2 import number, parse
+from drivers.devices.chambers.chamber_cts import framed, unframed
+from drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
+from drivers.devices.chambers.climate_chamber import ClimateChamber
 from drivers.sim.faults import LinkFaults
 from drivers.sim.physics.plant import Plant, PlantSpec
 from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss

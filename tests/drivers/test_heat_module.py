@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager, suppress
 import pytest
 from pydantic import ValidationError
 
-from drivers.devices.heat_module import HeatModule, HeatModuleSettings
+from drivers.devices.regulators.heat_module import HeatModule, HeatModuleSettings
 from drivers.sim.faults import LinkFaults
 from drivers.sim.physics.plant import Plant, PlantSpec
 from drivers.sim.units import heat_module as fake_module

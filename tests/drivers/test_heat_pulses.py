@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.devices.heat_pulses import HeatPulses, PulsesSettings, pulse_s
+from drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings, pulse_s
 from foundation.clock import FollowedClock, seconds_ns
 from foundation.errors import DeviceFault, Refused
 from foundation.readings import Reading

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivers.devices.regulator import Regulator
+from drivers.devices.regulators.regulator import Regulator
 from drivers.sim.faults import LinkFaults
 from drivers.sim.physics.plant import Plant, PlantSpec
 from drivers.sim.units.modbus import TcpEngine

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import TransferFunction, lsim
 
-from drivers.devices import pid
-from drivers.devices.pid import Law
+from drivers.devices.regulators import pid
+from drivers.devices.regulators.pid import Law
 
 PLAIN = Law(
     gain_percent_per_K=10,

@@ -11,8 +11,8 @@ import flyr
 import numpy as np
 import pytest
 
-from drivers.devices.radiometric_jpeg import NotRadiometric, is_whole, parse
-from drivers.devices.radiometry import Air, temperatures_degC
+from drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
+from drivers.devices.imager.radiometry import Air, temperatures_degC
 from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 
 SCENE_DEGC = np.linspace(-15.0, 75.0, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)

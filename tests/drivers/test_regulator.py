@@ -10,7 +10,7 @@ import pytest
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.devices.regulator import Regulator
+from drivers.devices.regulators.regulator import Regulator
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.registers import load_register_map
 from foundation.clock import WallClock, seconds_ns

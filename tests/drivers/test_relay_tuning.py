@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from drivers.devices import relay_tuning
-from drivers.devices.pid import Law
-from drivers.devices.relay_tuning import Tuning, TuningSettings
+from drivers.devices.regulators import relay_tuning
+from drivers.devices.regulators.pid import Law
+from drivers.devices.regulators.relay_tuning import Tuning, TuningSettings
 from foundation.clock import seconds_ns
 
 SETTINGS, LAW = TuningSettings(), Law()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.devices.regulator import Regulator
+from drivers.devices.regulators.regulator import Regulator
 from drivers.sim.faults import LinkFaults
 from drivers.sim.physics.plant import Plant, PlantSpec
 from drivers.sim.units.modbus import TcpEngine

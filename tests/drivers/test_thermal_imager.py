@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.thermal_imager import SpotSettings, ThermalImager, ThermalImagerSettings
+from drivers.devices.imager.thermal_imager import SpotSettings, ThermalImager, ThermalImagerSettings
 from drivers.sim.units.thermal_imager import FakeThermalImager
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.items import Event, Item, Original

@@ -17,16 +17,16 @@ from markers.target import Target
 from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
 from stand.imaging.equilibrium import LOST, CameraEquilibrium
 from stand.interlock import Interlocked
-from stand.running.camera_gap import OffsetWatch
-from stand.running.deciding import Decider, fixed_plan
-from stand.running.entries import Gap
-from stand.running.executor import Executor
-from stand.running.fold import fold
-from stand.running.holds import keep_shut_in_holds
-from stand.running.journal import JOURNAL_NAME, Journal, Logbook
+from stand.running.executing.camera_gap import OffsetWatch
+from stand.running.executing.deciding import Decider, fixed_plan
+from stand.running.executing.executor import Executor
+from stand.running.executing.settling_watch import SettlingWatch
+from stand.running.memory.entries import Gap
+from stand.running.memory.fold import fold
+from stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
+from stand.running.opening.holds import keep_shut_in_holds
+from stand.running.opening.stop import Stop
 from stand.running.resume import with_recorded
-from stand.running.settling_watch import SettlingWatch
-from stand.running.stop import Stop
 from stand.safety import Safety
 from stand.stand import Stand
 

@@ -52,8 +52,8 @@ class Camera:
 USED = """
 import asyncio, sys
 from pathlib import Path
-import drivers.devices
-drivers.devices.__path__.append(sys.argv[1])
+import drivers.devices.cameras
+drivers.devices.cameras.__path__.append(sys.argv[1])
 from foundation.clock import VirtualClock
 from foundation.errors import ConfigError
 from foundation.documents import load_document
@@ -88,7 +88,7 @@ def used(tmp_path: Path, side: dict[str, object]) -> "subprocess.CompletedProces
 def test_a_second_camera_protocol_is_one_file(tmp_path: Path):
     done = used(tmp_path, {"protocol": "still", "address": "nowhere", "shade_DN": 9, "has_temperature": False})
     assert done.stdout.splitlines() == [
-        "[('camera', 'drivers.devices.camera_gige'), ('side', 'drivers.devices.camera_still')]",
+        "[('camera', 'drivers.devices.cameras.camera_gige'), ('side', 'drivers.devices.cameras.camera_still')]",
         "9.0",
     ], done.stderr
 

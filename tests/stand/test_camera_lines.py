@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from drivers.devices.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Camera
 from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
 from experiments.steps import Capture, parameters_of
 from foundation.clock import WallClock

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.devices.thermal_imager import ThermalImagerSettings
+from drivers.devices.imager.thermal_imager import ThermalImagerSettings
 from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 from stand.commissioning.camera_line_check import packet_finding
 from stand.commissioning.imager import imager_finding

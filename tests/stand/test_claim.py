@@ -17,7 +17,7 @@ import yaml
 from foundation.documents import parse_document
 from foundation.errors import InUse, SessionError
 from stand.config.stand_config import StandConfig, packaged
-from stand.running.claim import addresses, claimed
+from stand.running.opening.claim import addresses, claimed
 from tests.sections import change
 
 
@@ -152,7 +152,7 @@ HOLDER = """
 import asyncio, sys
 from pathlib import Path
 from stand.config.stand_config import load_config
-from stand.running.claim import claimed
+from stand.running.opening.claim import claimed
 
 async def run():
     async with claimed(load_config(Path(sys.argv[1])), Path("/their/night")):

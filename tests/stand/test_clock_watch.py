@@ -2,7 +2,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
-from stand.running.clock_watch import HOST_SUSPENDED, ClockWatch
+from stand.running.opening.clock_watch import HOST_SUSPENDED, ClockWatch
 from tests.host import Host
 
 

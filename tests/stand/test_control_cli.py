@@ -17,9 +17,9 @@ from stand.commands.control_cli import app, status_lines
 from stand.config.stand_config import packaged
 from stand.estimating.run_estimate import Night
 from stand.gate import Gate
-from stand.running.state import RunState
+from stand.running.memory.state import RunState
+from stand.running.opening.stop import Stop
 from stand.running.status import StatusBoard
-from stand.running.stop import Stop
 from stand.serving.api.access import user_name
 from stand.serving.client import ask
 from stand.serving.desk import RunStatus

@@ -17,10 +17,10 @@ from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from foundation.clock import NS_PER_S, WallClock
 from foundation.items import Event
 from foundation.readings import Frame
-from stand.running.deciding import Decider
-from stand.running.entries import Edited, read_lines
-from stand.running.fold import fold
-from stand.running.journal import JOURNAL_NAME
+from stand.running.executing.deciding import Decider
+from stand.running.memory.entries import Edited, read_lines
+from stand.running.memory.fold import fold
+from stand.running.memory.journal import JOURNAL_NAME
 from tests.stand.decisions_process import ANSWERS, ASKED
 from tests.stand.small_stand import Life
 

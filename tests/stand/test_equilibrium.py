@@ -13,7 +13,7 @@ from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from stand.imaging.camera_cooling import CameraTemperature
 from stand.imaging.equilibrium import CameraEquilibrium
-from stand.running.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
+from stand.running.executing.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
 
 TIME_CONSTANT_S, RISE_K = 900.0, 20.0
 

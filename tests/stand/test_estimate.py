@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.stage_profiles import PROFILES
+from drivers.devices.motion.stage_profiles import PROFILES
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -38,7 +38,7 @@ from stand.estimating.durations import Situation, expect, move_s
 from stand.estimating.estimate import PricedStep, price, way_back_s
 from stand.estimating.eta import Eta
 from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
-from stand.running.entries import Change, Edited, Extended, Skipped, data_of
+from stand.running.memory.entries import Change, Edited, Extended, Skipped, data_of
 from tests.recording.recorded import record
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from foundation.clock import WallClock
 from foundation.errors import SessionError
-from stand.running.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, encode_line, read_lines
-from stand.running.journal import JOURNAL_NAME, Journal
+from stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, encode_line, read_lines
+from stand.running.memory.journal import JOURNAL_NAME, Journal
 
 ENTRIES = [
     Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),

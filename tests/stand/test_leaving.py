@@ -23,10 +23,10 @@ from stand.daemon.daemon_file import Kept, KeptFile
 from stand.queueing.queue import append
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
-from stand.running.entries import Begun, Ended
-from stand.running.journal import Journal, Logbook
-from stand.running.state import RunState
-from stand.running.stop import STOPPED, Interrupted, Stop
+from stand.running.memory.entries import Begun, Ended
+from stand.running.memory.journal import Journal, Logbook
+from stand.running.memory.state import RunState
+from stand.running.opening.stop import STOPPED, Interrupted, Stop
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", stop_frames_below_bytes=0, alert_below_fraction=0.0)

@@ -14,8 +14,8 @@ from foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Un
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry, working
 from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped, work
+from stand.running.opening.stop import Interrupted
 from stand.running.order import load_order
-from stand.running.stop import Interrupted
 
 ORDER = load_order("warm-up", "simulated")
 

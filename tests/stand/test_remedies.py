@@ -11,8 +11,8 @@ from recording.format.restarts import KIND as RESTARTED
 from recording.format.utc_offsets import CLOCK_STEP
 from recording.reading.contents import PLAN_CHANGED, RUN_END
 from stand.imaging.equilibrium import LOST
-from stand.running.camera_gap import CHANGED
-from stand.running.clock_watch import HOST_SUSPENDED
+from stand.running.executing.camera_gap import CHANGED
+from stand.running.opening.clock_watch import HOST_SUSPENDED
 from stand.serving.alert_book import RUN_FAILED
 from stand.watching.remedies import next_command
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.errors import ConfigError, SessionError
-from stand.running.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
-from stand.running.entries import (
+from stand.running.executing.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
+from stand.running.memory.entries import (
     Again,
     Begun,
     Cleared,
@@ -30,9 +30,9 @@ from stand.running.entries import (
     encode_line,
     read_lines,
 )
-from stand.running.fold import after, fold
+from stand.running.memory.fold import after, fold
+from stand.running.memory.state import RunState
 from stand.running.resume import folded
-from stand.running.state import RunState
 from tests.stand.test_run_table import ID, PLAN, SOAK, S
 
 ids = st.sampled_from([*ID, "unknown"])

@@ -25,7 +25,7 @@ from experiments.steps import (
 )
 from foundation.clock import NS_PER_S
 from stand.gate import INTERLOCK, OPERATOR
-from stand.running.actions import (
+from stand.running.executing.actions import (
     Aim,
     Begin,
     Complete,
@@ -45,7 +45,7 @@ from stand.running.actions import (
     next_due_ns,
     worth_of_soaks,
 )
-from stand.running.entries import (
+from stand.running.memory.entries import (
     Again,
     Cleared,
     Cooled,
@@ -64,8 +64,8 @@ from stand.running.entries import (
     Taken,
     Tripped,
 )
-from stand.running.fold import after, fold
-from stand.running.state import RunState, SetUp
+from stand.running.memory.fold import after, fold
+from stand.running.memory.state import RunState, SetUp
 
 S = NS_PER_S
 FIT = Capture(2, 10.0, 0.1, Role.FIT, 30.0)

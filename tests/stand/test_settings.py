@@ -29,7 +29,8 @@ from stand.config.stand_config import StandConfig, packaged
 
 def modules_of(*packages: ModuleType) -> Iterator[ModuleType]:
     for package in packages:
-        for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+        look = pkgutil.walk_packages if package is drivers.devices else pkgutil.iter_modules
+        for found in look(package.__path__, f"{package.__name__}."):
             yield importlib.import_module(found.name)
 
 

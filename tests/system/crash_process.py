@@ -17,8 +17,8 @@ from recording.writing.disk import Disk
 from recording.writing.recorder import Recorder
 from stand.chamber.compressor import CompressorState, keep
 from stand.queueing.queue_file import changing
-from stand.running.entries import Begun, Dwell
-from stand.running.journal import Journal
+from stand.running.memory.entries import Begun, Dwell
+from stand.running.memory.journal import Journal
 from tests.system.recording_process import INFO, MESSAGES_PER_ROUND, SETTINGS, batches_of, frame_of
 
 SESSION, QUEUE, COMPRESSOR, CONTROL = "session", "runs", "state/compressor.json", "control"

@@ -19,9 +19,9 @@ from foundation.patience import Patience
 from foundation.readings import Frame
 from recording.writing.disk import Disk
 from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
-from stand.running.entries import Begun, Dwell, Ended
-from stand.running.journal import Journal, Logbook
-from stand.running.state import RunState
+from stand.running.memory.entries import Begun, Dwell, Ended
+from stand.running.memory.journal import Journal, Logbook
+from stand.running.memory.state import RunState
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", telemetry_commit_s=0.05, stop_frames_below_bytes=0, alert_below_fraction=0.0)

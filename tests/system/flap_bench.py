@@ -10,7 +10,7 @@ from typing import cast
 
 from usb.core import USBError
 
-from drivers.devices.flap import Flap, FlapSettings
+from drivers.devices.motion.flap import Flap, FlapSettings
 from drivers.sim.motion.flap import MAX_DUTY_FORWARD, FakeFlap
 from drivers.sim.physics.plant import Plant
 from drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from drivers.devices.pid import Law
-from drivers.devices.software_regulator import SoftwareRegulator
+from drivers.devices.regulators.pid import Law
+from drivers.devices.regulators.software_regulator import SoftwareRegulator
 from tests.system.virtual_stand import VirtualStand, bare_config, virtual_stand
 
 Kind = Literal["simulated", "software-regulator"]

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Literal, cast
 
-from drivers.devices.stage import Axis, AxisSettings
+from drivers.devices.motion.stage import Axis, AxisSettings
 from drivers.framing.ximc import encode
 from drivers.sim.faults import LinkFaults
 from drivers.sim.motion.ximc import FakeAxis, XimcEngine

@@ -6,7 +6,7 @@ from collections.abc import AsyncGenerator
 
 import pytest
 
-from drivers.devices.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Camera
 from drivers.sim.gige.camera import FakeCamera
 from drivers.sim.gige.gvsp_sender import StreamSender
 from drivers.wires import camera_connection

@@ -11,8 +11,8 @@ import pytest
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
 from recording.reading.session import Session
-from stand.running.entries import Dwell, Gap, read_lines
-from stand.running.journal import JOURNAL_NAME
+from stand.running.memory.entries import Dwell, Gap, read_lines
+from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis

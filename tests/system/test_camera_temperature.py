@@ -18,8 +18,8 @@ from recording.reading.session import Session
 from stand.commands.command_table import app
 from stand.config.stand_config import load_config, packaged
 from stand.guarding.rules import camera_measured
-from stand.running.entries import Again, Step
-from stand.running.fold import after, fold
+from stand.running.memory.entries import Again, Step
+from stand.running.memory.fold import after, fold
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.devices.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Camera
 from drivers.framing.aravis_library import library
 from drivers.sim.gige.camera import FakeCamera
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
@@ -391,7 +391,7 @@ async def test_while_another_client_controls_the_camera_open_is_refused():
 
 CRASH = f"""
 import asyncio, os
-from drivers.devices.camera_gige import Camera
+from drivers.devices.cameras.camera_gige import Camera
 from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
 asyncio.run(Camera("camera", GigeCameraSettings(address="{ADDRESS}", heartbeat_s=1.5), WallClock()).open())

@@ -19,9 +19,9 @@ from stand.commissioning.commissioning import commission
 from stand.commissioning.finding import Finding
 from stand.config.checked import doubt, load_checked
 from stand.config.stand_config import load_config
-from stand.running.claim import claimed
+from stand.running.opening.claim import claimed
+from stand.running.opening.stop import Interrupted
 from stand.running.order import Order, load_order, register_texts
-from stand.running.stop import Interrupted
 from stand.simulator import ControlSocket, Simulator
 from tests.system.conftest import require_aravis
 

@@ -16,9 +16,9 @@ from foundation.items import Event, Item, StepMark, StepState
 from foundation.readings import Frame
 from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
-from stand.running.actions import cold_start
-from stand.running.entries import Step
-from stand.running.fold import fold
+from stand.running.executing.actions import cold_start
+from stand.running.memory.entries import Step
+from stand.running.memory.fold import fold
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_virtual

@@ -24,7 +24,7 @@ from recording.reading.session import Session
 from recording.repair.salvage import salvage_unfinished
 from stand.chamber.compressor import restored
 from stand.queueing.queue_file import read_queue
-from stand.running.journal import Journal
+from stand.running.memory.journal import Journal
 from tests.system.crash_process import COMPRESSOR, CONTROL, QUEUE, SESSION, journal_entry
 from tests.system.logged_disk import FLUSH, LIMIT_S, MARK, WRITE, Entry, logged_disk, read_log
 from tests.system.recording_process import frame_records, telemetry_records

@@ -20,7 +20,7 @@ from recording.reading.session import Session
 from recording.reading.using import open_whole
 from recording.repair.salvage import salvage_session
 from recording.repair.verify import verify
-from stand.running.entries import Tripped, read_lines
+from stand.running.memory.entries import Tripped, read_lines
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual

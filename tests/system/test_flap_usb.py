@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.devices.flap import Flap
+from drivers.devices.motion.flap import Flap
 from drivers.sim.usb import Stall, TimedOut, UsbServer
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.devices.flap import Flap
+from drivers.devices.motion.flap import Flap
 from drivers.sim.motion.flap import (
     ERROR_FEEDBACK_DISCONNECT,
     ERROR_HARD_OVER_CURRENT,

@@ -16,8 +16,8 @@ from foundation.errors import SessionError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from recording.reading.session import Session
-from stand.running.entries import Cleared, Tripped, read_lines
-from stand.running.journal import JOURNAL_NAME
+from stand.running.memory.entries import Cleared, Tripped, read_lines
+from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_virtual

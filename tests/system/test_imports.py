@@ -41,7 +41,7 @@ def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(recipe: str,
     code = (
         "import stand.running.run\n"
         "from stand.running.order import load_order\n"
-        "from stand.running.settling_watch import load_for\n"
+        "from stand.running.executing.settling_watch import load_for\n"
         f"load_for(load_order({recipe!r}, 'simulated').recipe.plan())"
     )
     assert loaded(code) - {"cv2"} == heavy  # frames are encoded with OpenCV

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from stand.running.entries import Ended, Gap, Written, read_lines
-from stand.running.journal import JOURNAL_NAME
+from stand.running.memory.entries import Ended, Gap, Written, read_lines
+from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon

@@ -10,8 +10,8 @@ from experiments.known import Visit
 from experiments.steps import Capture, Decide
 from foundation.clock import WallClock
 from recording.reading.session import Session
-from stand.running.deciding import MODULE, Decider
-from stand.running.entries import Edited, read_lines
+from stand.running.executing.deciding import MODULE, Decider
+from stand.running.memory.entries import Edited, read_lines
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from tests.system.conftest import WHOLE_SENSOR, require_aravis

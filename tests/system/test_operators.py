@@ -13,8 +13,8 @@ from foundation.errors import SessionError, StandError
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from recording.reading.session import Session
-from stand.running.entries import Held, read_lines
-from stand.running.journal import JOURNAL_NAME
+from stand.running.memory.entries import Held, read_lines
+from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
 from stand.serving.client import ask, ask_status

@@ -7,11 +7,11 @@ from typing import Any, cast
 
 from recording.reading.session import Session
 from stand.assembly import Assembly
-from stand.running.fold import fold
-from stand.running.journal import Logbook
+from stand.running.memory.fold import fold
+from stand.running.memory.journal import Logbook
+from stand.running.opening.stop import Stop
 from stand.running.order import Order
 from stand.running.run_desk import RunDesk
-from stand.running.stop import Stop
 from stand.serving.client import ask
 from stand.serving.desk import Who
 from tests.system.conftest import require_aravis

@@ -15,7 +15,7 @@ from recording.reading.overview import overview
 from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.repair.verify import verify
-from stand.running.executor import Executor
+from stand.running.executing.executor import Executor
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual

@@ -16,7 +16,7 @@ from stand.assembly import assemble
 from stand.commands.queue_cli import app
 from stand.config.stand_config import load_config, packaged
 from stand.queueing.queue import queued
-from stand.running.claim import claimed
+from stand.running.opening.claim import claimed
 from stand.running.order import Order
 from stand.simulator import Simulator
 from tests.addresses import free_port

@@ -20,8 +20,8 @@ from recording.reading.glance import glance
 from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.repair.verify import verify
-from stand.running.entries import Dwell, Gap, Step, encode_line, read_lines
-from stand.running.journal import JOURNAL_NAME
+from stand.running.memory.entries import Dwell, Gap, Step, encode_line, read_lines
+from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import Interruption, interruption
 from stand.running.run import Interrupted, resume, run_virtual

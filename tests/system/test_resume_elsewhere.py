@@ -18,8 +18,8 @@ from recording.reading.session import Session
 from stand.commands.command_table import app
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.queueing.queue_file import QUEUE_NAME
+from stand.running.opening.own_stand import on_this_stand
 from stand.running.order import Order
-from stand.running.own_stand import on_this_stand
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_real, run_virtual
 from tests.sections import change

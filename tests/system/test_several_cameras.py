@@ -15,10 +15,10 @@ from recording.reading.session import Session
 from recording.repair.verify import Files, verify
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.running.opening.stop import Interrupted
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import resume, run_virtual
-from stand.running.stop import Interrupted
 from tests.dialects import DIALECTS
 
 from .conftest import require_aravis

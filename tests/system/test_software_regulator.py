@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivers.devices.pid import Law
-from drivers.devices.software_regulator import SoftwareRegulator
+from drivers.devices.regulators.pid import Law
+from drivers.devices.regulators.software_regulator import SoftwareRegulator
 from foundation.errors import DeviceFault, Occupied, Refused
 from stand.daemon.by_hand import ByHand
 from stand.simulator import ControlSocket, Simulator, laboratory_of

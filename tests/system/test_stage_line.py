@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.camera_gige import Camera
-from drivers.devices.flap import Flap
-from drivers.devices.regulator import Regulator
+from drivers.devices.cameras.camera_gige import Camera
+from drivers.devices.motion.flap import Flap
+from drivers.devices.motion.stage import Axis, AxisSettings
+from drivers.devices.regulators.regulator import Regulator
 from drivers.devices.relays import Relays
-from drivers.devices.stage import Axis, AxisSettings
 from drivers.devices.thermometers import Thermometers
 from drivers.wires.bus import Bus, BusSettings
 from drivers.wires.camera_settings import GigeCameraSettings

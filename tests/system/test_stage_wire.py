@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.stage import AxisSettings
+from drivers.devices.motion.stage import AxisSettings
 from foundation.clock import seconds_ns
 from foundation.errors import DeviceFault, Refused
 from foundation.readings import Quality, Reading

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.cameras_by_protocol import make_camera
+from drivers.devices.cameras.cameras_by_protocol import make_camera
 from foundation.clock import WallClock
 from stand.config.stand_config import load_config
 from tests.stock_camera import ADDRESS, SERIAL

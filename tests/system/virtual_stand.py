@@ -15,8 +15,8 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from stand.assembly import Assembly, assemble
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.house import House, opened
-from stand.running.stop import Stop
+from stand.running.opening.house import House, opened
+from stand.running.opening.stop import Stop
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 from tests.sections import change
 

@@ -1,4 +1,4 @@
-"""Performs what the table of a run says (stand/running/actions.py), and enters the results.
+"""Performs what the table of a run says (stand/running/executing/actions.py), and enters the results.
 
 One loop for a run that continues, was held, tripped, killed or resumed: what it remembers is the logbook's state and
 nothing else. What an action raises ends the run, unless something has undone the set-up meanwhile: then the table says
@@ -42,7 +42,7 @@ from foundation.tasks import cancelled, first_of
 from recording.format.restarts import restarted
 from recording.reading.contents import PLAN_CHANGED
 from stand.interlock import Interlocked
-from stand.running.actions import (
+from stand.running.executing.actions import (
     Action,
     Aim,
     Begin,
@@ -64,9 +64,11 @@ from stand.running.actions import (
     next_action,
     next_due_ns,
 )
-from stand.running.camera_gap import OffsetWatch
-from stand.running.deciding import Decided, change_of_plan, fixed_plan
-from stand.running.entries import (
+from stand.running.executing.camera_gap import OffsetWatch
+from stand.running.executing.deciding import Decided, change_of_plan, fixed_plan
+from stand.running.executing.restoring import restore
+from stand.running.executing.settling_watch import SettlingWatch
+from stand.running.memory.entries import (
     Again,
     Change,
     Cooled,
@@ -81,11 +83,9 @@ from stand.running.entries import (
     data_of,
     edited,
 )
-from stand.running.fold import after, change_text, refusal
-from stand.running.journal import Logbook
-from stand.running.restoring import restore
-from stand.running.settling_watch import SettlingWatch
-from stand.running.state import Plan, RunState, duration_of
+from stand.running.memory.fold import after, change_text, refusal
+from stand.running.memory.journal import Logbook
+from stand.running.memory.state import Plan, RunState, duration_of
 from stand.stand import Stand
 
 _JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most

@@ -1,8 +1,8 @@
 """What happens to a run: published on the hub, folded into its state, and kept in `journal.jsonl`, from which a
 killed run is resumed.
 
-Append-only, one entry a line (stand/running/entries.py). A line is on the disk (fdatasync) when `write` returns. What
-follows the last sound line is cut off before anything is appended. A damaged line before it stays where it is, and the
+Append-only, one entry a line (entries.py). A line is on the disk (fdatasync) when `write` returns. What follows the
+last sound line is cut off before anything is appended. A damaged line before it stays where it is, and the
 lines after it count; of a file with damaged lines a copy is kept as `journal.jsonl.damaged`.
 """
 
@@ -29,9 +29,9 @@ from recording.writing.home import FolderLost
 from recording.writing.locks import lock
 from stand.fault import Fault
 from stand.gate import IN_WORDS, INTERLOCK, STOPPING
-from stand.running.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encode_line
-from stand.running.fold import after
-from stand.running.state import RunState
+from stand.running.memory.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encode_line
+from stand.running.memory.fold import after
+from stand.running.memory.state import RunState
 
 _END_WITHIN_S, _COMPLETE_WITHIN_S = 1.0, 10.0  # real seconds that a disk may take for the last entry
 _DAMAGED = ".damaged"  # the ending of the copy of a journal with damaged lines

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from foundation.clock import Clock
-from stand.running.actions import Surroundings, worth_of_soaks
-from stand.running.entries import Dwell, Restored
-from stand.running.journal import Logbook
-from stand.running.state import SetUp
+from stand.running.executing.actions import Surroundings, worth_of_soaks
+from stand.running.memory.entries import Dwell, Restored
+from stand.running.memory.journal import Logbook
+from stand.running.memory.state import SetUp
 from stand.stand import Stand
 
 

@@ -1,6 +1,7 @@
 """The whole memory of a run, as a value: what is done, earned and recorded, and what has been undone since.
 
-It is folded from the run's entries (stand/running/fold.py); what to do next is read from it (stand/running/actions.py).
+It is folded from the run's entries (fold.py); what to do next is read from it
+(stand/running/executing/actions.py).
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from experiments.steps import (
     longest_s,
 )
 from foundation.clock import NS_PER_S, seconds_ns
-from stand.running.entries import Change, Edited, Ended
-from stand.running.ids import Ids
+from stand.running.memory.entries import Change, Edited, Ended
+from stand.running.memory.ids import Ids
 
 Plan = tuple[PlannedStep, ...]
 

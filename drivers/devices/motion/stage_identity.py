@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from drivers.devices.stage_profiles import StageProfile
+from drivers.devices.motion.stage_profiles import StageProfile
 from drivers.settings import Identity
 from drivers.wires.ximc_client import XimcClient
 from foundation.errors import Refused

@@ -21,8 +21,8 @@ from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import StandError
 from foundation.helper import Helper
-from stand.running.entries import Edited, edited
-from stand.running.state import RunState
+from stand.running.memory.entries import Edited, edited
+from stand.running.memory.state import RunState
 
 MODULE = "compensation.design.process"  # by its name: the daemon imports nothing of it
 _LINE, _KEPT = "design", "design"

@@ -26,7 +26,7 @@ from experiments.steps import (
 )
 from foundation.clock import seconds_ns
 from stand.gate import INTERLOCK
-from stand.running.entries import (
+from stand.running.memory.entries import (
     Again,
     Change,
     Cleared,
@@ -46,7 +46,7 @@ from stand.running.entries import (
     Taken,
     Tripped,
 )
-from stand.running.state import RunState, SetUp
+from stand.running.memory.state import RunState, SetUp
 
 
 def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:

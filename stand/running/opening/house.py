@@ -23,8 +23,8 @@ from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording
 from stand.guarding.rules import Announcements
 from stand.poller import Poller
-from stand.running.holds import keep_shut_in_holds
-from stand.running.stop import Stop
+from stand.running.opening.holds import keep_shut_in_holds
+from stand.running.opening.stop import Stop
 
 _OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chamber_language import ChamberState
-from drivers.devices.chamber_settings import Ascii2Settings
+from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_settings import Ascii2Settings
 from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import Unreachable

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, Union, cast
 
 from pydantic import Discriminator, Tag
 
-import drivers.devices
+import drivers.devices.cameras
 from drivers.devices.protocols import Camera
 from drivers.settings import CameraSettings
 from foundation.clock import Clock
@@ -27,9 +27,9 @@ class _Driver(Protocol):
 
 
 def _found() -> dict[str, _Driver]:
-    names = sorted(module.name for module in pkgutil.iter_modules(drivers.devices.__path__))
+    names = sorted(module.name for module in pkgutil.iter_modules(drivers.devices.cameras.__path__))
     return {
-        name.removeprefix(_PREFIX): cast("_Driver", importlib.import_module(f"drivers.devices.{name}"))
+        name.removeprefix(_PREFIX): cast("_Driver", importlib.import_module(f"drivers.devices.cameras.{name}"))
         for name in names
         if name.startswith(_PREFIX)
     }

@@ -18,8 +18,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from drivers.devices.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
-from drivers.devices.radiometry import temperatures_degC
+from drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
+from drivers.devices.imager.radiometry import temperatures_degC
 from drivers.settings import DeviceName, Identity, Polled
 from foundation.calls import Lane
 from foundation.clock import NS_PER_S, Clock, seconds_ns

@@ -13,8 +13,8 @@ import usb.core
 import usb.util
 from pydantic import Field, model_validator
 
-from drivers.devices.flap_travel import POLL_S, Travel
-from drivers.devices.motion import Motion, Turn
+from drivers.devices.motion.flap_travel import POLL_S, Travel
+from drivers.devices.motion.motion import Motion, Turn
 from drivers.settings import Identity, Polled, same_device
 from foundation.addresses import TcpAddress
 from foundation.calls import Lane, Result

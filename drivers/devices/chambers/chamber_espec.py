@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chamber_language import ChamberState
-from drivers.devices.chamber_settings import EspecSettings
+from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_settings import EspecSettings
 from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import GarbledReply, Refused

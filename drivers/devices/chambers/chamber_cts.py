@@ -14,8 +14,8 @@ from functools import reduce
 from operator import xor
 from typing import TypeVar
 
-from drivers.devices.chamber_language import ChamberState
-from drivers.devices.chamber_settings import CtsSettings
+from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_settings import CtsSettings
 from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import Refused

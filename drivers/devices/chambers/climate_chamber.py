@@ -12,8 +12,8 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from typing import Protocol, cast
 
-from drivers.devices.chamber_language import ChamberLanguage, ChamberState
-from drivers.devices.chamber_settings import ChamberUnitSettings
+from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
+from drivers.devices.chambers.chamber_settings import ChamberUnitSettings
 from drivers.settings import Identity, same_device
 from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
@@ -47,7 +47,7 @@ class ClimateChamber:
         self._allowed_degC = allowed_degC
         self._clock = clock
         protocol = settings.model_dump()["protocol"]
-        module = cast("_Module", importlib.import_module(f"drivers.devices.chamber_{protocol}"))
+        module = cast("_Module", importlib.import_module(f"drivers.devices.chambers.chamber_{protocol}"))
         self._language = module.Language(name, settings)
         self.dead_man = self._language.dead_man
         self._lane: Lane | None = None

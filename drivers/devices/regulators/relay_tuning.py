@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import Field
 
-from drivers.devices.pid import Law
+from drivers.devices.regulators.pid import Law
 from foundation.clock import NS_PER_S
 from foundation.documents import Document
 

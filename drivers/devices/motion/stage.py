@@ -14,9 +14,9 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.devices.motion import Motion, Turn
-from drivers.devices.stage_identity import changed_settings, identity_of, power_off_s, speed_steps_s
-from drivers.devices.stage_profiles import PROFILES, ProfileName, StageProfile
+from drivers.devices.motion.motion import Motion, Turn
+from drivers.devices.motion.stage_identity import changed_settings, identity_of, power_off_s, speed_steps_s
+from drivers.devices.motion.stage_profiles import PROFILES, ProfileName, StageProfile
 from drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
 from drivers.wires.link import SerialSettings, open_link
 from drivers.wires.ximc_client import XimcClient

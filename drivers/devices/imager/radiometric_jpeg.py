@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.devices.radiometry import Air, Planck, Surroundings
+from drivers.devices.imager.radiometry import Air, Planck, Surroundings
 from foundation.image_limit import size_fault
 
 _START, _END = b"\xff\xd8", b"\xff\xd9"

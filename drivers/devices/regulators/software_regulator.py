@@ -15,11 +15,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from drivers.devices import pid, relay_tuning
-from drivers.devices.heat_pulses import PulsesSettings
-from drivers.devices.pid import Law
 from drivers.devices.protocols import HeatOutput
-from drivers.devices.relay_tuning import Found, Tuning, TuningSettings
+from drivers.devices.regulators import pid, relay_tuning
+from drivers.devices.regulators.heat_pulses import PulsesSettings
+from drivers.devices.regulators.pid import Law
+from drivers.devices.regulators.relay_tuning import Found, Tuning, TuningSettings
 from drivers.settings import DeviceName, Identity, Polled
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, Occupied, Refused

@@ -1,0 +1,1 @@
+"""Cameras, a file for each protocol."""

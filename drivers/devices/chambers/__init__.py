@@ -1,0 +1,1 @@
+"""Climate chambers, a file for each language."""

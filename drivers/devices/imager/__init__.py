@@ -1,0 +1,1 @@
+"""The thermal imager, a folder of radiometric JPEGs."""

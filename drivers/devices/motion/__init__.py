@@ -1,0 +1,1 @@
+"""What moves: stages and the flap."""

@@ -1,0 +1,1 @@
+"""What holds the temperature: a unit on the bus, or our own law."""

@@ -1,0 +1,1 @@
+"""What a run remembers: its state, folded from the journal's entries."""

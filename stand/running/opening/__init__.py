@@ -1,0 +1,1 @@
+"""A stand for a run: claimed, opened, stopped, closed."""
