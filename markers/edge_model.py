@@ -32,11 +32,11 @@ Variance = tuple[float, float]
 """floor_DN2 and slope_DN of a `Noise`."""
 
 _TINY = 1e-12
-_BLOCK = 256
+BLOCK = 256
 """Pixels whose derivatives are held at a time: they stay in the processor's nearest cache."""
-_ERROR = PARAMETERS
-_PIXEL = PARAMETERS + 1
-_ROWS = PARAMETERS + 7
+ERROR = PARAMETERS
+PIXEL = PARAMETERS + 1
+ROWS = PARAMETERS + 7
 """Rows of a block: the derivatives, the residuals, then the rows of `Pixels.table`."""
 _TABLE_END = 6.0
 _TABLE_CELLS = 8192
@@ -99,20 +99,17 @@ def _core_equations(
     table: Float, count: int, p: Float, scale: float, noise: Variance, normal: Float, right: Float
 ) -> tuple[float, float]:
     """Add the pixels near the outline to the upper half of `normal`, and to `right`."""
-    rows = np.empty((_ROWS, _BLOCK))
+    rows = np.empty((ROWS, BLOCK))
     block = rows.ravel()
     squares, weights = 0.0, 0.0
-    for first in range(0, count, _BLOCK):
-        size = min(_BLOCK, count - first)
-        for row in (U, V, VALUE, SHARE):
-            for k in range(size):
-                rows[_PIXEL + row, k] = table[row, first + k]
-        more = _derivatives(block, size, p, scale, noise)
+    for first in range(0, count, BLOCK):
+        size = load_block(rows, table, first, count)
+        more = derivatives(block, size, p, scale, noise)
         squares += more[0]
         weights += more[1]
         for row in (RESIDUAL, RISE):
             for k in range(size):
-                table[row, first + k] = rows[_PIXEL + row, k]
+                table[row, first + k] = rows[PIXEL + row, k]
         for i in range(0, PARAMETERS, 3):
             for j in range(i, PARAMETERS, 3):
                 _add_products(rows, i, j, size, normal)
@@ -121,11 +118,21 @@ def _core_equations(
 
 
 @compiled
-def _derivatives(block: Float, size: int, p: Float, scale: float, noise: Variance) -> tuple[float, float]:
+def load_block(rows: Float, table: Float, first: int, count: int) -> int:
+    """Copy the pixels from `first` on into a block (ROWS, BLOCK), as many as there is room for; their number."""
+    size = min(BLOCK, count - first)
+    for row in (U, V, VALUE, SHARE):
+        for k in range(size):
+            rows[PIXEL + row, k] = table[row, first + k]
+    return size
+
+
+@compiled
+def derivatives(block: Float, size: int, p: Float, scale: float, noise: Variance) -> tuple[float, float]:
     """From the first `size` pixels of `block` its weighted derivatives by the parameters and weighted residuals.
 
     Terms that vanish on the outline are left out: the fit still ends where J'We = 0, which is free of bias while the
-    model holds. The rows of `block` lie one after the other, _BLOCK numbers each, so that the compiler sees that they
+    model holds. The rows of `block` lie one after the other, BLOCK numbers each, so that the compiler sees that they
     do not overlap and does eight pixels at a time.
     """
     m11, m12, m22, sigma = p[M11], p[M12], p[M22], p[SIGMA]
@@ -135,8 +142,8 @@ def _derivatives(block: Float, size: int, p: Float, scale: float, noise: Varianc
     slope_x, slope_y = bx - fx, by - fy
     squares, weights = 0.0, 0.0
     for k in range(size):
-        x = (block[(_PIXEL + U) * _BLOCK + k] - cx) * per_scale
-        y = (block[(_PIXEL + V) * _BLOCK + k] - cy) * per_scale
+        x = (block[(PIXEL + U) * BLOCK + k] - cx) * per_scale
+        y = (block[(PIXEL + V) * BLOCK + k] - cy) * per_scale
         gx, gy = m11 * x + m12 * y, m12 * x + m22 * y
         F = math.sqrt(max(gx * x + gy * y, _TINY))
         per_length = 1 / (math.sqrt(gx * gx + gy * gy) + _TINY)
@@ -147,29 +154,29 @@ def _derivatives(block: Float, size: int, p: Float, scale: float, noise: Varianc
         contrast = b0 + bx * x + by * y - disc
         model = disc + contrast * step + (slope_x * nx + slope_y * ny) * density * sharpness
         root = math.sqrt(1 / (floor + gain * max(model, 0.0)))
-        residual = (block[(_PIXEL + VALUE) * _BLOCK + k] - model) * root
-        weight = block[(_PIXEL + SHARE) * _BLOCK + k]
+        residual = (block[(PIXEL + VALUE) * BLOCK + k] - model) * root
+        weight = block[(PIXEL + SHARE) * BLOCK + k]
         share = math.sqrt(weight)
         rise = contrast * density * per_sigma * root
-        block[(_PIXEL + RESIDUAL) * _BLOCK + k] = residual
-        block[(_PIXEL + RISE) * _BLOCK + k] = rise
+        block[(PIXEL + RESIDUAL) * BLOCK + k] = residual
+        block[(PIXEL + RISE) * BLOCK + k] = rise
         squares, weights = squares + weight * residual * residual, weights + weight
         root, rise = root * share, rise * share
         bend = rise * scale * per_length
-        block[CX * _BLOCK + k] = -rise * nx
-        block[CY * _BLOCK + k] = -rise * ny
-        block[M11 * _BLOCK + k] = 0.5 * bend * x * x
-        block[M12 * _BLOCK + k] = bend * x * y
-        block[M22 * _BLOCK + k] = 0.5 * bend * y * y
-        block[SIGMA * _BLOCK + k] = -rise * t
+        block[CX * BLOCK + k] = -rise * nx
+        block[CY * BLOCK + k] = -rise * ny
+        block[M11 * BLOCK + k] = 0.5 * bend * x * x
+        block[M12 * BLOCK + k] = bend * x * y
+        block[M22 * BLOCK + k] = 0.5 * bend * y * y
+        block[SIGMA * BLOCK + k] = -rise * t
         ground, inside = step * root, (1 - step) * root
-        block[B0 * _BLOCK + k] = ground
-        block[BX * _BLOCK + k] = ground * x
-        block[BY * _BLOCK + k] = ground * y
-        block[F0 * _BLOCK + k] = inside
-        block[FX * _BLOCK + k] = inside * x
-        block[FY * _BLOCK + k] = inside * y
-        block[_ERROR * _BLOCK + k] = residual * share
+        block[B0 * BLOCK + k] = ground
+        block[BX * BLOCK + k] = ground * x
+        block[BY * BLOCK + k] = ground * y
+        block[F0 * BLOCK + k] = inside
+        block[FX * BLOCK + k] = inside * x
+        block[FY * BLOCK + k] = inside * y
+        block[ERROR * BLOCK + k] = residual * share
     return squares, weights
 
 
@@ -203,7 +210,7 @@ def _add_products(rows: Float, i: int, j: int, size: int, normal: Float) -> None
 def _add_right(rows: Float, i: int, size: int, right: Float) -> None:
     """Add the products of rows i..i+2 with the residuals."""
     sa = sb = sc = 0.0
-    a, b, c, residual = rows[i], rows[i + 1], rows[i + 2], rows[_ERROR]
+    a, b, c, residual = rows[i], rows[i + 1], rows[i + 2], rows[ERROR]
     for k in range(size):
         sa, sb, sc = sa + a[k] * residual[k], sb + b[k] * residual[k], sc + c[k] * residual[k]
     right[i] += sa

@@ -91,10 +91,14 @@ def errors_px(picture: Callable[[int], Image]) -> tuple[Float, Float, list[Detec
         as_jpeg(80),
         moved_while_exposed(2),
         moved_while_exposed(4),
+        moved_while_exposed(8),
         unequal_pixels,
         with_gamma,
     ],
-    ids=["noise alone", "JPEG 95", "JPEG 90", "JPEG 80", "blurred 2 px", "blurred 4 px", "unequal pixels", "gamma 2.2"],
+    ids=[
+        *("noise alone", "JPEG 95", "JPEG 90", "JPEG 80", "blurred 2 px", "blurred 4 px", "blurred 8 px"),
+        *("unequal pixels", "gamma 2.2"),
+    ],
 )
 def test_the_claimed_variance_is_that_of_the_errors(picture: Callable[[int], Image]):
     """The chi^2 of 432 coordinates scatters by 7 %."""
@@ -103,12 +107,11 @@ def test_the_claimed_variance_is_that_of_the_errors(picture: Callable[[int], Ima
 
 
 def test_rows_that_flicker_make_y_uncertain_and_leave_x_as_it_is():
-    """Of the variance along y, ten times that of x, a part is missing: rows are longer than a cluster near the top and
-    the bottom of a disc."""
+    """The nine markers of a row share its flicker: 24 numbers scatter by 29 %."""
     errors, variances, _ = errors_px(flickering_rows)
     x, y = np.mean(errors**2 / variances, axis=0)
     assert 0.8 < x < 1.25
-    assert 0.8 < y < 2
+    assert 0.8 < y < 1.6
     assert np.mean(variances[:, 1]) > 5 * np.mean(variances[:, 0])
 
 
