@@ -2,7 +2,8 @@
 
 A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form, those
 before version 4 know of no bumps, those before version 5 have correlations between the motions, which are dropped,
-those before version 6 no powers of the air's lags.
+those before version 6 no powers of the air's lags, and those before version 7 claim too little on another night: their
+covariance is also the matrix of leverage.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from foundation.errors import SessionError
 from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 
 Positive = Annotated[int, Field(gt=0)]
 Rows = tuple[tuple[float, ...], ...]
@@ -40,7 +41,7 @@ class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Literal[2, 3, 4, 5, 6] = SCHEMA_VERSION
+    schema_version: Literal[2, 3, 4, 5, 6, 7] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]
@@ -90,6 +91,7 @@ class ThermalFile(_File):
     ambient_range_degC: Pair
     rate_range_K_per_h: Pair
     least_on_s: float | None
+    leverage_matrix_px2: Rows | None = None
     leverage_px2: float | None = None
     usual_leverage_px2: float | None = None
     history_s: float | None = None
@@ -181,6 +183,7 @@ def _thermal_fields(model: ThermalModel) -> dict[str, object]:
         "has_warm_up": model.has_warm_up,
         "coefficients_px": model.coefficients.tolist(),
         "coefficient_covariance_px2": np.concatenate(model.coefficient_covariance).tolist(),
+        "leverage_matrix_px2": model.leverage_matrix.tolist(),
         "ambient_range_degC": model.valid.ambient_degC,
         "rate_range_K_per_h": model.valid.rate_K_per_h,
         "least_on_s": _finite(model.valid.least_on_s),
@@ -216,6 +219,7 @@ def _paper(file: PaperFile) -> PaperModel:
 def _thermal(file: ThermalFile) -> ThermalModel:
     """The model of a file; ValueError when its parts do not fit together."""
     count = len(file.terms)
+    covariance, leverage = _blocks(file, count), file.leverage_matrix_px2
     return ThermalModel(
         facts=_facts(file),
         terms=tuple(Term(term.kind, term.parameter) for term in file.terms),
@@ -223,7 +227,10 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         self_heating_K=file.self_heating_K,
         reference_features=_shaped("reference_features", file.reference_features, (count,)),
         coefficients=_shaped("coefficients_px", file.coefficients_px, (MOTIONS, count)),
-        coefficient_covariance=_blocks(file, count),
+        coefficient_covariance=covariance,
+        leverage_matrix=covariance[0] + covariance[1]
+        if leverage is None
+        else _shaped("leverage_matrix_px2", leverage, (count, count)),
         discrepancy_px=np.array(file.discrepancy_px),
         valid=ThermalRange(
             ambient_degC=file.ambient_range_degC,

@@ -84,6 +84,15 @@ class Learned:
             found[motion] = _solved(known, motion, own)[0] * self._scale_px[motion]
         return found
 
+    def doubt(self, fold: Float) -> Float:
+        """(8, H, H), px^2: how much the coefficients hang on any one of the folds (I,), NaN in none; the jackknife's
+        variance (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11). What no term explains, a
+        dead zone of a part that nobody measures, pulls each of them its own way, and the posterior knows nothing of it.
+        """
+        each = np.array([self.without(fold == value) for value in np.unique(fold[np.isfinite(fold)])])
+        away = each - each.mean(axis=0)
+        return np.einsum("kmg,kmh->mgh", away, away) * (len(each) - 1) / len(each)
+
 
 def learn(instants: Instants, terms: Sequence[Term]) -> Learned:
     """The most likely prior and noise of each motion, and what they make of these instants."""

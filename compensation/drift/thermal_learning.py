@@ -28,6 +28,9 @@ _GUESSED = 0.25
 """How wrong the first guess of a feature may be, 5 K of 20: of where the camera has been, and of its self-heating."""
 _OF_PLACE, _OF_HEATING = (Kind.AMBIENT_LAG, Kind.CAMERA_LAG), (Kind.CAMERA_LAG,)
 _LEAST_PX, _STEP_S = 0.003, 300.0
+_DOUBT = 4.0
+"""The jackknife over the set-points of one night sees a part of what another night brings: its variance counts so many
+times. Chosen on 48 drawn cameras, judged on 48 others (docs/decisions.md)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +133,8 @@ def _model(taught: _Taught, heating_K: float) -> ThermalModel:
         self_heating_K=heating_K,
         reference_features=trained.reference_features,
         coefficients=learned.coefficients,
-        coefficient_covariance=learned.covariance,
+        coefficient_covariance=learned.covariance + _DOUBT * learned.doubt(learned.instants.chamber_degC),
+        leverage_matrix=learned.covariance[0] + learned.covariance[1],
         discrepancy_px=_discrepancy_px(taught),
         valid=_range(trained),
         has_warm_up=bool(trained.observations.of(Role.WARM_UP).any()),

@@ -52,6 +52,8 @@ class ThermalModel:
     """Maps measured positions of one camera to those at the reference temperature.
 
     terms: H features of the thermal state. coefficients (8, H) px, each motion's with a covariance (8, H, H) px^2.
+    leverage_matrix (H, H), px^2: what features of a state are to the posterior of the shift along I and J, without what
+    the covariance has beyond that; it says which states are like those of the fit.
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
     the shift at the reference is about 0. discrepancy_px (2,): what the form leaves unexplained at temperatures not
     fitted, one standard deviation, marker noise taken off. has_warm_up: whether a warm-up was among the training
@@ -65,6 +67,7 @@ class ThermalModel:
     reference_features: Float
     coefficients: Float
     coefficient_covariance: Float
+    leverage_matrix: Float
     discrepancy_px: Float
     valid: ThermalRange
     has_warm_up: bool
@@ -122,12 +125,6 @@ class ThermalModel:
         """How long a camera must be followed after a guess of its state."""
         longest_s = SETTLED_TAUS * max(self.memory.taus_s, default=0.0)
         return longest_s if self.valid.history_s is None else min(self.valid.history_s, longest_s)
-
-    @property
-    def leverage_matrix(self) -> Float:
-        """(H, H), px^2: what the coefficients' covariance makes of the features of a state, for the shift along I and
-        J."""
-        return self.coefficient_covariance[0] + self.coefficient_covariance[1]
 
     def leverage(self, state: States) -> Float:
         """(N,), px^2: how far a state is from those of the fit, in terms of what they determine (the diagonal of the

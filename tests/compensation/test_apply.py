@@ -83,6 +83,7 @@ def thermal(*, warmed: bool = True) -> ThermalModel:
         reference_features=rng.normal(0, 0.1, len(terms)),
         coefficients=rng.normal(0, 0.2, (8, len(terms))),
         coefficient_covariance=np.array([1e-6 * np.eye(len(terms))] * 8),
+        leverage_matrix=2e-6 * np.eye(len(terms)),
         discrepancy_px=np.array([0.003, 0.004]),
         valid=ThermalRange((10.0, 52.0), (-9.0, 9.0), 120.0 if warmed else np.inf),
         has_warm_up=True,
