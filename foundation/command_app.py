@@ -27,21 +27,18 @@ _COMMON: dict[str, Any] = {
 
 
 class App(typer.Typer):
-    """Every command has -q, -v, --version and --json, which `foundation.output` knows of; `has_json=False` for one that
-    has nothing to say to a program."""
+    """Every command has -q, -v, --version and --json, which `foundation.output` knows of."""
 
     def __init__(self, help: str | None = None, *, no_args_is_help: bool = False) -> None:  # noqa: A002 - as in typer
         own: dict[str, Any] = {} if help is None else {"help": help}  # else it is that of the callback
         super().__init__(cls=OneLineUsage, add_completion=False, no_args_is_help=no_args_is_help, **own)
 
-    def command(
-        self, name: str | None = None, *, has_json: bool = True, **settings: Any
-    ) -> Callable[[Function], Function]:
+    def command(self, name: str | None = None, **settings: Any) -> Callable[[Function], Function]:
         """As typer has it; a parameter that is a dataclass is given by options, one for each of its fields."""
         register = super().command(name, **settings)
 
         def take(function: Function) -> Function:
-            register(_with_common(_with_groups(function), has_json=has_json))
+            register(_with_common(_with_groups(function)))
             return function
 
         return take
@@ -66,7 +63,7 @@ def _with_group(function: Callable[..., Any], group: str, kind: type[Any]) -> Ca
     return with_parameters(command, function, added, without=group)
 
 
-def _with_common(function: Callable[..., Any], *, has_json: bool) -> Callable[..., Any]:
+def _with_common(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` with the common options behind its own."""
 
     @functools.wraps(function)
@@ -76,8 +73,7 @@ def _with_common(function: Callable[..., Any], *, has_json: bool) -> Callable[..
         with outputting(wanted):
             return function(*args, **options)
 
-    added = {name: (kind, False) for name, kind in _COMMON.items() if has_json or name != "common_json"}
-    return with_parameters(command, function, added)
+    return with_parameters(command, function, {name: (kind, False) for name, kind in _COMMON.items()})
 
 
 def with_parameters(

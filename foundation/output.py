@@ -53,6 +53,11 @@ def show(data: object, lines: Iterable[object]) -> None:
         typer.echo(line)
 
 
+def json_line(data: object) -> str:
+    """Of what goes on, for programs: as `show` has it, in one line."""
+    return json.dumps(_plain(data), default=str)
+
+
 def say(line: object) -> None:
     """What goes on, in one line on standard error; nothing when quiet."""
     if not output().quiet:

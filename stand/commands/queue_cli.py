@@ -60,9 +60,7 @@ def list_runs(door: Door) -> None:
     Example: stand queue list --out /data/sessions
     """
     halted, runs = door.runs()
-    texts = {"config_text", "recipe_text", "target_text"}
-    entries = [run.model_dump(mode="json", exclude=texts) for run in runs]
-    show({"halted": halted, "runs": entries}, queue_lines(runs) if runs else ())
+    show(_as_json(halted, runs), queue_lines(runs) if runs else ())
     if not runs:
         say(f"{door.name}: nothing is queued there")
     if halted:
@@ -96,7 +94,7 @@ def remove(door: Door, number: RunArgument) -> None:
     show({"id": number}, ())
 
 
-@app.command(has_json=False)
+@app.command()
 def start(
     config: ConfigOption = "simulated",
     out: OutOption = None,
@@ -115,6 +113,7 @@ def start(
     with one_line_errors():
         directory = directory_of(config, out)
         if not queue.queued(directory).entries:
+            show(_as_json("", ()), ())
             say(f"{directory}: nothing is queued there")
             return
         if clear:
@@ -129,6 +128,15 @@ def start(
             asyncio.run(work(directory, run_one, WallClock(), say))
         except Interrupted as error:
             raise typer.Exit(INTERRUPTED) from error  # its end has been reported
+        finally:
+            left = queue.queued(directory)
+            show(_as_json(left.halted, left.entries), ())
+
+
+def _as_json(halted: str, runs: Sequence[Entry | QueuedRun]) -> dict[str, object]:
+    """Of `list`, and of `start` when it is over."""
+    texts = {"config_text", "recipe_text", "target_text"}
+    return {"halted": halted, "runs": [run.model_dump(mode="json", exclude=texts) for run in runs]}
 
 
 def queue_lines(runs: Sequence[Entry | QueuedRun]) -> list[str]:

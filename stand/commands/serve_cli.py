@@ -18,7 +18,7 @@ from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.hub import Hub
 from foundation.items import Event, Item
-from foundation.output import Output, output, say
+from foundation.output import Output, json_line, output, say
 from foundation.usage import one_line
 from stand.commands.checked_cli import warn_unchecked
 from stand.config.checked import ATTACHMENT, load_checked
@@ -38,7 +38,7 @@ app = App()
 _HERE = "127.0.0.1"
 
 
-@app.command(has_json=False)
+@app.command()
 def serve(
     config: Annotated[str, typer.Argument(help="A configuration file, or the name of an installed one.")] = "simulated",
     out: Annotated[Path | None, typer.Option(help="Where the sessions go; else recording.directory.")] = None,
@@ -53,7 +53,8 @@ def serve(
 ) -> None:
     """Own the stand until it is stopped: status, devices by hand, and a queue whose runs are its guests.
 
-    SIGTERM or Ctrl-C makes the stand safe and ends it; the run under way may be resumed.
+    SIGTERM or Ctrl-C makes the stand safe and ends it; the run under way may be resumed. With --json what happens as
+    events, one a line.
 
     Example: stand serve laboratory.yaml --out /data/sessions
     """
@@ -77,7 +78,9 @@ def serve(
             async with serve_clients(desk, hub, clock, directory, stand.name, served, desk.patience):
                 where = f"; http://{host}:{port}/" if port is not None else ""
                 where += f"; SECoP at {secop_port}" if secop_port is not None else ""
-                say(f"{stand.name} is open; sessions go to {directory}{where}")
+                opened = f"{stand.name} is open; sessions go to {directory}{where}"
+                event = Event(clock.now_ns(), "info", "open", opened, {"sessions": str(directory), "port": port})
+                _tell_json(event) if output().as_json else say(opened)
                 with _events_shown(hub):
                     yield
 
@@ -97,11 +100,12 @@ def _attachments(path: Path, stand: StandConfig) -> dict[str, str]:
 def _events_shown(hub: Hub) -> Generator[None]:
     """A terminal that is slow, or stopped, delays nothing."""
     with aside() as later:
-        wanted, tell = output(), later(_tell)
+        wanted = output()
+        tell = later(_tell_json if wanted.as_json else _tell)
 
         def follow(item: Item) -> None:
             if isinstance(item, Event) and _is_told(item, wanted):
-                tell(_line(item))
+                tell(item)
 
         hub.subscribe(follow)
         try:
@@ -119,12 +123,13 @@ def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
     return room
 
 
-def _tell(line: str) -> None:
+def _tell(event: Event) -> None:
+    line = event.text if event.level == "info" else f"{event.text}; {next_command(event.kind, event.data)}"
     typer.echo(one_line(line), err=True)
 
 
-def _line(event: Event) -> str:
-    return event.text if event.level == "info" else f"{event.text}; {next_command(event.kind, event.data)}"
+def _tell_json(event: Event) -> None:
+    typer.echo(json_line(event))
 
 
 def _is_told(event: Event, wanted: Output) -> bool:

@@ -91,7 +91,8 @@ def test_an_empty_queue_has_nothing_to_list_or_start(tmp_path: Path):
     for command in ("list", "start"):
         result = invoke(tmp_path, command)
         assert result.exit_code == 0
-        assert result.stderr == f"{tmp_path}: nothing is queued there\n"
+        assert (result.stdout, result.stderr) == ("", f"{tmp_path}: nothing is queued there\n")
+        assert json.loads(invoke(tmp_path, command, "--json").stdout) == {"halted": "", "runs": []}
     assert list(tmp_path.iterdir()) == []
 
 

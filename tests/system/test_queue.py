@@ -1,5 +1,6 @@
 """A queue of real runs in virtual time: one goes through, one is killed, resumed and completed by the next start."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -73,11 +74,12 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
     assert (first.state, second.state) == ("interrupted", "waiting")
     assert first.session.endswith("-queued")
 
-    ended = forked.run([*COMMAND, str(out), "--report"], capture_output=True, text=True, timeout=300)
+    ended = forked.run([*COMMAND, str(out), "--report", "--json"], capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     assert f"run 1 (queued) is resumed in {first.session}" in ended.stderr
     entries = queue.queued(out).entries
     assert [(entry.state, entry.reason) for entry in entries] == [("done", ""), ("done", "")]
+    assert [run["session"] for run in json.loads(ended.stdout)["runs"]] == [entry.session for entry in entries]
     for entry in entries:
         session, plan = Session.open(out / entry.session), queue.order_of(entry).recipe.plan()
         assert session.incomplete == ()

@@ -63,6 +63,8 @@ export class Plan {
     fill(this.asks, h("div", { class: "ask" }, h("p", {}, `Steps from number ${from_index + 1} on, one a line, in JSON: change, remove, move or add lines. The stand checks them all before it takes any.`), text,
       h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: replace }, "Replace them"), h("button", { type: "button", onclick: done }, "Leave them"))));
     text.focus();
+    text.setSelectionRange(0, 0);
+    text.scrollTop = 0;
   }
 
   async refresh() {

@@ -1,0 +1,39 @@
+"""What `stand serve` says of what happens, for people and for programs."""
+
+import json
+import math
+
+import pytest
+
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.output import Output, outputting
+from stand.commands.serve_cli import _events_shown
+
+LOST = Event(7, "warning", "device_lost", "linear does not answer", {"device": "linear", "lost_s": math.nan})
+
+
+def shown(wanted: Output) -> None:
+    hub = Hub()
+    with outputting(wanted), _events_shown(hub):
+        hub.publish(Event(6, "info", "home_residual", "of no importance"))
+        hub.publish(LOST)
+
+
+def test_people_are_told_what_to_type(capsys: pytest.CaptureFixture[str]):
+    shown(Output())
+    assert capsys.readouterr() == ("", "linear does not answer; `stand devices` shows what is connected\n")
+
+
+def test_programs_get_events_one_a_line(capsys: pytest.CaptureFixture[str]):
+    shown(Output(verbose=True, as_json=True))
+    out, err = capsys.readouterr()
+    first, second = map(json.loads, out.splitlines())
+    assert (first["kind"], err) == ("home_residual", "")
+    assert second == {
+        "time_ns": 7,
+        "level": "warning",
+        "kind": "device_lost",
+        "text": "linear does not answer",
+        "data": {"device": "linear", "lost_s": None},
+    }
