@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS := 1
 export PYTHONDONTWRITEBYTECODE :=
 BIN := $(VENV)/bin
 # Tests wait half of their time, for real clocks and other processes.
-WORKERS := $(shell processors=$$(nproc); workers=$$((processors * 3 / 2)); echo $$((workers < 8 ? workers : 8)))
+WORKERS := $(shell workers=$$(($$(nproc) * 2)); echo $$((workers < 8 ? workers : 8)))
 RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
 PEER_PACKAGES := aravis-tools-cli aravis-tools chromium gcc libc6-dev
 
@@ -24,8 +24,8 @@ test: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
-	@$(BIN)/pyright --project tests & tests=$$!; $(BIN)/pyright && wait $$tests
-	$(BIN)/pytest -n $(WORKERS) --no-loadscope-reorder
+	@$(BIN)/pyright & types=$$!; $(BIN)/pytest -n $(WORKERS) --no-loadscope-reorder; tests=$$?; \
+		wait $$types || { echo "pyright has found errors, see above"; exit 1; }; exit $$tests
 
 nightly: setup
 	@sh .ci/system-packages $(PEER_PACKAGES)
