@@ -45,7 +45,8 @@ _PREVIEW_WIDTH_PX = 816
 class SessionFacts:
     """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
     segments that a killed recorder left behind and that were not read. utc: from its instants to UTC. spots: what a
-    thermal imager saw of the camera, name -> (time_ns, degC)."""
+    thermal imager saw of the camera, name -> (time_ns, degC). doubtful: frames that the noise model does not describe,
+    so that the covariance of their centres is an estimate (markers.Detection)."""
 
     session_id: str
     recipe: str
@@ -58,6 +59,7 @@ class SessionFacts:
     spots: Mapping[str, tuple[NDArray[np.int64], Float]] = field(
         default_factory=dict[str, tuple[NDArray[np.int64], Float]], compare=False
     )
+    doubtful: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,7 +225,7 @@ def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -
     image = session.frame(int(own[first])).image
     return Observations(
         target=target,
-        sessions=(_facts(session),),
+        sessions=(_facts(session, int(np.count_nonzero(found.doubtful))),),
         image_size=(image.shape[1], image.shape[0]),
         preview=_preview(image),
         session=np.zeros(len(reasons), np.int64),
@@ -265,12 +267,17 @@ def _purpose(role: str, chamber_degC: float) -> tuple[str, float]:
     return role, chamber_degC
 
 
-def _facts(session: Session) -> SessionFacts:
+def _facts(session: Session, doubtful: int) -> SessionFacts:
     fields = ("session_id", "recipe", "operator", "software_version")
     texts = {name: session.metadata.get(name, "") for name in fields} | {"camera_serial": serial_of(session)}
     simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
     return SessionFacts(
-        **texts, simulated=simulated, incomplete=len(session.incomplete), utc=session.utc, spots=_spots(session)
+        **texts,
+        simulated=simulated,
+        incomplete=len(session.incomplete),
+        utc=session.utc,
+        spots=_spots(session),
+        doubtful=doubtful,
     )
 
 

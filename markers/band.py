@@ -28,12 +28,12 @@ _BEYOND_CHANCE = 1.5
 """Of a mean square over a frame's markers, 54 of them: chance reaches it once in a hundred frames."""
 
 
-def is_doubtful(wide: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> bool:
-    """Whether residuals hang together, round the outlines (`growth`, sandwich.py) or in the levels beside them, so that
-    a narrow band is worth its time."""
+def is_doubtful(fit: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> bool:
+    """Whether residuals hang together, round the outlines (`growth`, sandwich.py) or in the levels beside them: what is
+    seen is not what the noise model describes."""
     if not clean.any():
         return False
-    levels = float(np.median(wide.levels[clean] / wide.chi[clean]))
+    levels = float(np.median(fit.levels[clean] / fit.chi[clean]))
     return bool(growth.max() > _DOUBTFUL_GROWTH) or levels > _DOUBTFUL_LEVELS
 
 

@@ -66,7 +66,8 @@ class Detection:
     homography: (3, 3), target mm -> px. state: the fitted edges, the start of the next frame. growth: (2,), by what the
     variances along x and y exceed, or fall below, those of residuals that are independent of each other (sandwich.py).
     excess_px2: (2,), what misfit of ground and disc adds to them, px^2. band_sigma: half width of the band of pixels
-    fitted, in blurs (band.py). The next frame keeps the last two.
+    fitted, in blurs (band.py). The next frame keeps these two. is_doubtful: the noise model does not describe the
+    picture (compression, texture, print, flicker): the covariance is an estimate from how its residuals hang together.
     """
 
     centres_px: Float
@@ -78,6 +79,7 @@ class Detection:
     growth: Float
     excess_px2: Float
     band_sigma: float
+    is_doubtful: bool
 
     @property
     def found(self) -> int:
@@ -128,6 +130,7 @@ def nothing_found(target: Target) -> Detection:
         growth=np.ones(2),
         excess_px2=np.zeros(2),
         band_sigma=WIDE_SIGMA,
+        is_doubtful=False,
     )
 
 
@@ -190,7 +193,7 @@ def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> 
     if found is None:
         return None
     wide, fit = found
-    if not is_doubtful(fit, wide.growth, wide.flags == 0):
+    if not wide.is_doubtful:
         return wide
     again = _fit_in_band(grey, target, wide.state, noise, NARROW_SIGMA)
     if again is None:
@@ -224,7 +227,8 @@ def _doubted(detection: Detection, excess: Float) -> Detection:
     hang together over the whole marker hide from `growth`: below 1 it is not believed."""
     growth = np.where(excess > 0, np.maximum(detection.growth, 1), detection.growth)
     covariance = _grown(detection.covariance_px2, growth / detection.growth) + np.diag(excess)
-    return replace(detection, covariance_px2=covariance, growth=growth, excess_px2=excess)
+    doubtful = detection.is_doubtful or bool(np.any(excess > 0))
+    return replace(detection, covariance_px2=covariance, growth=growth, excess_px2=excess, is_doubtful=doubtful)
 
 
 def _judged(
@@ -244,8 +248,9 @@ def _judged(
     scale = np.median(fit.state.radii_px()[good] / expected.radii_px()[good])
     parameters = expected.parameters
     parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
-    centres, covariance = under_common_light(fit, good & ~poor)
-    growth = variance_growth(fit.scatter, good & ~poor)
+    believed = good & ~poor
+    centres, covariance = under_common_light(fit, believed)
+    growth = variance_growth(fit.scatter, believed)
     return Detection(
         centres_px=np.where(good[:, None], centres, np.nan),
         covariance_px2=np.where(good[:, None, None], _grown(covariance, growth), np.nan),
@@ -259,6 +264,7 @@ def _judged(
         growth=growth,
         excess_px2=np.zeros(2),
         band_sigma=band_sigma,
+        is_doubtful=is_doubtful(fit, growth, believed),
     )
 
 

@@ -25,6 +25,14 @@ COLUMNS = (
 CENTRES = "x_px, y_px: centres of the outlines in the image; disc_x_px, disc_y_px: images of the discs' own centres"
 
 
+def doubt(images: int) -> str:
+    """What is said of so many images whose detections are doubtful."""
+    return (
+        f"{images} images are not described by noise (texture, print, compression, flicker, motion): the variances of "
+        "their centres are estimates from how the residuals hang together, and may be too small by half"
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedImage:
     """One image's markers. image: its file name or frame index. time_ns: None when unknown (an empty cell)."""

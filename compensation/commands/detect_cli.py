@@ -26,7 +26,7 @@ from foundation.progress import Report, late_progress
 from foundation.usage import one_line
 from markers.detection import Detection, DetectionError, Image, detect, nothing_found
 from markers.image_file import read_image
-from markers.table import CENTRES, DetectedImage, write_detections
+from markers.table import CENTRES, DetectedImage, doubt, write_detections
 from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole
@@ -60,11 +60,15 @@ def detect_images(
         opened = [_open(path, incomplete) for path in sources]
         chosen = _detection_target(opened, target)
         failures: list[str] = []
+        doubtful: list[str] = []
         with late_progress("find markers", sum(_count(source) for source in opened)) as report:
-            write_detections(out, chosen, _detections(opened, chosen, failures, report))
-        show({"table": out, "target": chosen.name, "not_found": failures}, [CENTRES, chosen.orientation])
+            write_detections(out, chosen, _detections(opened, chosen, failures, doubtful, report))
+        shown = {"table": out, "target": chosen.name, "not_found": failures, "doubtful": doubtful}
+        show(shown, [CENTRES, chosen.orientation])
         for failure in failures:
             say(f"not found in {failure}")
+        if doubtful:
+            say(doubt(len(doubtful)))
 
 
 def _open(path: Path, incomplete: bool) -> Session | Path:
@@ -91,9 +95,10 @@ def _count(source: Session | Path) -> int:
 
 
 def _detections(
-    sources: Sequence[Session | Path], target: Target, failures: list[str], report: Report
+    sources: Sequence[Session | Path], target: Target, failures: list[str], doubtful: list[str], report: Report
 ) -> Iterator[DetectedImage]:
-    """Every image in turn; where the target is not found all its markers are missing, and `failures` grows by a line.
+    """Every image in turn; where the target is not found all its markers are missing, and `failures` grows by a line;
+    `doubtful` by the names of those that noise does not describe.
 
     DetectionError when it is found nowhere.
     """
@@ -111,6 +116,8 @@ def _detections(
             except DetectionError as error:
                 failures.append(f"{name}: {error}")
                 found = nothing_found(target)
+            if found.is_doubtful:
+                doubtful.append(name)
             report(images, name)
             yield DetectedImage(name, time_ns, found)
     if len(failures) == images:

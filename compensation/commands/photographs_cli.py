@@ -25,6 +25,7 @@ from foundation.progress import Report, progress
 from markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
 from markers.detection import DetectionError, Image, detect
 from markers.image_file import read_image
+from markers.table import doubt
 from markers.target import Target
 
 app = App()
@@ -60,10 +61,13 @@ def calibrate_photographs(
         check_folder_writable(export, EXPORTS)
         board = _described(target)
         failures: list[str] = []
+        doubtful: list[str] = []
         with progress("find markers", len(images)) as report:
-            views = _views(images, board, failures, report)
+            views = _views(images, board, failures, doubtful, report)
         for failure in failures:
             say(f"not used: {failure}")
+        if doubtful:
+            say(doubt(len(doubtful)))
         known = board_of(board) if isinstance(board, Target) else board_of_corners(board)
         found = calibrate_views(views, known)
         write_exports(export, found.scene.lens, "camera", found.rms_px)
@@ -71,7 +75,7 @@ def calibrate_photographs(
         held_out_px = cross_validated_px(views, known)
         lens = dict(zip(NAMES, found.scene.lens.vector, strict=False))
         data = {"lens": lens, "lens_sigma": found.lens_sigma, "rms_px": found.rms_px, "held_out_px": held_out_px}
-        more = {"discrepancy_px": found.discrepancy_px, "not_used": failures, "exports": export}
+        more = {"discrepancy_px": found.discrepancy_px, "not_used": failures, "doubtful": doubtful, "exports": export}
         show({**data, **more}, [summary(found, views, held_out_px, at_mm, board)])
 
 
@@ -108,22 +112,26 @@ def _described(name: str) -> Target | BoardOfCorners:
     return corners or installed_target(name)
 
 
-def _look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float]:
-    """Points (N, 2) px and their covariances (N, 2, 2) in a picture; DetectionError when the target is not in it."""
+def _look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
+    """Points (N, 2) px and their covariances (N, 2, 2) in a picture, and whether these are doubtful; DetectionError
+    when the target is not in it."""
     if isinstance(target, Target):
         found = detect(image, target)
-        return found.centres_px, found.covariance_px2
-    return find_corners(image, target), np.tile(SIGMA_px**2 * np.eye(2), (target.count, 1, 1))
+        return found.centres_px, found.covariance_px2, found.is_doubtful
+    return find_corners(image, target), np.tile(SIGMA_px**2 * np.eye(2), (target.count, 1, 1)), False
 
 
-def _views(images: list[Path], target: Target | BoardOfCorners, failures: list[str], report: Report) -> Views:
-    """The pictures that show enough of the target; `failures` grows by a line for each other one."""
+def _views(
+    images: list[Path], target: Target | BoardOfCorners, failures: list[str], doubtful: list[str], report: Report
+) -> Views:
+    """The pictures that show enough of the target; `failures` grows by a line for each other one, `doubtful` by the
+    names of those that noise does not describe."""
     found: list[tuple[Float, Float]] = []
     size: tuple[int, int] | None = None
     for number, path in enumerate(images, 1):
         try:
             pixels = read_image(path)
-            points = _look(pixels, target)
+            *points, is_doubtful = _look(pixels, target)
         except DetectionError as error:
             failures.append(f"{path.name}: {error}")
             continue
@@ -137,7 +145,9 @@ def _views(images: list[Path], target: Target | BoardOfCorners, failures: list[s
         if count < LEAST_MARKERS:
             failures.append(f"{path.name}: {count} markers, {LEAST_MARKERS} are needed")
             continue
-        found.append(points)
+        if is_doubtful:
+            doubtful.append(path.name)
+        found.append((points[0], points[1]))
     if size is None:
         raise CalibrationError(failures[0] if failures else "there are no pictures")
     centres = np.array([centres for centres, _ in found]).reshape(-1, target.count, 2)

@@ -120,6 +120,7 @@ def _session(observations: Observations, index: int) -> SessionNumbers:
         centres=flags.size,
         set_aside=int(np.count_nonzero(flags)),
         flags={flag: count for flag, count in by_flag.items() if count},
+        doubtful=facts.doubtful,
     )
 
 

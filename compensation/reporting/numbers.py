@@ -25,7 +25,8 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class SessionNumbers:
-    """frames_by_role, flags: how many of each. centres: in usable frames; set_aside: of them, with a flag."""
+    """frames_by_role, flags: how many of each. centres: in usable frames; set_aside: of them, with a flag.
+    doubtful: frames that the noise model does not describe."""
 
     session_id: str
     recipe: str
@@ -43,6 +44,7 @@ class SessionNumbers:
     centres: int
     set_aside: int
     flags: dict[str, int]
+    doubtful: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,6 +137,14 @@ def test_grained_ground_is_fitted_in_a_narrow_band_where_that_is_better_and_fram
     assert after.excess_px2.tolist() == found[0].excess_px2.tolist()
 
 
+def test_a_picture_that_noise_does_not_describe_is_doubtful_and_one_with_noise_alone_is_not():
+    _, _, grained = errors_px(on_grained_paper)
+    _, _, noisy = errors_px(noise_alone)
+    assert all(one.is_doubtful for one in grained)
+    assert not any(one.is_doubtful for one in noisy)
+    assert detect(on_grained_paper(9), PAPER, grained[0]).is_doubtful
+
+
 def test_growth_within_its_chance_is_none_and_beyond_it_is_kept():
     rng = np.random.default_rng(1)
     independent = np.full((200, 2), 7.0)

@@ -50,7 +50,12 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
         result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "not found" not in result.stderr
+    assert "images are not described by noise (texture, print, compression" in result.stderr
     return out, detections
+
+
+def test_noise_does_not_describe_webcam_pictures_of_a_print_and_that_is_said(detected: Detected):
+    assert sum(one.is_doubtful for one in detected[1]) >= COUNT - 1
 
 
 @pytest.fixture(params=range(COUNT), ids="{}.png".format)
