@@ -21,17 +21,19 @@ from foundation.output import output, say, show
 from foundation.usage import one_line, tell
 from recording.repair.salvage import salvage_line
 from stand.commands.checked_cli import warn_unchecked
-from stand.commands.submitted import daemon_of, follow, submit, submit_resumed
+from stand.commands.reached import TokenOption, UrlOption
+from stand.commands.submitted import daemon_of, follow, submit, submit_recipe, submit_resumed
 from stand.config.checked import load_checked
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.learned import learn
 from stand.estimating.run_estimate import existing, price_night, small_disk
 from stand.running.opening.stop import Interrupted
-from stand.running.order import Order, load_order
+from stand.running.order import load_order
 from stand.running.resume import interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
-from stand.serving.client import Server
+from stand.serving.client import Server, server_at
+from stand.serving.desk import QueuedRun
 from stand.watching.live import followed
 
 app = App()
@@ -82,14 +84,23 @@ def run(
     detach: Annotated[
         bool, typer.Option("--detach", help="Where `stand serve` has the stand: submit the run and leave.")
     ] = False,
+    url: UrlOption = "",
+    token_file: TokenOption = None,
 ) -> None:
     """Run a recipe and record it; prints the session's folder.
 
-    Where `stand serve` has the stand, the run is submitted to it and followed; Ctrl-C stops it.
+    Where `stand serve` has the stand, here or at --url, the run is submitted to it and followed; Ctrl-C stops it.
 
     Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions --report
     """
     with _run_errors():
+        if url:
+            here = {"--virtual-time": virtual_time, "--seed": seed, "--out": out, "--report": report}
+            if given := next((name for name, value in here.items() if not (value is None or value is False)), ""):
+                raise ConfigError(f"{given} is for a run of this machine; leave it out, or --url")
+            server = server_at(url, token_file)
+            _follow(server, submit_recipe(server, recipe, attended=attended), detach=detach, report=False)
+            return
         if seed is not None and not virtual_time:
             raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
         if seed is not None and seed < 0:
@@ -101,7 +112,7 @@ def run(
             path = packaged("", config)
             warn_unchecked(path, order.config, load_checked(path))
         if not virtual_time and (server := daemon_of(order.config)) is not None:
-            _run_there(server, order, out, detach=detach, report=report)
+            _follow(server, submit(server, order, out), detach=detach, report=report)
             return
         if detach:
             raise ConfigError("--detach: no `stand serve` has this stand, and a run by itself ends with its command")
@@ -158,9 +169,8 @@ def resume_run(
         _finished(session, order.config, report=report)
 
 
-def _run_there(server: Server, order: Order, out: Path | None, *, detach: bool, report: bool) -> None:
-    """By the daemon that has the stand."""
-    submitted = submit(server, order, out)
+def _follow(server: Server, submitted: QueuedRun, *, detach: bool, report: bool) -> None:
+    """A run of the daemon that has the stand."""
     if detach:
         show({"id": submitted.id}, [f"run {submitted.id} is queued; `stand status` follows it"])
         return

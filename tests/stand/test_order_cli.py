@@ -6,6 +6,7 @@ from pathlib import Path
 
 from typer.testing import CliRunner, Result
 
+from stand.commands.command_table import app as stand
 from stand.commands.order_cli import app
 from stand.serving.api.doors import Interface
 from tests.stand.a_desk import ADesk, served
@@ -29,6 +30,18 @@ async def test_a_run_is_submitted_once_for_each_key(tmp_path: Path):
         assert (other.exit_code, "was used for another run" in other.stderr) == (1, True)
         assert json.loads((await invoke("submit", "demo", *there, "--json")).stdout)["recipe"] == "demo"
     assert [run.recipe for run in desk.queue] == ["written", "demo"]
+
+
+async def test_a_run_is_begun_at_an_address_and_what_is_of_this_machine_is_refused_with_it(tmp_path: Path):
+    port, token = free_port(), tmp_path / "token"
+    token.write_text(TOKEN)
+    there = ["--url", f"http://127.0.0.1:{port}", "--token-file", str(token), "--detach"]
+    async with served(ADesk(), tmp_path / "sessions", Interface(tmp_path, port=port, tokens={"rose": TOKEN})) as desk:
+        begun = await asyncio.to_thread(CliRunner().invoke, stand, ["run", "demo", *there])
+        assert begun.stdout == "run 1 is queued; `stand status` follows it\n"
+        refused = await asyncio.to_thread(CliRunner().invoke, stand, ["run", "demo", *there, "--seed", "0"])
+        assert (refused.exit_code, refused.stderr.startswith("error: --seed is for a run of this machine")) == (2, True)
+    assert [run.recipe for run in desk.queue] == ["demo"]
 
 
 async def test_a_device_is_told_something_over_the_network(tmp_path: Path):
