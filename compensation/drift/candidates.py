@@ -22,14 +22,16 @@ class Candidate(Document):
     """One form and what leave-temperatures-out says of it; a fold is one chamber set-point with all its visits.
 
     form: paper or thermal. name: in words. terms: coefficients of both coordinates together. rms_px: held-out RMS along
-    I and J, all folds counting the same; fold_rms_px: of each fold. bic: in older files.
-    chosen: whether it is the best of its form.
+    I and J, all folds counting the same; fold_rms_px: of each fold. moving_rms_px: of frames on the way to set-points
+    and after switching on, held out as well, of the one in use, where such were recorded. bic: in older files. chosen:
+    whether it is the best of its form.
     """
 
     form: str
     name: str
     terms: int
     rms_px: Pair
+    moving_rms_px: Pair | None = None
     bic: float | None = None
     chosen: bool
     fold_chamber_degC: tuple[float, ...]
@@ -44,6 +46,14 @@ class Candidate(Document):
     def squares_between(self) -> Float:
         """(folds,): of the set-points between others, by which forms and families are chosen."""
         return self.fold_squares[between(np.array(self.fold_chamber_degC))]
+
+
+def moving_rms_px(residual: Float) -> Pair | None:
+    """RMS along I and J of residuals (M, 2) of frames that were not at rest; None where there are none."""
+    if len(residual) == 0:
+        return None
+    i, j = np.sqrt((residual**2).mean(axis=0))
+    return float(i), float(j)
 
 
 def fold_means(rows: Displacements, values: Float) -> Float:

@@ -10,13 +10,16 @@ import numpy as np
 
 from compensation.drift.bump import Bump
 from compensation.drift.bumps import around_bumps, find_bumps
-from compensation.drift.candidates import NO_MATTER_PX, Candidate
+from compensation.drift.candidates import NO_MATTER_PX, Candidate, moving_rms_px
+from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
-from compensation.drift.paper_fit import check_degree, fit_paper
+from compensation.drift.paper_fit import check_degree, fit_paper, left_out
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.training import training
 from compensation.observations import Observations
+from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError
 
 Form = Literal["paper", "thermal"]
@@ -27,7 +30,8 @@ Fitted = TypeVar("Fitted")
 def fit(observations: Observations, degree: int | None = None, form: Form | None = None) -> DriftModel:
     """The model of these sessions.
 
-    form: None takes the one that predicts better at temperatures left out between others, the paper's if both do;
+    form: None takes the one that predicts better what was left out: temperatures between others and, where these were
+    recorded, frames on the way and after switching on; the paper's if both do;
     sessions without the telemetry that the thermal form needs have the paper's. degree: of the paper's form, which it
     implies. The model has the form that was not taken as `other`, where the sessions support it. SessionError when
     they cannot support what was asked for, or a degree was given for thermal.
@@ -60,7 +64,7 @@ def _fitted(observations: Observations, degree: int | None, form: Form | None) -
     thermal = _or_none(lambda: fit_thermal(observations)) if _has_histories(observations) else None
     if thermal is None or form == "paper" or degree is not None:
         return replace(paper, other=thermal)
-    return _better(paper, thermal)
+    return better(_asked_on_the_way(observations, paper, thermal), thermal)
 
 
 def _or_none(fitted: Callable[[], Fitted]) -> Fitted | None:
@@ -77,8 +81,17 @@ def check_request(degree: int | None, form: Form | None) -> None:
         raise ConfigError("the thermal form has no degree; leave out --degree, or ask for --form paper")
 
 
-def _better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
-    """By the squares at temperatures left out; each gets the table with the rows of both."""
+def _asked_on_the_way(observations: Observations, paper: PaperModel, thermal: ThermalModel) -> PaperModel:
+    """The paper's form with what it leaves of frames that were not at rest, the same as of the thermal form."""
+    asked = training(observations, thermal.terms, thermal.memory).moving_rows
+    rows = displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
+    found = moving_rms_px(left_out(rows, paper.degree, paper.scaling, asked))
+    told = tuple(one.model_copy(update={"moving_rms_px": found if one.chosen else None}) for one in paper.candidates)
+    return replace(paper, candidates=told)
+
+
+def better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
+    """By the squares at what was left out; each gets the table with the rows of both."""
     both = paper.candidates + thermal.candidates
     in_use = [next(one for one in model.candidates if one.chosen) for model in (paper, thermal)]
     is_thermal = _comparable(*in_use) and _predicts_better(*in_use)
@@ -90,9 +103,14 @@ def _better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
 
 
 def _predicts_better(paper: Candidate, thermal: Candidate) -> bool:
-    """By more than anybody measures, at set-points between others. That the paper's form needs no history does not
-    weigh against its prediction: it is in the file in any case, and `apply` takes it where there is none."""
-    rms_px = [float(np.sqrt(one.squares_between.mean())) for one in (paper, thermal)]
+    """By more than anybody measures, at set-points between others, and as much on the way and after switching on, where
+    frames of these were recorded: who records them will ask about them. That the paper's form needs no history does
+    not weigh against its prediction: it is in the file in any case, and `apply` takes it where there is none."""
+    squares = [[float(one.squares_between.mean())] for one in (paper, thermal)]
+    if paper.moving_rms_px is not None and thermal.moving_rms_px is not None:
+        for of_form, one in zip(squares, (paper.moving_rms_px, thermal.moving_rms_px), strict=True):
+            of_form.append(one[0] ** 2 + one[1] ** 2)
+    rms_px = [float(np.sqrt(np.mean(of_form))) for of_form in squares]
     return rms_px[1] < rms_px[0] - NO_MATTER_PX
 
 

@@ -20,7 +20,7 @@ from foundation.clock import NS_PER_S
 
 Index = NDArray[np.int64]
 
-_INSTANT_NS = 240 * NS_PER_S
+INSTANT_NS = 240 * NS_PER_S
 _FLOOR_PX = 0.002
 """What no model of this kind explains is common to all markers of an instant: many frames at one temperature (a
 warm-up has thousands) do not outweigh one frame at each of many."""
@@ -29,7 +29,8 @@ warm-up has thousands) do not outweigh one frame at each of many."""
 @dataclass(frozen=True, slots=True, eq=False)
 class Instants:
     """I instants. amounts_px, variance_px2 (I, 8): of the motions. features (I, H): means over the frames, minus those
-    of the reference. chamber_degC (I,): set-point, NaN in a warm-up. session (I,). time_s (I,): of the first frame."""
+    of the reference. chamber_degC (I,): set-point, NaN in a warm-up. session (I,). time_s (I,): of the first frame,
+    frame (I,): which one that is."""
 
     amounts_px: Float
     variance_px2: Float
@@ -37,6 +38,7 @@ class Instants:
     chamber_degC: Float
     session: Index
     time_s: Float
+    frame: Index
 
 
 def condense_instants(observations: Observations, rows: Displacements, features: Float, set_point: Mask) -> Instants:
@@ -65,6 +67,7 @@ def condense_instants(observations: Observations, rows: Displacements, features:
         chamber_degC=np.where(set_point[first], observations.chamber_degC[first], np.nan),
         session=observations.session[first],
         time_s=(observations.time_ns[first] - observations.time_ns[0]) / NS_PER_S,
+        frame=first,
     )
 
 
@@ -78,6 +81,6 @@ def _gram(g: Float, label: Index, rows_of: Index) -> Float:
 def _labels(observations: Observations, rows: Displacements) -> Index:
     """(M,): the instant of each row, from 0."""
     _, step = np.unique(np.array(observations.step_id), return_inverse=True)
-    part = observations.time_ns // _INSTANT_NS
+    part = observations.time_ns // INSTANT_NS
     key = np.column_stack([observations.session, step, part])[rows.frame]
     return np.unique(key, axis=0, return_inverse=True)[1].ravel()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ from compensation.drift.displacements import Displacements, displacements
 from compensation.drift.facts import facts_of
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
-from compensation.observations import Mask, Observations
+from compensation.observations import Observations
 from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError
 
@@ -107,41 +108,44 @@ def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
     )
 
 
-def left_out(rows: Displacements, degree: int, scaling: Scaling) -> Float:
-    """Residual displacement (M, 2) of each row, from a fit that has not seen its chamber set-point."""
+def left_out(rows: Displacements, degree: int, scaling: Scaling, asked: Displacements | None = None) -> Float:
+    """Residual displacement (M, 2) of each row that is asked for, by default the same, from a fit to the rows that has
+    not seen its chamber set-point; where that is NaN, to all."""
+    asked = rows if asked is None else asked
     folds = _condensed(rows, degree, scaling)
-    residual = np.empty_like(rows.displacement_px)
-    for index, fold in enumerate(folds):
-        known = _solutions(folds[:index] + folds[index + 1 :])
+    residual = asked.displacement_px.copy()
+    for chamber_degC in np.unique(asked.chamber_degC).tolist():
+        known = _solutions([fold for fold in folds if fold.chamber_degC != chamber_degC])
+        here = np.isnan(asked.chamber_degC) if math.isnan(chamber_degC) else asked.chamber_degC == chamber_degC
         coefficients = np.stack([solution.coefficients for solution in known], axis=1)
-        terms = design(rows.measured_px[fold.rows], rows.camera_degC[fold.rows], degree, scaling)
-        residual[fold.rows] = rows.displacement_px[fold.rows] - terms @ coefficients
+        residual[here] -= design(asked.measured_px[here], asked.camera_degC[here], degree, scaling) @ coefficients
     return residual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fold:
-    """The rows (M,) of one chamber set-point, and their triangles for I and J."""
+    """How many rows one chamber set-point has, and their triangles for I and J."""
 
-    rows: Mask
+    chamber_degC: float
+    count: int
     triangles: tuple[Float, Float]
 
 
 def _condensed(rows: Displacements, degree: int, scaling: Scaling) -> list[_Fold]:
     """All rows, a fold for each chamber set-point."""
     folds: list[_Fold] = []
-    for chamber_degC in np.unique(rows.chamber_degC):
+    for chamber_degC in np.unique(rows.chamber_degC).tolist():
         here = rows.chamber_degC == chamber_degC
         terms = design(rows.measured_px[here], rows.camera_degC[here], degree, scaling)
         values, variance = rows.displacement_px[here], rows.variance_px2[here]
         i, j = (condense(terms, values[:, axis], variance[:, axis]) for axis in (0, 1))
-        folds.append(_Fold(here, (i, j)))
+        folds.append(_Fold(chamber_degC, int(here.sum()), (i, j)))
     return folds
 
 
 def _solutions(folds: Sequence[_Fold]) -> list[Solution]:
     """The fits of I and of J to all rows of the folds; LinAlgError when they do not determine them."""
-    count = sum(int(fold.rows.sum()) for fold in folds)
+    count = sum(fold.count for fold in folds)
     return [solve([fold.triangles[axis] for fold in folds], count) for axis in (0, 1)]
 
 

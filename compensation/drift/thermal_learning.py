@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.candidates import Candidate, discrepancy_px, fold_means
+from compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px
 from compensation.drift.displacements import Displacements
 from compensation.drift.facts import facts_of
 from compensation.drift.terms import MOTIONS, PLAYS_K, TAUS_S, TERMS, Kind, motions
@@ -36,12 +36,13 @@ times. Chosen on 48 drawn cameras, judged on 48 others (docs/decisions.md)."""
 @dataclass(frozen=True, slots=True, eq=False)
 class _Taught:
     """What was learned from. rows: of the frames at set-points; held_out (M, 2): their residuals, px, each from what
-    the others teach."""
+    the others teach. moving (M, 2): such residuals of frames that were not at rest."""
 
     trained: Training
     learned: Learned
     rows: Displacements
     held_out: Float
+    moving: Float
 
 
 def fit_thermal(observations: Observations) -> ThermalModel:
@@ -65,8 +66,10 @@ def _taught(trained: Training) -> _Taught:
             f"a thermal fit needs frames at {_FEWEST_FOLDS} chamber temperatures or more, found {len(set_points)}"
         )
     learned = learn(instants, trained.terms)
-    rows = trained.fold_rows.where(trained.at_rest)
-    return _Taught(trained, learned, rows, _held_out(trained, learned, rows, instants.chamber_degC, rows.chamber_degC))
+    rows, moving = trained.fold_rows.where(trained.at_rest), trained.moving_rows
+    held_out = _held_out(trained, learned, rows, instants.chamber_degC, rows.chamber_degC)
+    folds = trained.fold_of(instants.frame), trained.fold_of(moving.frame)
+    return _Taught(trained, learned, rows, held_out, _held_out(trained, learned, moving, *folds))
 
 
 def _held_out(
@@ -117,6 +120,7 @@ def _candidate(taught: _Taught) -> Candidate:
         name=form_name(terms),
         terms=MOTIONS * len(terms),
         rms_px=(float(i), float(j)),
+        moving_rms_px=moving_rms_px(taught.moving),
         chosen=True,
         fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
         fold_rms_px=tuple((float(i), float(j)) for i, j in np.sqrt(squares)),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compensation.drift.condensed import Instants, condense_instants
+from compensation.drift.candidates import between
+from compensation.drift.condensed import INSTANT_NS, Index, Instants, condense_instants
 from compensation.drift.displacements import Displacements, anchors, displacements
 from compensation.drift.terms import Kind, Origin, Term, features
 from compensation.history.states import Float, Memory, States
@@ -60,6 +61,29 @@ class Training:
     def at_rest(self) -> Mask:
         """(M,): which of the fold_rows are at set-points."""
         return self.set_points[self.fold_rows.frame]
+
+    @property
+    def moving_rows(self) -> Displacements:
+        """The rows of frames that were not at rest, of sessions with a reference: on the way to set-points between
+        others, and of a camera that was switched on lately; the chamber's temperature is NaN in these."""
+        observed = self.observations
+        known = np.unique(observed.session[observed.of(Role.REFERENCE)])
+        moving = observed.of(Role.WARM_UP) & np.isin(observed.session, known)
+        rows = self.rows.where(moving[self.rows.frame])
+        rows = replace(rows, chamber_degC=np.where(self.folds[rows.frame], rows.chamber_degC, np.nan))
+        on_the_way = np.isfinite(rows.chamber_degC)
+        asked = ~on_the_way
+        if on_the_way.any():
+            asked[on_the_way] = between(rows.chamber_degC[on_the_way])
+        return rows.where(asked)
+
+    def fold_of(self, frame: Index) -> Float:
+        """(M,): with which others these frames (M,) are left out: those of their set-point; of a camera that was
+        switched on lately those of four minutes, as numbers below all temperatures."""
+        observed = self.observations
+        pieces = (observed.time_ns[frame] - observed.time_ns.min()) // INSTANT_NS
+        at_set_point = self.folds[frame] & np.isfinite(observed.chamber_degC[frame])
+        return np.where(at_set_point, observed.chamber_degC[frame], -1000.0 - pieces)
 
     def instants(self) -> Instants:
         """The rows condensed."""

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.choosing import fit
+from compensation.drift.choosing import better, fit
 from compensation.drift.drift_model import DriftModel, Outside
 from compensation.drift.evaluation import evaluate
 from compensation.drift.facts import ModelFacts
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_fit import fit_paper
+from compensation.drift.paper_model import PaperModel
 from compensation.drift.terms import Kind
 from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
@@ -29,6 +30,7 @@ from .reservoirs import cycle, reference, session, warm_up
 from .synthetic import observations as without_histories
 from .synthetic import quadratic
 
+AT_REST = {"fold_chamber_degC": (10.0, 24.0, 38.0), "fold_rms_px": ((0.003, 0.003),) * 3}
 Seen = tuple[Observations, np.ndarray]
 
 
@@ -71,6 +73,20 @@ def test_what_is_asked_for_without_a_form_is_the_one_that_predicts_better(night:
     assert (asked.form, asked.other and asked.other.form) == ("paper", "thermal")
     alone = fit(without_histories(quadratic, 0.005))
     assert (alone.form, alone.other) == ("paper", None)
+
+
+def test_forms_that_are_as_good_at_rest_are_chosen_by_frames_that_were_not(night: Seen, thermal: ThermalModel):
+    paper = fit(night[0]).other
+    assert isinstance(paper, PaperModel)
+    alike = replace(paper, candidates=tuple(one.model_copy(update=AT_REST) for one in paper.candidates))
+    own = replace(thermal, candidates=tuple(one.model_copy(update=AT_REST) for one in thermal.candidates))
+    in_use = next(one for one in alike.candidates if one.chosen)
+    assert in_use.moving_rms_px is not None
+    assert own.candidates[0].moving_rms_px is not None
+    assert np.hypot(*in_use.moving_rms_px) > 5 * np.hypot(*own.candidates[0].moving_rms_px)
+    assert better(alike, own).form == "thermal"
+    unseen = [one.model_copy(update={"moving_rms_px": None}) for one in alike.candidates]
+    assert better(replace(alike, candidates=tuple(unseen)), own).form == "paper"
 
 
 @pytest.mark.parametrize("air_degC", [15.0, 34.0])
