@@ -129,9 +129,9 @@ def _roles(chamber_degC: Float, reference_degC: float | None) -> NDArray[np.str_
 def _history(air: tuple[ArrayLike, ArrayLike], instants: NDArray[np.int64], camera_degC: Float) -> History:
     """What lags are computed from; the camera's supply is on, for it has temperatures."""
     time_ns, degC = np.array(air[0], np.int64), np.array(air[1], np.float64)
-    good, told = np.isfinite(degC), np.isfinite(camera_degC)
+    good, measured = np.isfinite(degC), np.isfinite(camera_degC)
     nothing = np.empty(0, np.int64), np.empty(0)
-    return refined(History(time_ns[good], degC[good], *nothing, instants[told], camera_degC[told]))
+    return refined(History(time_ns[good], degC[good], *nothing, instants[measured], camera_degC[measured]))
 
 
 def _unnamed(count: int) -> Target:

@@ -151,8 +151,8 @@ class Drift:
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """As ThermalState.advance."""
         self._state.advance(dt_s, ambient_degC, power_on, camera_degC)
-        told = camera_degC if is_temperature(camera_degC) else math.nan
-        self._camera_degC = self._state.camera_degC if self._state.begun else told
+        measured = camera_degC if is_temperature(camera_degC) else math.nan
+        self._camera_degC = self._state.camera_degC if self._state.begun else measured
 
     def shift(self, points_px):
         """Displacement (N, 2), px, of points (N, 2) to where they would be at the reference; NaN before `advance`."""

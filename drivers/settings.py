@@ -94,10 +94,10 @@ class Identity:
     by_map: bool = False
 
     def __str__(self) -> str:
-        told = [f"serial number {self.serial_number}"] if self.serial_number else []
-        told += [f"version {self.version}"] if self.version else []
+        details = [f"serial number {self.serial_number}"] if self.serial_number else []
+        details += [f"version {self.version}"] if self.version else []
         named = " ".join(part for part in (self.vendor, self.model) if part) or "a device that does not tell its make"
-        return ", ".join([f"{named} (by its register map)" if self.by_map else named, *told])
+        return ", ".join([f"{named} (by its register map)" if self.by_map else named, *details])
 
     def is_another_than(self, before: Identity) -> bool:
         """Whether something that both state differs: one that states nothing cannot be distinguished from others of

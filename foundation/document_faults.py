@@ -110,14 +110,14 @@ def sentences(where: str, error: ValidationError, model: type[BaseModel], root: 
     faults = _causes([{**fault, "loc": yaml_text.place(fault)} for fault in error.errors()])
     more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
     listed: set[tuple[int | str, ...]] = set()  # places whose keys were listed
-    told: list[str] = []
+    details: list[str] = []
     for fault in faults[:_MOST_FAULTS]:
         advice = ""
         if fault["type"] == "extra_forbidden":
             advice = _about_key(fault["loc"], model, listed)
             listed.add(fault["loc"][:-1])
-        told.append(_sentence(where, fault, yaml_text, advice))
-    return "; ".join(told) + more
+        details.append(_sentence(where, fault, yaml_text, advice))
+    return "; ".join(details) + more
 
 
 def yaml_fault(error: yaml.YAMLError | ValueError) -> str:
@@ -171,15 +171,15 @@ def _sentence(where: str, fault: ErrorDetails, yaml_text: _Written, advice: str)
     text = words(fault, written) + advice
     if not place:  # about the whole: the sentence names what it is about
         return f"{where}: {text}"
-    value, told = fault["input"], list[str]()
+    value, details = fault["input"], list[str]()
     if isinstance(node, yaml.ScalarNode) and value is None and not node.value:
-        told.append("nothing stands behind the key")
+        details.append("nothing stands behind the key")
     elif not isinstance(value, dict | list) and value is not None and fault["type"] != "extra_forbidden":
-        told.append(f"got {_shown(value)}")
+        details.append(f"got {_shown(value)}")
     if line is not None:
-        told.append(f"line {line}")
+        details.append(f"line {line}")
     path = ".".join(str(part) for part in place if part != "[key]")
-    return f"{where}: {path}: {text}" + (f" ({', '.join(told)})" if told else "")
+    return f"{where}: {path}: {text}" + (f" ({', '.join(details)})" if details else "")
 
 
 def _number(place: Place, value: object, *, whole: bool) -> str:

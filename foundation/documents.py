@@ -45,9 +45,9 @@ class _Strict(yaml.constructor.SafeConstructor):
         number, written = super().construct_yaml_int(node), node.value
         if _OCTAL.fullmatch(written) or ":" in written:
             base = "60" if ":" in written else "8"
-            told = f"{written} is {number} in YAML, a number to base {base}; put it in quotes, '{written}'"
-            told += "" if ":" in written else f", or write {written.lstrip('0')}"
-            raise yaml.constructor.ConstructorError(None, None, told, node.start_mark)
+            advice = f"{written} is {number} in YAML, a number to base {base}; put it in quotes, '{written}'"
+            advice += "" if ":" in written else f", or write {written.lstrip('0')}"
+            raise yaml.constructor.ConstructorError(None, None, advice, node.start_mark)
         return number
 
 

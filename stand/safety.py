@@ -18,7 +18,7 @@ from foundation.tasks import first_of
 
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
 _PAUSE_S = 1.0  # between tries
-_TOLD_EVERY_S = 60.0
+_REPORTED_EVERY_S = 60.0
 _GIVEN_UP_AFTER_S = 60.0  # before that, a second signal does not end it
 
 
@@ -116,7 +116,7 @@ class Safety:
         self._revoke = revoke
         self._hub = hub
         self._clock = clock
-        self._told: dict[_Maker, str] = {}
+        self._reported: dict[_Maker, str] = {}
         self._changed = asyncio.Event()  # set, and replaced, when something was tried
         self._unsafe_since_ns: int | None = None
         self._given_up = False
@@ -190,7 +190,7 @@ class Safety:
         end_ns = self._clock.now_ns() + seconds_ns(limit_s)
         await self.tried()
         while not self.is_confirmed and not self._given_up and self._clock.now_ns() < end_ns:
-            due_ns = min(end_ns, self._clock.now_ns() + seconds_ns(_TOLD_EVERY_S))
+            due_ns = min(end_ns, self._clock.now_ns() + seconds_ns(_REPORTED_EVERY_S))
             if not await self._changes_before(due_ns) and not self.is_confirmed:
                 text = f"still trying: {'; '.join(self.unconfirmed)}"
                 self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text, self._data()))
@@ -222,13 +222,13 @@ class Safety:
     def _tell(self) -> None:
         """Each new reason, and the end of the last one."""
         for maker in self._makers:
-            if maker.failure and self._told.get(maker) != maker.failure:
-                self._told[maker] = maker.failure
+            if maker.failure and self._reported.get(maker) != maker.failure:
+                self._reported[maker] = maker.failure
                 data: dict[str, object] = {"unconfirmed": [maker.failure]}
                 event = Event(self._clock.now_ns(), "error", "not_confirmed_safe", maker.failure, data)
                 self._hub.publish(event)
-        if self._told and self.is_confirmed:
-            self._told.clear()
+        if self._reported and self.is_confirmed:
+            self._reported.clear()
             self._hub.publish(Event(self._clock.now_ns(), "info", "confirmed_safe", "the stand is safe"))
 
     def _data(self) -> dict[str, object]:

@@ -30,8 +30,8 @@ class Repeatability:
 
 def home_residuals(events: Sequence[Event], unit: str) -> Repeatability:
     """Where the axes that move in `unit` (mm or deg) found their homes, against where they expected them."""
-    told = [event.data for event in events if event.kind in _HOME_KINDS and event.data.get("unit") == unit]
-    found = [float(residual) for data in told if isinstance(residual := data.get("residual"), int | float)]
+    recorded = [event.data for event in events if event.kind in _HOME_KINDS and event.data.get("unit") == unit]
+    found = [float(residual) for data in recorded if isinstance(residual := data.get("residual"), int | float)]
     return Repeatability(_rms(np.array(found)), unit, len(found))
 
 

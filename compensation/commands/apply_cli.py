@@ -216,9 +216,9 @@ def _without_history(model: DriftModel) -> DriftModel:
 
 def _recorded_states(model: DriftModel, session: Session, time_ns: Sequence[int]) -> States:
     """The thermal state at each instant, of which the same may come many times and in any order."""
-    told = {frame_ns: meta.camera_degC for frame_ns, meta in session.frame_metas}
+    recorded_degC = {frame_ns: meta.camera_degC for frame_ns, meta in session.frame_metas}
     instants, where = np.unique(np.array(time_ns, np.int64), return_inverse=True)
-    camera_degC = np.array([told.get(instant, math.nan) for instant in instants.tolist()])
+    camera_degC = np.array([recorded_degC.get(instant, math.nan) for instant in instants.tolist()])
     return states_at(recorded_history(session), model.memory, instants, camera_degC).where(where)
 
 

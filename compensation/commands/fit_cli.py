@@ -82,12 +82,12 @@ def fit(
         save_model(model, out)
         bumps = list(model.facts.bumps)
         unrepeated = find_unrepeated(observations, model.facts.bumps)
-        told = [one for one in unrepeated if one.cause is not Cause.NOTHING]
+        named = [one for one in unrepeated if one.cause is not Cause.NOTHING]
         data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
         stepped = [_bump_line(each, observations) for each in bumps]
-        stepped += [f"{one.session_id}: {one.text}" for one in told]
+        stepped += [f"{one.session_id}: {one.text}" for one in named]
         lines = [f"{model.form}: {model.title}", *stepped, table(evaluation)]
-        show({**data, "unrepeated": told, **_scores(evaluation)}, lines)
+        show({**data, "unrepeated": named, **_scores(evaluation)}, lines)
 
 
 def _bump_line(bump: Bump, observations: Observations) -> str:

@@ -65,15 +65,15 @@ def surroundings(observations: Observations, ramp_K_per_min: float) -> Surroundi
     history = observations.histories[-1] if observations.histories else None
     if history is None or not history.has_ambient or len(history.camera_ns) < 10 * _EVERY:
         raise SessionError("the session has no history of air and camera; nothing can be foreseen")
-    at_ns, told = history.camera_ns[::_EVERY], history.camera_degC[::_EVERY]
-    states = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, told)
+    at_ns, recorded_degC = history.camera_ns[::_EVERY], history.camera_degC[::_EVERY]
+    states = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, recorded_degC)
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
     # While it warms up the supply's lags explain it; of a camera that has been on for long they are 1.
     terms = np.column_stack([np.ones(len(air)), air, states.ambient_lag_degC, states.power_lag - 1])
-    known = np.isfinite(terms).all(axis=1) & np.isfinite(told)
+    known = np.isfinite(terms).all(axis=1) & np.isfinite(recorded_degC)
     normal = terms[known].T @ terms[known]
     damped = normal + _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
-    weights = np.linalg.solve(damped, terms[known].T @ told[known])
+    weights = np.linalg.solve(damped, terms[known].T @ recorded_degC[known])
     return Surroundings(_air(observations), weights[: 2 + len(_CAMERA_TAUS_S)], ramp_K_per_min)
 
 
@@ -91,10 +91,10 @@ def now(observations: Observations, memory: Memory) -> Situation:
     """At the last frame of the last session."""
     history = observations.histories[-1]
     own = observations.session == len(observations.sessions) - 1
-    at_ns, told = observations.time_ns[own][-1:], observations.camera_degC[own][-1:]
-    lags = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, told).ambient_lag_degC
+    at_ns, recorded_degC = observations.time_ns[own][-1:], observations.camera_degC[own][-1:]
+    lags = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, recorded_degC).ambient_lag_degC
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
-    return Situation(air, air, lags, states_at(history, memory, at_ns, told))
+    return Situation(air, air, lags, states_at(history, memory, at_ns, recorded_degC))
 
 
 def at_rest(around: Surroundings, set_points_degC: Float, memory: Memory) -> Situation:

@@ -28,7 +28,7 @@ def recorded_so_far(session: Path) -> Observations:
             for segment in sorted((session / series).iterdir()) if (session / series).is_dir() else ():
                 _taken(segment, copy / series)
         salvage_unfinished(Path(folder))
-        observed = observe(copy, incomplete=_nobody_told)
+        observed = observe(copy, incomplete=_unreported)
         history = recorded_history(Session.open(copy), int(observed.time_ns[-1]))
         return replace(observed, histories=(history,))
 
@@ -47,5 +47,5 @@ def _taken(segment: Path, folder: Path) -> None:
         (folder / finished.name).symlink_to(finished.absolute())
 
 
-def _nobody_told(sentence: str) -> None:
+def _unreported(sentence: str) -> None:
     """A night under way lacks its rest."""

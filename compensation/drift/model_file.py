@@ -246,9 +246,9 @@ def _thermal(file: ThermalFile) -> ThermalModel:
 
 def _blocks(file: ThermalFile, count: int) -> Float:
     """(8, H, H)."""
-    told = file.coefficient_covariance_px2
-    whole = bool(told) and len(told[0]) == MOTIONS * count
-    rows = _shaped("coefficient_covariance_px2", told, (MOTIONS * count, MOTIONS * count if whole else count))
+    given = file.coefficient_covariance_px2
+    whole = bool(given) and len(given[0]) == MOTIONS * count
+    rows = _shaped("coefficient_covariance_px2", given, (MOTIONS * count, MOTIONS * count if whole else count))
     return np.stack([rows[k : k + count, k if whole else 0 :][:, :count] for k in range(0, len(rows), count)])
 
 

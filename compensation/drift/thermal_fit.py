@@ -3,8 +3,8 @@
 amount = features . c + wander + noise. The coefficients c of each group of terms are Gaussian about 0, as wide as makes
 the night most likely (its evidence: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.1
 and 5.4): a camera that no play moves gets coefficients of plays near 0, and a state unlike those of the night an
-uncertain answer. The wander (Ornstein-Uhlenbeck) is of fixings that slip or settle anew; without it a hundred frames of
-one dwell would count as a hundred answers.
+uncertain answer. The wander (Ornstein-Uhlenbeck) is of fixings that slip or settle again; without it a hundred frames
+of one dwell would count as a hundred answers.
 """
 
 from __future__ import annotations
@@ -136,12 +136,12 @@ def _weightings(instants: Instants, variance: Float) -> Iterator[_Weighting]:
 
 def _equations(features: Float, amounts: Float, weighting: _Weighting, left_out: Index | None = None) -> _Equations:
     """Without the instants that are left out: the precision of the others is B - B_rf B_ff^-1 B_fr."""
-    weighted, told = weighting.precision @ features, weighting.precision @ amounts
-    gram, moment, square = features.T @ weighted, features.T @ told, (amounts * told).sum(axis=0)
+    weighted, projected = weighting.precision @ features, weighting.precision @ amounts
+    gram, moment, square = features.T @ weighted, features.T @ projected, (amounts * projected).sum(axis=0)
     count = len(features)
     if left_out is not None:
         own = np.linalg.inv(weighting.precision[np.ix_(left_out, left_out)]) @ weighted[left_out]
-        gram, moment = gram - weighted[left_out].T @ own, moment - own.T @ told[left_out]
+        gram, moment = gram - weighted[left_out].T @ own, moment - own.T @ projected[left_out]
         count -= len(left_out)
     return _Equations(gram, moment, square, count, weighting.log_determinant)
 
@@ -162,18 +162,18 @@ def _most_likely(known: _Equations, motion: int, group: Index, start: Float) -> 
         widths, per_noise = np.exp(logs[group]), math.exp(-2 * logs[-1])
         explained = widths[:, None] * known.gram * widths * per_noise
         inverse = np.linalg.inv(explained + np.eye(len(group)))
-        told = widths * moment * per_noise
-        found = inverse @ told
+        projected = widths * moment * per_noise
+        found = inverse @ projected
         free = np.diagonal(inverse)
         beyond = (logs[:-1] - _USUAL) / _UNSURE
         value = (
-            0.5 * float(square * per_noise - told @ found)
+            0.5 * float(square * per_noise - projected @ found)
             - 0.5 * float(np.linalg.slogdet(inverse)[1])
             + known.count * float(logs[-1])
             + 0.5 * (known.log_determinant + float(beyond @ beyond))
         )
         of_widths = np.bincount(group, 1 - free - found**2, groups) + beyond / _UNSURE
-        left = square * per_noise - 2 * told @ found + found @ explained @ found
+        left = square * per_noise - 2 * projected @ found + found @ explained @ found
         return value, np.append(of_widths, known.count - left - (len(group) - free.sum()))
 
     limits = [_WIDTHS] * groups + [_NOISES]

@@ -79,19 +79,19 @@ def refined(history: History) -> History:
     step_K = _step_K(history.camera_degC)
     if step_K < _FINE_K or not history.has_ambient or len(history.camera_ns) < _FEWEST_READINGS:
         return history
-    told, seconds = history.camera_degC, (history.camera_ns - history.camera_ns[0]) / NS_PER_S
-    states = states_at(history, Memory(_SHAPE_TAUS_S), history.camera_ns, told)
+    shown, seconds = history.camera_degC, (history.camera_ns - history.camera_ns[0]) / NS_PER_S
+    states = states_at(history, Memory(_SHAPE_TAUS_S), history.camera_ns, shown)
     ambient = interpolated(history.ambient_ns, history.ambient_degC, history.camera_ns, GAP_NS)
-    terms = np.column_stack([np.ones(len(told)), ambient, states.ambient_lag_degC, states.power_lag])
+    terms = np.column_stack([np.ones(len(shown)), ambient, states.ambient_lag_degC, states.power_lag])
     known = np.isfinite(terms).all(axis=1)
-    shape = np.where(known, terms @ _least_squares(terms[known], told[known]), told)
-    changes = np.flatnonzero((np.diff(told) != 0) & (np.diff(history.camera_ns) < _CHANGE_NS))
+    shape = np.where(known, terms @ _least_squares(terms[known], shown[known]), shown)
+    changes = np.flatnonzero((np.diff(shown) != 0) & (np.diff(history.camera_ns) < _CHANGE_NS))
     if len(changes) == 0:
         return history
     middle_s = (seconds[changes] + seconds[changes + 1]) / 2
-    edge_degC = (told[changes] + told[changes + 1]) / 2
+    edge_degC = (shown[changes] + shown[changes + 1]) / 2
     shift = np.interp(seconds, middle_s, edge_degC - np.interp(middle_s, seconds, shape))
-    camera_degC = np.clip(shape + shift, told - step_K / 2, told + step_K / 2)
+    camera_degC = np.clip(shape + shift, shown - step_K / 2, shown + step_K / 2)
     return replace(history, camera_degC=camera_degC, resolution_K=step_K)
 
 
@@ -162,10 +162,10 @@ def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: 
     within the display's step by the whole record."""
     camera = interpolated(history.camera_ns, history.camera_degC, marks_ns, GAP_NS)
     at = np.searchsorted(marks_ns, time_ns)
-    told = np.isfinite(camera_degC) & (time_ns >= marks_ns[0])
-    known, half_K = camera[at[told]], history.resolution_K / 2
-    own = camera_degC[told]
-    camera[at[told]] = np.where(np.isfinite(known), np.clip(known, own - half_K, own + half_K), own)
+    shown = np.isfinite(camera_degC) & (time_ns >= marks_ns[0])
+    known, half_K = camera[at[shown]], history.resolution_K / 2
+    own = camera_degC[shown]
+    camera[at[shown]] = np.where(np.isfinite(known), np.clip(known, own - half_K, own + half_K), own)
     return camera
 
 

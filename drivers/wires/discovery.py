@@ -68,8 +68,8 @@ def serial_ports() -> tuple[SerialPort, ...]:
     for port in list_ports.comports():
         if port.hwid == "n/a":
             continue  # a name in /dev without hardware behind it
-        told = (port.manufacturer or "", port.product or port.description or "")
-        words = " ".join(dict.fromkeys(word for word in told if word and word != "n/a"))
+        names = (port.manufacturer or "", port.product or port.description or "")
+        words = " ".join(dict.fromkeys(word for word in names if word and word != "n/a"))
         what = _KNOWN_USB.get((port.vid or 0, port.pid or 0), words)
         found.append(SerialPort(lasting.get(Path(port.device).resolve(), port.device), what, port.serial_number or ""))
     return tuple(sorted(found, key=lambda port: port.address))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from drivers.settings import Identity, same_device
 from drivers.wires.bus import Bus
-from drivers.wires.registers import Command, Point, PointType, RegisterMap, Space, Split, Told
+from drivers.wires.registers import Command, IdentityPoint, Point, PointType, RegisterMap, Space, Split
 from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 
 WRITE_TRIES = 2
@@ -86,31 +86,31 @@ class ModbusUnit:
                 raise DeviceFault(
                     self.name, f"{probe.point} is {found:g} where the register map expects {probe.expect:g}; not used"
                 )
-        self.identity = same_device(self.name, await self._told(), self.identity)
+        self.identity = same_device(self.name, await self._read_identity(), self.identity)
 
-    async def _told(self) -> Identity:
+    async def _read_identity(self) -> Identity:
         """What the unit tells of itself; vendor and model are otherwise those of the map."""
-        told = {field: await self._told_one(told) for field, told in self.map.identity.items()}
-        model = told.get("model", "")
+        stated = {field: await self._identity_field(stated) for field, stated in self.map.identity.items()}
+        model = stated.get("model", "")
         return Identity(
             self.map.vendor,
             f"{self.map.model} {model}".rstrip(),
-            told.get("serial_number", ""),
-            told.get("version", ""),
+            stated.get("serial_number", ""),
+            stated.get("version", ""),
             by_map=not model,
         )
 
-    async def _told_one(self, told: Told) -> str:
+    async def _identity_field(self, stated: IdentityPoint) -> str:
         """Nothing when the unit does not have the point: it refuses it, or one that was never seen cannot be read."""
         try:
-            sample = (await self.snapshot([told.point])).samples[told.point]
+            sample = (await self.snapshot([stated.point])).samples[stated.point]
         except DeviceError as error:
-            if isinstance(error, Refused) or self.map.points[told.point].unverified:
+            if isinstance(error, Refused) or self.map.points[stated.point].unverified:
                 return ""
             raise
         if sample.reason:
             return ""
-        return f"{sample.value:g}" if told.shown == "number" else f"{sample.raw:#x}"
+        return f"{sample.value:g}" if stated.shown == "number" else f"{sample.raw:#x}"
 
     async def write(self, point_name: str, value: float) -> float:
         """Write a register point and read it back; the value as the unit took it, rounded to its scale.

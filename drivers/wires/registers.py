@@ -158,7 +158,7 @@ class Probe(Document):
     expect: float
 
 
-class Told(Document):
+class IdentityPoint(Document):
     """A point by which the unit tells what it is, read as a number (scaled) or as hexadecimal digits."""
 
     point: str
@@ -177,7 +177,7 @@ class RegisterMap(Document):
     when_silent: str = ""
     transport: Transport
     probe: tuple[Probe, ...] = ()
-    identity: dict[Literal["serial_number", "model", "version"], Told] = Field(default_factory=dict)
+    identity: dict[Literal["serial_number", "model", "version"], IdentityPoint] = Field(default_factory=dict)
     points: dict[str, Point] = Field(min_length=1)
     fault_bits: tuple[str, ...] = ()
     commands: dict[str, Command] = Field(default_factory=dict)

@@ -81,8 +81,8 @@ def archive(entry: Entry, to: Path, by: str, now_ns: int, report: Report = lambd
             _check_same(part, sums, report)
             if contents_of(entry.path) != contents:
                 raise SessionError(f"{entry.path}: has changed while it was copied; try again")
-            told = {"contents": contents, "session": entry.name, "blake2b": sums}
-            replace_file(part / MANIFEST, json.dumps(told, indent=1).encode())
+            manifest = {"contents": contents, "session": entry.name, "blake2b": sums}
+            replace_file(part / MANIFEST, json.dumps(manifest, indent=1).encode())
             part.rename(copy)
             sync_folder(to)
         add_archived(entry.path, Archived(str(copy.resolve()), now_ns, contents), by)
@@ -192,8 +192,8 @@ def _copied(source: Path, target: Path, report: Report) -> str:
             written.flush()
             os.fsync(written.fileno())
     if not is_there:
-        told = source.stat()
-        os.utime(growing, ns=(told.st_atime_ns, told.st_mtime_ns))
+        status = source.stat()
+        os.utime(growing, ns=(status.st_atime_ns, status.st_mtime_ns))
         growing.replace(target)
         sync_folder(target.parent)
     return digest.hexdigest()

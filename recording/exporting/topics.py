@@ -42,6 +42,6 @@ def _channels(session: Session) -> list[Channel]:
         if path.parent.name != TELEMETRY:
             continue
         with reading(path), path.open("rb") as file:
-            told = read_summary(file, path.stat().st_size).channels()
-        channels += [told[number][0] for number in sorted(told)]
+            numbered = read_summary(file, path.stat().st_size).channels()
+        channels += [numbered[number][0] for number in sorted(numbered)]
     return channels

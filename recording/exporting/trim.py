@@ -71,8 +71,8 @@ def _metadata(session: Session, begin_ns: int, end_ns: int) -> dict[str, str]:
         begin_ns, end_ns = max(begin_ns, before.begin_ns), min(end_ns, before.end_ns)
     extent = Extent(session.metadata.get("session_id", session.path.name), begin_ns, end_ns, session.run)
     holes = [part for hole in session.holes if (part := hole.within(begin_ns, end_ns)) is not None]
-    told = {"format": str(FORMAT), "extent": extent.record(), "holes": holes_text(holes)}
-    return {**session.metadata, **{name: text for name, text in told.items() if text}}
+    extra = {"format": str(FORMAT), "extent": extent.record(), "holes": holes_text(holes)}
+    return {**session.metadata, **{name: text for name, text in extra.items() if text}}
 
 
 def _places(session: Session) -> Iterator[FramePlace]:

@@ -189,9 +189,9 @@ def _files(path: Path) -> list[_File] | None:
                 for entry in entries:
                     name = entry.name
                     if name.endswith(_SUFFIXES):
-                        told = entry.stat()
+                        status = entry.stat()
                         is_open = name.endswith(UNFINISHED) and is_locked(Path(entry.path))
-                        found.append((f"{series}/{name}", told.st_size, told.st_mtime_ns, is_open))
+                        found.append((f"{series}/{name}", status.st_size, status.st_mtime_ns, is_open))
         except OSError:  # not there, or removed meanwhile
             continue
     if not found:
@@ -199,10 +199,10 @@ def _files(path: Path) -> list[_File] | None:
     found.sort()
     for name in (JOURNAL_NAME, NOTES_NAME):
         try:
-            told = os.stat(f"{place}/{name}")
+            status = os.stat(f"{place}/{name}")
         except OSError:
             continue
-        found.append((name, told.st_size, told.st_mtime_ns, False))
+        found.append((name, status.st_size, status.st_mtime_ns, False))
     return found
 
 

@@ -31,7 +31,7 @@ class Coverage:
     is_ended: bool
     holes: tuple[Hole, ...]
 
-    def is_told(self, series: str, time_ns: int) -> bool:
+    def is_reported(self, series: str, time_ns: int) -> bool:
         """Whether the session's own record says that the series lacks that instant."""
         return any(hole.series == series and hole.covers(time_ns) for hole in self.holes)
 

@@ -62,8 +62,8 @@ def frames_of_plan(events: Iterable[Event], frames: int) -> str:
     """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the recording has no number
     of planned frames (format 1 has none), or when there are as many."""
     planned = [event.data.get("frames") for event in events if event.kind in TELL_PLAN]
-    told = planned[-1] if planned else None
-    return f"; {frames} of the {told} frames of the plan are there" if isinstance(told, int) and frames < told else ""
+    last = planned[-1] if planned else None
+    return f"; {frames} of the {last} frames of the plan are there" if isinstance(last, int) and frames < last else ""
 
 
 def is_of_a_run(events: Iterable[Event], marks: Iterable[StepMark]) -> bool:

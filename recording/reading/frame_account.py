@@ -14,12 +14,13 @@ from recording.reading.coverage import Coverage
 @dataclass(frozen=True, slots=True)
 class FrameAccount:
     """Keys of frames. bare: images without a description; gone: descriptions without an image, in both cases without
-    a reason. bare_torn, gone_torn: lost when the recorder was killed. gone_told: lost by the recorder, as it said."""
+    a reason. bare_torn, gone_torn: lost when the recorder was killed. gone_reported: lost by the recorder, as it
+    said."""
 
     bare: tuple[FrameKey, ...]
     bare_torn: tuple[FrameKey, ...]
     gone: tuple[FrameKey, ...]
-    gone_told: tuple[FrameKey, ...]
+    gone_reported: tuple[FrameKey, ...]
     gone_torn: tuple[FrameKey, ...]
 
 
@@ -27,12 +28,12 @@ def frame_account(
     images: Counter[FrameKey],
     block_ids: Mapping[FrameKey, int],
     described: Counter[FrameKey],
-    told: Iterable[range],
+    reported: Iterable[range],
     coverage: Coverage,
     is_damaged_at: Callable[[str, int], bool] = lambda series, time_ns: False,
 ) -> FrameAccount:
-    """`told`: blocks that the recorder reported as lost. What was not read, is damaged (`is_damaged_at`) or is missing
-    by the session's own record may have what is looked for: such frames are in none of the lists."""
+    """`reported`: blocks that the recorder reported as lost. What was not read, is damaged (`is_damaged_at`) or is
+    missing by the session's own record may have what is looked for: such frames are in none of the lists."""
 
     def unexplained(keys: Iterable[FrameKey], series: str) -> list[FrameKey]:
         unread = coverage.unread(series)
@@ -40,20 +41,20 @@ def frame_account(
             key
             for key in keys
             if not is_damaged_at(series, key[0])
-            and not coverage.is_told(series, key[0])
+            and not coverage.is_reported(series, key[0])
             and not any(begin < key[0] < end for begin, end in unread)
         ]
 
     bare = unexplained(images - described, TELEMETRY)
     gone = unexplained(described - images, FRAMES)
-    told = tuple(told)
+    reported = tuple(reported)
     bare_torn = tuple(key for key in bare if coverage.is_torn_at(TELEMETRY, key[0]))
-    gone_told = tuple(key for key in gone if any(block_ids[key] in blocks for blocks in told))
-    gone_torn = tuple(key for key in gone if key not in gone_told and coverage.is_torn_at(FRAMES, key[0]))
+    gone_reported = tuple(key for key in gone if any(block_ids[key] in blocks for blocks in reported))
+    gone_torn = tuple(key for key in gone if key not in gone_reported and coverage.is_torn_at(FRAMES, key[0]))
     return FrameAccount(
         tuple(key for key in bare if key not in bare_torn),
         bare_torn,
-        tuple(key for key in gone if key not in {*gone_told, *gone_torn}),
-        gone_told,
+        tuple(key for key in gone if key not in {*gone_reported, *gone_torn}),
+        gone_reported,
         gone_torn,
     )

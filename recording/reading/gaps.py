@@ -117,11 +117,11 @@ def _names(hole: _Hole, channels: frozenset[str]) -> list[str]:
     return [hole.device] if hole.channels == channels else sorted(hole.channels)
 
 
-def told_blocks(events: Iterable[Event]) -> list[range]:
+def reported_blocks(events: Iterable[Event]) -> list[range]:
     """The block ids of frames that the recorder itself said it lost: `blocks` of the events' data, pairs of the first
     and the last. What is no such pair is left out: a session may be from anybody."""
-    told = [event.data.get("blocks") for event in events if event.kind == FRAMES_DROPPED]
-    pairs = [pair for blocks in told if isinstance(blocks, list) for pair in cast("list[object]", blocks)]
+    reported = [event.data.get("blocks") for event in events if event.kind == FRAMES_DROPPED]
+    pairs = [pair for blocks in reported if isinstance(blocks, list) for pair in cast("list[object]", blocks)]
     return [range(first, last + 1) for first, last in map(_pair, pairs) if 0 <= first <= last <= _LAST_BLOCK]
 
 

@@ -106,9 +106,9 @@ class _Seen(NamedTuple):
     @property
     def link(self) -> Link:
         """Its place in the chain."""
-        told = self.summary.statistics
-        times_ns = (told.message_start_time, told.message_end_time)
-        return Link(self.file.series, self.file.number, told.message_count, *times_ns, bool(self.head.salvaged))
+        totals = self.summary.statistics
+        times_ns = (totals.message_start_time, totals.message_end_time)
+        return Link(self.file.series, self.file.number, totals.message_count, *times_ns, bool(self.head.salvaged))
 
 
 class _Near(NamedTuple):
@@ -132,7 +132,7 @@ def glance(path: Path) -> Glance:
             except SessionError as error:
                 troubles.append(within(path, error))
     metadata, attachments = _opening(files, seen)
-    told = [each.summary.statistics for each in seen if each.summary.statistics.message_count]
+    totals = [each.summary.statistics for each in seen if each.summary.statistics.message_count]
     near, journal = _near([each for each in seen if each.file.series == TELEMETRY]), journal_facts(path)
     extent, utc = extent_of(metadata), offsets_of(near.events)
     links = {each.file.name: each.link for each in seen}
@@ -150,8 +150,8 @@ def glance(path: Path) -> Glance:
         metadata,
         attachments,
         sum(each.summary.statistics.message_count for each in seen if each.file.series == FRAMES),
-        min((statistics.message_start_time for statistics in told), default=None),
-        max((statistics.message_end_time for statistics in told), default=None),
+        min((statistics.message_start_time for statistics in totals), default=None),
+        max((statistics.message_end_time for statistics in totals), default=None),
         tuple(troubles),
         tuple(missing),
         utc,

@@ -16,7 +16,7 @@ from recording.reading.contents import Contents, FrameKey
 from recording.reading.coverage import Coverage
 from recording.reading.ends import lost_end
 from recording.reading.frame_account import FrameAccount, frame_account
-from recording.reading.gaps import told_blocks
+from recording.reading.gaps import reported_blocks
 from recording.reading.journal_lines import JournalFacts
 
 
@@ -33,7 +33,7 @@ def find_holes(
     images = Counter((time_ns, 0) for time_ns in image_times_ns)
     described = Counter((key[0], 0) for key, _ in contents.metas)
     block_ids = {(key[0], 0): meta.block_id for key, meta in contents.metas}
-    account = frame_account(images, block_ids, described, told_blocks(contents.events), coverage)
+    account = frame_account(images, block_ids, described, reported_blocks(contents.events), coverage)
     gaps = {series: tuple(_gaps(series, coverage)) for series in (TELEMETRY, FRAMES)}
     if not is_part:
         has_gap = gaps[TELEMETRY] or any(hole.series == TELEMETRY for hole in coverage.holes)
@@ -85,4 +85,4 @@ def _stretches(series: str, keys: set[FrameKey], every: Sequence[FrameKey], *, e
 
 def _excused(account: FrameAccount, every: Sequence[FrameKey]) -> Iterator[Hole]:
     yield from _stretches(TELEMETRY, set(account.bare_torn), every, excused=True)
-    yield from _stretches(FRAMES, {*account.gone_told, *account.gone_torn}, every, excused=True)
+    yield from _stretches(FRAMES, {*account.gone_reported, *account.gone_torn}, every, excused=True)

@@ -84,8 +84,8 @@ def journal_facts(directory: Path) -> JournalFacts | None:
     except OSError as error:
         return JournalFacts(damage=f"cannot be read ({error.strerror})")
     last = next((entry for text in reversed(lines.sound) if (entry := _fields(text)) is not None), dict[str, object]())
-    told = (text for text in lines.sound if b'"done"' in text or b'"Gap"' in text)  # the others take seconds to decode
-    entries = [entry for text in told if (entry := _fields(text)) is not None]
+    few = (text for text in lines.sound if b'"done"' in text or b'"Gap"' in text)  # the others take seconds to decode
+    entries = [entry for text in few if (entry := _fields(text)) is not None]
     is_end = last.get("entry") == "Ended"
     done = (entry.get("step_id") for entry in entries if entry.get("entry") == "Step" and entry.get("state") == "done")
     last_ns = _instant(last.get("time_ns"))

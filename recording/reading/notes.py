@@ -110,10 +110,10 @@ def _append(directory: Path, fields: Mapping[str, object]) -> None:
         fd = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX)
-            told = os.fstat(fd)
-            if not stat.S_ISREG(told.st_mode) or told.st_size + len(line) > LIMIT_BYTES:
+            status = os.fstat(fd)
+            if not stat.S_ISREG(status.st_mode) or status.st_size + len(line) > LIMIT_BYTES:
                 raise SessionError(f"{path}: is no file of notes, or is full")
-            torn = told.st_size and os.pread(fd, 1, told.st_size - 1) != b"\n"
+            torn = status.st_size and os.pread(fd, 1, status.st_size - 1) != b"\n"
             os.write(fd, b"\n" + line if torn else line)
             os.fsync(fd)
         finally:

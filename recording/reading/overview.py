@@ -19,7 +19,7 @@ from recording.format.layout import FRAMES
 from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
 from recording.format.utc_offsets import UtcOffsets, offsets_of
 from recording.reading.contents import RUN_END, TELL_PLAN, Channel, Contents
-from recording.reading.gaps import Silence, silences, told_blocks
+from recording.reading.gaps import Silence, reported_blocks, silences
 from recording.reading.glance import Glance, glance, within
 from recording.reading.run_word import Files
 
@@ -88,8 +88,8 @@ class Overview:
     def planned_steps(self) -> int | None:
         """How many steps the plan of the run has, None when that is not recorded, as in format 1."""
         begins = [event.data.get("steps") for event in self.events if event.kind in TELL_PLAN]
-        told = begins[-1] if begins else None
-        return told if isinstance(told, int) else None
+        planned = begins[-1] if begins else None
+        return planned if isinstance(planned, int) else None
 
     @property
     def ending(self) -> Event | None:
@@ -176,7 +176,7 @@ def _frames(seen: Glance, read: _Reading) -> Frames:
         max(times_ns, default=None),
         len(contents.metas),
         sum(meta.dropped for _, meta in contents.metas),
-        sum(map(len, told_blocks(contents.events))),
+        sum(map(len, reported_blocks(contents.events))),
     )
 
 

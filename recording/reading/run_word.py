@@ -37,8 +37,8 @@ _STOPPED_BY_OPERATOR = "interrupted"  # what the journals of format 1 call it
 
 def last_run_event(events: Iterable[Event]) -> Event | None:
     """The last event of a run's beginning or end; None when none is recorded."""
-    told = [event for event in events if event.kind in (*RUN_BEGINS, RUN_END)]
-    return max(told, key=lambda event: event.time_ns, default=None)
+    marks = [event for event in events if event.kind in (*RUN_BEGINS, RUN_END)]
+    return max(marks, key=lambda event: event.time_ns, default=None)
 
 
 def run_word(events: Iterable[Event], journal: JournalFacts | None, *, is_recording: bool = False) -> Run:
@@ -47,8 +47,8 @@ def run_word(events: Iterable[Event], journal: JournalFacts | None, *, is_record
     if is_recording:
         return Run.RUNNING
     last = last_run_event(events)
-    told_ns = -1 if last is None else last.time_ns
-    if journal is not None and (journal.last_ns > told_ns or (journal.status and journal.last_ns == told_ns)):
+    ended_ns = -1 if last is None else last.time_ns
+    if journal is not None and (journal.last_ns > ended_ns or (journal.status and journal.last_ns == ended_ns)):
         return _journaled(journal.status)
     if last is None or last.kind != RUN_END:
         return Run.INTERRUPTED

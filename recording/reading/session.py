@@ -62,7 +62,7 @@ from recording.reading.journal_lines import journal_facts
 from recording.reading.run_word import Run, run_word
 
 T = TypeVar("T")
-_HOLES_TOLD_BY = (messages.CAMERA_META, messages.EVENT, messages.STEP)
+_TOPICS_OF_HOLES = (messages.CAMERA_META, messages.EVENT, messages.STEP)
 _NUMBER_DIGITS = 18
 
 
@@ -329,7 +329,7 @@ class Session:
         """What of the session is not there, of the telemetry first; those that are excused make it no less whole. Reads
         the telemetry once."""
         contents = Contents()
-        for message in self._decoded(lambda channel: channel.topic in _HOLES_TOLD_BY, lambda message: message):
+        for message in self._decoded(lambda channel: channel.topic in _TOPICS_OF_HOLES, lambda message: message):
             contents.receive(message)
         files, recorded = inventory(self.path), holes_in(self.metadata.get("holes", ""))
         links = {f"{path.parent.name}/{path.name}": self._link(path) for path in self.segments}

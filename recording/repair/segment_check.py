@@ -157,9 +157,9 @@ class _Walk:
     def _places(self) -> list[int]:
         """Where each indexed record begins, in order, and where the last one ends."""
         index = self._index
-        ends = {place: place + told.chunk_length + told.message_index_length for place, told in index.chunks.items()}
+        ends = {place: place + entry.chunk_length + entry.message_index_length for place, entry in index.chunks.items()}
         ends.update(
-            {place: place + told.length for place, told in chain(index.attachments.items(), index.metadata.items())}
+            {place: place + entry.length for place, entry in chain(index.attachments.items(), index.metadata.items())}
         )
         places = sorted(ends)
         last = index.begin - _DATA_END_BYTES
@@ -175,8 +175,8 @@ class _Walk:
             self._file.seek(place)
             read(place, self._file.read(end - place))
         except DAMAGE as error:
-            told = self._index.chunks.get(place)
-            times_ns = (told.message_start_time, told.message_end_time) if told else (inf, -inf)
+            entry = self._index.chunks.get(place)
+            times_ns = (entry.message_start_time, entry.message_end_time) if entry else (inf, -inf)
             self._check.damages.append(Damage(f"{_sentence(error)} (at byte {place})", *times_ns))
 
     def _header(self, place: int, data: bytes) -> None:
@@ -200,26 +200,26 @@ class _Walk:
                 raise ValueError("a metadata record has another name than in the index")
             self._check.metadata[metadata.name] = metadata.metadata
 
-    def _chunk(self, told: ChunkIndex, data: bytes) -> None:
+    def _chunk(self, entry: ChunkIndex, data: bytes) -> None:
         """A chunk and the message indexes behind it."""
-        head, content = chunk_content(memoryview(data)[RECORD.size : told.chunk_length])
-        _check_same(_head_bytes(head, told), data[: RECORD.size + head.begin], "the head of a chunk")
+        head, content = chunk_content(memoryview(data)[RECORD.size : entry.chunk_length])
+        _check_same(_head_bytes(head, entry), data[: RECORD.size + head.begin], "the head of a chunk")
         messages = self._contents(content)
-        offsets, indexes = _message_indexes(messages, told.chunk_start_offset + told.chunk_length)
-        _check_same(indexes, data[told.chunk_length :], "the index of a chunk's messages")
+        offsets, indexes = _message_indexes(messages, entry.chunk_start_offset + entry.chunk_length)
+        _check_same(indexes, data[entry.chunk_length :], "the index of a chunk's messages")
         times_ns = [message.time_ns for message in messages]
         rebuilt = ChunkIndex(
-            chunk_length=told.chunk_length,
-            chunk_start_offset=told.chunk_start_offset,
+            chunk_length=entry.chunk_length,
+            chunk_start_offset=entry.chunk_start_offset,
             compression=head.compression.decode(),
-            compressed_size=told.chunk_length - RECORD.size - head.begin,
+            compressed_size=entry.chunk_length - RECORD.size - head.begin,
             message_end_time=max(times_ns),
             message_index_length=len(indexes),
             message_index_offsets=offsets,
             message_start_time=min(times_ns),
             uncompressed_size=head.size_bytes,
         )
-        if rebuilt != told:
+        if rebuilt != entry:
             raise ValueError("a chunk's size or times are not those in the index")
         for message in messages:
             self._count(message)
@@ -287,15 +287,15 @@ class _Placed(NamedTuple):
     message: Message
 
 
-def _head_bytes(head: ChunkHead, told: ChunkIndex) -> bytes:
+def _head_bytes(head: ChunkHead, entry: ChunkIndex) -> bytes:
     """What stands before the data of a chunk, by the index where that has it."""
-    name = told.compression.encode()
-    times_ns = told.message_start_time, told.message_end_time
+    name = entry.compression.encode()
+    times_ns = entry.message_start_time, entry.message_end_time
     return (
-        RECORD.pack(Opcode.CHUNK, told.chunk_length - RECORD.size)
-        + CHUNK.pack(*times_ns, told.uncompressed_size, head.crc, len(name))
+        RECORD.pack(Opcode.CHUNK, entry.chunk_length - RECORD.size)
+        + CHUNK.pack(*times_ns, entry.uncompressed_size, head.crc, len(name))
         + name
-        + LENGTH.pack(told.compressed_size)
+        + LENGTH.pack(entry.compressed_size)
     )
 
 

@@ -34,7 +34,7 @@ from recording.reading.coverage import Coverage, coverage_of
 from recording.reading.ends import is_of_a_run, lost_end
 from recording.reading.extent import Extent, extent_of
 from recording.reading.frame_account import frame_account
-from recording.reading.gaps import FRAMES_DROPPED, silences, told_blocks
+from recording.reading.gaps import FRAMES_DROPPED, reported_blocks, silences
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
 from recording.reading.kept_originals import is_recovered
 from recording.reading.run_word import Files, Run, run_word
@@ -120,8 +120,8 @@ class _Read:
 
     def session(self) -> dict[str, str]:
         """The record `session` that most segments have."""
-        told = Counter(_entries(check.metadata.get(SESSION_METADATA)) for check in self.checks.values())
-        return dict(told.most_common(1)[0][0]) if told else {}
+        stated = Counter(_entries(check.metadata.get(SESSION_METADATA)) for check in self.checks.values())
+        return dict(stated.most_common(1)[0][0]) if stated else {}
 
 
 def _link(file: SegmentFile, check: SegmentCheck) -> Link:
@@ -284,10 +284,10 @@ def _damaged(read: _Read) -> Iterator[Finding]:
 
 def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
     """Every segment names the same session, and its own place in it."""
-    told = {file.name: check.metadata for file, check in zip(finished, read.checks.values(), strict=True)}
-    sessions = Counter(_entries(metadata.get(SESSION_METADATA)) for metadata in told.values())
+    stated = {file.name: check.metadata for file, check in zip(finished, read.checks.values(), strict=True)}
+    sessions = Counter(_entries(metadata.get(SESSION_METADATA)) for metadata in stated.values())
     for file in finished:
-        metadata = told[file.name]
+        metadata = stated[file.name]
         is_whole = SESSION_METADATA in metadata and SEGMENT_METADATA in metadata
         if not is_whole and read.checks[file.name].damages:
             continue  # a finding already
@@ -308,11 +308,11 @@ def _frames_against_descriptions(read: _Read, coverage: Coverage) -> Iterator[Fi
     """Every image has its description in the telemetry and the other way round; what was not read may have it."""
     described = Counter(key for key, _ in read.contents.metas)
     block_ids = {key: meta.block_id for key, meta in read.contents.metas}
-    told, utc = told_blocks(read.contents.events), offsets_of(read.contents.events)
-    found = frame_account(read.images, block_ids, described, told, coverage, read.is_damaged_at)
+    reported, utc = reported_blocks(read.contents.events), offsets_of(read.contents.events)
+    found = frame_account(read.images, block_ids, described, reported, coverage, read.is_damaged_at)
     yield from _frames(_missing_part, found.bare, "without a description in the telemetry", utc)
     yield from _frames(_missing_part, found.gone, "missing, though described in the telemetry", utc)
-    yield from _frames(_note, found.gone_told, "described but lost by the recorder, as its events say", utc)
+    yield from _frames(_note, found.gone_reported, "described but lost by the recorder, as its events say", utc)
     yield from _frames(
         _note, found.bare_torn, "without a description, which was lost when the recorder was killed", utc
     )

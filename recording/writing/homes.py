@@ -48,7 +48,7 @@ class Homes:
         self._tell = tell
         self._lost: dict[str, str] = {}
         self._kept: dict[str, Kept] = {}  # by what was lost
-        self._anew: list[str] = []  # made again by a refounding that has not come to its end
+        self._made_again: list[str] = []  # made again by a refounding that has not come to its end
         self._reason = ""
         self.beside: list[Beside] = []
         self.refinding = asyncio.Event()
@@ -87,7 +87,7 @@ class Homes:
         if now and not was:
             self._reason = now
             self._tell(Notice("error", "folder_lost", now, {"folder": str(self._directory)}))
-        if was and not now and not self._anew:
+        if was and not now and not self._made_again:
             self._tell(Notice("info", "folder_back", f"the session's folder {self._directory} is back"))
 
     def refind(self) -> None:
@@ -101,8 +101,8 @@ class Homes:
         parts = [(TELEMETRY, telemetry), (FRAMES, frames), *((each.name, each.refound) for each in self.beside)]
         try:
             for name, refound in parts:
-                if not await refound() and name not in self._anew:
-                    self._anew.append(name)
+                if not await refound() and name not in self._made_again:
+                    self._made_again.append(name)
                 self._lost.pop(name, None)
         except OSError as error:
             text = f"{self._directory}: no folder can be made there again ({error})"
@@ -111,21 +111,21 @@ class Homes:
         finally:
             self.refinding.clear()
         self.there.set()
-        anew, self._anew = tuple(self._anew), []
-        if not anew:
+        made_again, self._made_again = tuple(self._made_again), []
+        if not made_again:
             self._tell(Notice("info", "folder_back", f"the session's folder {self._directory} is back"))
-        return anew
+        return made_again
 
-    def loss(self, anew: tuple[str, ...], from_ns: int) -> Notice:
+    def loss(self, made_again: tuple[str, ...], from_ns: int) -> Notice:
         """What is not in the session's folder any more: all that this run had recorded in what was made again."""
-        gone = {name: self._kept[name] for name in anew if name in self._kept}
+        gone = {name: self._kept[name] for name in made_again if name in self._kept}
         self._kept.clear()
         to_ns = max((kept.until_ns for kept in gone.values()), default=from_ns)
         counts = {name: kept.items for name, kept in gone.items()}
-        data = {"what": list(anew), "from_ns": from_ns, "to_ns": to_ns, "counts": counts, "reason": self._reason}
+        data = {"what": list(made_again), "from_ns": from_ns, "to_ns": to_ns, "counts": counts, "reason": self._reason}
         lost = "".join(f", {counts[name]} {_UNITS[name]}" for name in counts)
         text = (
-            f"{self._reason}; {' and '.join(anew)} continue in a new place without what was recorded from "
+            f"{self._reason}; {' and '.join(made_again)} continue in a new place without what was recorded from "
             f"{utc_text(from_ns)} to {utc_text(to_ns)}{lost}"
         )
         return Notice("error", "recording_lost", text, data)

@@ -102,7 +102,7 @@ class Losses:
     """What is lost; `count` is called from any thread, `take` from one."""
 
     def __init__(self) -> None:
-        self._told = 0
+        self._reported = 0
         self._lost_ns: deque[tuple[str, int]] = deque()  # step, instant
         self._begins_ns: dict[str, int] = {}  # of captures that were restarted, by step
         self._new: deque[tuple[str, str, int]] = deque()  # reason, step, block
@@ -133,13 +133,13 @@ class Losses:
         while self._new:
             reason, step_id, block_id = self._new.popleft()
             reasons.setdefault(reason, {}).setdefault(step_id, []).append(block_id)
-            self._told += 1
+            self._reported += 1
         return [self._notice(reason, steps) for reason, steps in reasons.items()]
 
     def _notice(self, reason: str, steps: dict[str, list[int]]) -> Notice:
         blocks = [run for blocks in steps.values() for run in runs(blocks)]
-        data = {"blocks": blocks, "steps": list(steps), "total": self._told, "reason": reason}
-        text = f"frames lost: {_by_step(steps)}, {self._told} in all; {reason}"
+        data = {"blocks": blocks, "steps": list(steps), "total": self._reported, "reason": reason}
+        text = f"frames lost: {_by_step(steps)}, {self._reported} in all; {reason}"
         return Notice("error", "frames_dropped", text, data)
 
 

@@ -259,12 +259,12 @@ class Recorder:
         """After `refound`: the folders are found or made again, and the loss is an event."""
         while True:
             await self._homes.refinding.wait()
-            anew = await self._homes.refound(
+            made_again = await self._homes.refound(
                 lambda: self._telemetry.lane.call(self._telemetry.series.refound),
                 lambda: self._frames.lane.call(self._frames.series.refound),
             )
-            if anew:
-                self._notices.append(self._homes.loss(anew, self._begun_ns))
+            if made_again:
+                self._notices.append(self._homes.loss(made_again, self._begun_ns))
             await self._telemetry.save()
             self._report()
 

@@ -51,5 +51,5 @@ def try_them(
         if failures:
             raise StandError(f"{len(failures)} of {len(found.urls) + bool(found.alive_url)} were not reached")
         alive = ", and the sign of life was taken" if found.alive_url else "; no alive_url is given"
-        told = f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}"
-        show({"receivers": len(found.urls), "alive": bool(found.alive_url)}, [told])
+        line = f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}"
+        show({"receivers": len(found.urls), "alive": bool(found.alive_url)}, [line])

@@ -104,7 +104,7 @@ def _events_shown(hub: Hub) -> Generator[None]:
         tell = later(_tell_json if wanted.as_json else _tell)
 
         def follow(item: Item) -> None:
-            if isinstance(item, Event) and _is_told(item, wanted):
+            if isinstance(item, Event) and _is_shown(item, wanted):
                 tell(item)
 
         hub.subscribe(follow)
@@ -132,7 +132,7 @@ def _tell_json(event: Event) -> None:
     typer.echo(json_line(event))
 
 
-def _is_told(event: Event, wanted: Output) -> bool:
+def _is_shown(event: Event, wanted: Output) -> bool:
     if wanted.quiet:
         return event.level == "error"
     return wanted.verbose or event.level != "info" or event.kind in ("queue", "command")

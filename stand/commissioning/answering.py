@@ -20,7 +20,7 @@ from foundation.hub import Hub
 from stand.assembly import Assembly, assemble, register_map
 from stand.config.stand_config import StandConfig
 from stand.running.opening.claim import claimed
-from stand.running.opening.house import close_devices
+from stand.running.opening.open_stand import close_devices
 
 COMMAND = "stand queue add"
 _CAMERA_WAIT_S = 1.0  # for its answer to GVCP's discovery

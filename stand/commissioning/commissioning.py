@@ -24,7 +24,7 @@ from stand.commissioning.links import Links
 from stand.commissioning.moves import Moves
 from stand.config.stand_config import StandConfig
 from stand.running.opening.claim import claimed
-from stand.running.opening.house import close_devices, made_safe
+from stand.running.opening.open_stand import close_devices, made_safe
 from stand.running.opening.stop import Stop
 
 COMMAND = "stand check"
@@ -51,10 +51,10 @@ async def commission(
         if has_moves:
             stack.push_async_callback(_made_safe, assembly, stop, found, tell)
             stop.watch(assembly.stand)
-        told = 0
+        reported = 0
         async for _ in _looks(assembly, found.append, has_moves=has_moves):
-            tell(tuple(found[told:]))
-            told = len(found)
+            tell(tuple(found[reported:]))
+            reported = len(found)
         return tuple(found), _identities(assembly)
 
 

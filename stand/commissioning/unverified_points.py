@@ -18,7 +18,7 @@ async def unverified_points(
     """A finding for each remark `unverified` of the map, with what its points read; of the points `used` only, when
     given. A point that has an expected value is decided by it."""
     unit, points = ModbusUnit(device, bus, register_map), register_map.points
-    wanted = set(points) if used is None else {*used, *(told.point for told in register_map.identity.values())}
+    wanted = set(points) if used is None else {*used, *(field.point for field in register_map.identity.values())}
     names = [name for name, point in points.items() if point.unverified and name in wanted]
     found: list[Finding] = []
 
@@ -42,7 +42,7 @@ async def _read_back(unit: ModbusUnit, names: tuple[str, ...], remark: str) -> F
                 f"correct {name} in the map {unit.map.model}, or take it out; it was never seen on a unit: {remark}"
             )
             text = f"the unit {known} ({point.space} {point.address:#06x}): {error.text}"
-            is_needed = name not in {told.point for told in unit.map.identity.values()}
+            is_needed = name not in {field.point for field in unit.map.identity.values()}
             verdict: Verdict = "failed" if is_needed else "warning"
             return Finding(unit.name, what, verdict, text, advice, data)
         data[name] = sample.raw
@@ -63,7 +63,7 @@ def _what(names: tuple[str, ...]) -> str:
 def _shown(register_map: RegisterMap, name: str, sample: Sample) -> str:
     if sample.reason:
         return sample.reason
-    if any(told.point == name and told.shown == "hex" for told in register_map.identity.values()):
+    if any(field.point == name and field.shown == "hex" for field in register_map.identity.values()):
         return f"{sample.raw:#x}"
     unit = register_map.points[name].unit
     return f"{sample.value:.4g}{'' if unit == '1' else f' {unit}'}"

@@ -47,7 +47,7 @@ def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
     try:
         steps = tuple(islice(cast("Iterable[object]", make(checked)), MOST_STEPS + 1))
     except Exception as error:  # another package's code may raise anything
-        raise ValueError(f"{name}: {_package(point)} makes no steps of these ({_told(error)})") from error
+        raise ValueError(f"{name}: {_package(point)} makes no steps of these ({_described(error)})") from error
     faults = (f"step {number} {fault}" for number, step in enumerate(steps, 1) if (fault := _fault(step)))
     if fault := next(faults, ""):
         raise ValueError(f"{name}: {_package(point)} makes a step that cannot be done: {fault}; correct the package")
@@ -69,7 +69,9 @@ def _loaded(point: EntryPoint) -> tuple[Callable[[BaseModel], object], type[Base
         (parameter,) = inspect.signature(make).parameters
         model = get_type_hints(make)[parameter]
     except Exception as error:  # importing a stranger's module may raise anything
-        text = f"{point.name}: {_package(point)} cannot be loaded ({_told(error)}); reinstall it, or leave this out"
+        text = (
+            f"{point.name}: {_package(point)} cannot be loaded ({_described(error)}); reinstall it, or leave this out"
+        )
         raise ValueError(text) from error
     if not (inspect.isclass(model) and issubclass(model, BaseModel)):
         raise ValueError(f"{point.name}: {point.value} takes no pydantic model; annotate its parameter with one")
@@ -114,5 +116,5 @@ def _package(point: EntryPoint) -> str:
     return f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.value
 
 
-def _told(error: Exception) -> str:
+def _described(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]

@@ -19,11 +19,11 @@ def private_text(path: Path, place: str) -> str:
     except OSError as error:
         raise ConfigError(f"{place}: cannot be read ({error.strerror})") from error
     try:
-        told = os.fstat(fd)
-        if not stat.S_ISREG(told.st_mode) or told.st_size > _LARGEST_BYTES:
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST_BYTES:
             raise ConfigError(f"{place}: is no file of a few lines")
-        if told.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-            mode = stat.S_IMODE(told.st_mode)
+        if status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            mode = stat.S_IMODE(status.st_mode)
             raise ConfigError(f"{place}: others may read or write it (mode {mode:04o}); type `chmod 600 {path}`")
         return os.read(fd, _LARGEST_BYTES).decode()
     except UnicodeDecodeError:

@@ -117,5 +117,5 @@ def accepted_text(accepted: Mapping[str, float]) -> str:
     """What a start says of values outside their ranges that were accepted, by their paths."""
     ranges = {safe.path: str(safe) for safe in SAFE_RANGES}
     usual = "a correction of at most 10 K"
-    told = [f"{path} {value:g} (safe: {ranges.get(path, usual)})" for path, value in accepted.items()]
-    return f"guard.accept weakens the protection: {', '.join(told)}"
+    weakened = [f"{path} {value:g} (safe: {ranges.get(path, usual)})" for path, value in accepted.items()]
+    return f"guard.accept weakens the protection: {', '.join(weakened)}"

@@ -27,7 +27,7 @@ _LONGEST_EXPOSURE_S = 10.0
 class _Verb:
     """What is published of it, and what it does with a device of that name."""
 
-    told: DeviceVerb
+    described: DeviceVerb
     work: Callable[[str, Arguments], Work]
 
 
@@ -48,7 +48,7 @@ class ByHand:
                 name=name,
                 kind=kind,
                 channels=tuple(channel for channel in readings if channel.startswith(f"{name}.")),
-                verbs=tuple(verb.told for verb in self._verbs(name).values()),
+                verbs=tuple(verb.described for verb in self._verbs(name).values()),
                 refused=refused,
             )
             for name, kind in self._kinds.items()
@@ -62,7 +62,7 @@ class ByHand:
         verbs = self._verbs(name)
         if verb not in verbs:
             raise Missing(f"{name} does not know that; it takes {', '.join(verbs) or 'no orders'}")
-        known = {argument.name for argument in verbs[verb].told.arguments}
+        known = {argument.name for argument in verbs[verb].described.arguments}
         if unknown := sorted(set(arguments) - known):
             raise ConfigError(f"{name} {verb} has no {', '.join(unknown)}; it takes {', '.join(known) or 'nothing'}")
         return verbs[verb].work(name, arguments)
@@ -76,7 +76,7 @@ class ByHand:
             "camera": self._of_camera,
         }
         verbs = table[kind]() if kind in table else ()
-        return {verb.told.verb: verb for verb in verbs}
+        return {verb.described.verb: verb for verb in verbs}
 
     def _of_regulator(self) -> tuple[_Verb, ...]:
         low, high = self._assembly.config.limits.chamber_degC

@@ -25,13 +25,13 @@ from stand.daemon import systemd
 from stand.daemon.by_hand import ByHand
 from stand.daemon.counters import Counters
 from stand.daemon.daemon_file import Kept, KeptFile, Latch
-from stand.daemon.house_record import HouseRecord
+from stand.daemon.day_record import DayRecord
 from stand.daemon.orders import Orders
 from stand.fault import Fault
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
-from stand.running.opening.house import House
+from stand.running.opening.open_stand import OpenStand
 from stand.running.opening.stop import STOPPED, Interrupted, catch_signals
 from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
@@ -50,9 +50,9 @@ _ENDED_AGAIN_S = 5.0  # between two records that end by themselves
 class Daemon:
     """An open stand with its queue and record. `serve` until it is asked to leave, or something fails."""
 
-    def __init__(self, house: House, orders: Orders, record: HouseRecord, kept: Kept, keep: KeptFile) -> None:
-        assembly = house.assembly
-        self.house = house
+    def __init__(self, open_stand: OpenStand, orders: Orders, record: DayRecord, kept: Kept, keep: KeptFile) -> None:
+        assembly = open_stand.assembly
+        self.open_stand = open_stand
         self.orders = orders
         self.record = record
         config, hub = assembly.config, assembly.hub
@@ -75,7 +75,7 @@ class Daemon:
     @property
     def guest(self) -> Guest | None:
         """The run that has the stand."""
-        return cast("Guest | None", self.house.guest)
+        return cast("Guest | None", self.open_stand.guest)
 
     @property
     def disk_free_bytes(self) -> int:
@@ -93,7 +93,7 @@ class Daemon:
         self.orders.leaving = True
         self.stop()
         if not self._leaving.is_set():
-            self._beside(self.house.hurry())
+            self._beside(self.open_stand.hurry())
         self._leaving.set()
 
     def stop(self) -> None:
@@ -109,8 +109,8 @@ class Daemon:
 
     def note(self) -> None:
         """Counters and fault are kept for the next start."""
-        fault = self.house.latched
-        latch = None if fault is None else Latch(rule=fault.rule, text=fault.text, since_ns=self.house.fault_ns)
+        fault = self.open_stand.latched
+        latch = None if fault is None else Latch(rule=fault.rule, text=fault.text, since_ns=self.open_stand.fault_ns)
         self._keep.note(Kept(counters=dict(self.counters.values), latch=latch))
 
     def clear_queue(self) -> None:
@@ -126,8 +126,8 @@ class Daemon:
         """Why no device takes an order now, "" when they do."""
         if self.has_guest:
             return "a run has the stand; `stand stop` ends it"
-        if self.house.latched is not None:
-            return f"the stand has tripped: {self.house.latched.text}; `stand clear` once the cause is removed"
+        if self.open_stand.latched is not None:
+            return f"the stand has tripped: {self.open_stand.latched.text}; `stand clear` once the cause is removed"
         reasons = self._assembly.stand.gate.reasons
         return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
 
@@ -157,21 +157,21 @@ class Daemon:
         """Until `leave`; then the stand is safe. Raises what makes that impossible."""
         async with AsyncExitStack() as stack:
             stack.push_async_callback(cancelled, self._extending)
-            stack.push_async_callback(self._keep.close, self.house.patience)
-            await self._record_house()
+            stack.push_async_callback(self._keep.close, self.open_stand.patience)
+            await self._record_day()
             stack.push_async_callback(self._end_record)
             stack.callback(self.note)  # written while the record is ended
-            stack.callback(self.house.patience.begin)
-            stack.push_async_callback(self.house.close)
-            self.house.prepare()
-            await self.house.read_once()
-            self.house.start()
+            stack.callback(self.open_stand.patience.begin)
+            stack.push_async_callback(self.open_stand.close)
+            self.open_stand.prepare()
+            await self.open_stand.read_once()
+            self.open_stand.start()
             if self._kept.latch is not None:
                 latch = self._kept.latch
-                self.house.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
-            self.house.guard.look()
+                self.open_stand.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
+            self.open_stand.guard.look()
             catch_signals(self.leave)
-            await watched(self._serve(answering), self.house.tasks)
+            await watched(self._serve(answering), self.open_stand.tasks)
 
     async def _serve(self, answering: Answering) -> None:
         worker = asyncio.create_task(self._work())
@@ -198,7 +198,7 @@ class Daemon:
                 self.orders.stop(_ENDS)
             await asyncio.wait([worker], timeout=_STOPPED_LOOK_S)
         if self._is_draining:
-            await self.house.patience.wait(worker, FINISH_WITHIN_S)
+            await self.open_stand.patience.wait(worker, FINISH_WITHIN_S)
             await cancelled([worker])  # it says what the queue does not know
         if self._is_given_up:
             self._assembly.stand.safety.give_up()  # forgotten with the run
@@ -213,13 +213,13 @@ class Daemon:
             await self._wake.wait()
             self._wake.clear()
             queued = self.orders.queued
-            if self.house.latched is not None or queued.halted or self.orders.leaving:
+            if self.open_stand.latched is not None or queued.halted or self.orders.leaving:
                 continue
             if not any(entry.is_open for entry in queued.entries):
                 continue
             self._is_draining = True
             try:
-                await drain(directory, self._run_one, self._clock, self._say, disk, self.house.patience)
+                await drain(directory, self._run_one, self._clock, self._say, disk, self.open_stand.patience)
                 self._tell("info", "queue_empty", "all that was queued is done")
             except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
                 self._say(f"the queue is halted: {failure_text(error)}")
@@ -231,8 +231,8 @@ class Daemon:
     async def _run_one(self, entry: Entry, notes: Notes) -> Path:
         if self.orders.leaving:
             raise Interrupted("the daemon ends")
-        if self.house.latched is not None:
-            raise StandTripped(f"the stand has tripped: {self.house.latched.text}")
+        if self.open_stand.latched is not None:
+            raise StandTripped(f"the stand has tripped: {self.open_stand.latched.text}")
         has_begun = False
 
         def begun() -> None:
@@ -254,19 +254,19 @@ class Daemon:
             raise
         finally:
             if not self.orders.leaving:
-                await self._record_house()
+                await self._record_day()
             self.has_guest = False
             self.note()
             systemd.tell("STATUS=idle")
 
-    async def _record_house(self) -> None:
+    async def _record_day(self) -> None:
         """Heat depends on the record between runs while no run records; a disk that refuses it is an event, and
         there is no heat by hand."""
         self._recorded_ns = self._clock.now_ns()
         try:
-            self.house.recorder = self.record.recorder or await self.record.begin()
+            self.open_stand.recorder = self.record.recorder or await self.record.begin()
         except (SessionError, OSError) as error:
-            self.house.recorder = None
+            self.open_stand.recorder = None
             self._assembly.stand.safety.demand()
             self._tell(
                 "error", "house_not_recorded", f"nothing is recorded between runs, so nothing is heated: {error}"
@@ -295,14 +295,14 @@ class Daemon:
                 if reading is None or reading.done():  # another program may have locked it
                     reading = self._beside(self._read_queue())
             may_begin = not (self.has_guest or self.orders.leaving)
-            if may_begin and self.house.disk is not None and (ended := self.house.disk.ended):
+            if may_begin and self.open_stand.disk is not None and (ended := self.open_stand.disk.ended):
                 raise SessionError(f"{ended}; neither queue nor what the compressor did can be kept without it")
             if may_begin and self._is_midnight():
                 await self._turn_day()
             if may_begin and self._needs_record():
-                self.house.unrecorded()
+                self.open_stand.unrecorded()
                 await self._end_record()
-                await self._record_house()
+                await self._record_day()
             if self._clock.now_ns() - kept_ns >= _KEEP_EVERY_S * NS_PER_S:
                 kept_ns = self._clock.now_ns()
                 self.note()
@@ -329,8 +329,8 @@ class Daemon:
         except (SessionError, OSError) as error:
             self._tell("warning", "house_not_recorded", f"today's record is not begun, yesterday's goes on: {error}")
             return
-        if self.house.guest is None:
-            self.house.recorder = recorder
+        if self.open_stand.guest is None:
+            self.open_stand.recorder = recorder
         try:
             await self.record.complete(FINISH_WITHIN_S)
         except (SessionError, OSError) as error:
@@ -352,7 +352,7 @@ class Daemon:
         limit_s = systemd.watchdog_s()
         every_s = _KEEP_EVERY_S if limit_s is None else limit_s / 3
         while True:
-            if limit_s is not None and self.house.guard.is_on_time:
+            if limit_s is not None and self.open_stand.guard.is_on_time:
                 systemd.tell(systemd.FED)
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(every_s))
 
@@ -373,7 +373,7 @@ class Daemon:
         recorder = self.record.recorder
         if recorder is None or recorder.folder_lost or recorder.writer_ended:
             raise Conflict("nothing is recorded now, and there is no heat without a recording; see the last events")
-        if not self.house.guard.may_permit():
+        if not self.open_stand.guard.may_permit():
             raise Conflict("the guard does not permit heat now: it waits for fresh readings, or holds the stand")
 
     def _beside(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:

@@ -42,7 +42,7 @@ class DaemonDesk:
 
     def __init__(self, daemon: Daemon) -> None:
         self._daemon = daemon
-        self._assembly = daemon.house.assembly
+        self._assembly = daemon.open_stand.assembly
 
     def state(self) -> StandState:
         """As it is now."""
@@ -88,9 +88,9 @@ class DaemonDesk:
         self._tell(who, "clear", {})
         gate.clear(INTERLOCK)
         daemon.note()
-        if daemon.house.latched is None:
+        if daemon.open_stand.latched is None:
             daemon.clear_queue()
-        again = daemon.house.latched
+        again = daemon.open_stand.latched
         return self._done("clear", "cleared" if again is None else f"it has tripped again: {again.text}")
 
     def stop(self, who: Who) -> Done:
@@ -133,7 +133,7 @@ class DaemonDesk:
 
     async def resume(self, who: Who, session: str) -> Done:
         """Its run is the next one."""
-        if self._daemon.house.latched is not None:
+        if self._daemon.open_stand.latched is not None:
             self._refuse(who, "resume", {"session": session}, "the stand has tripped; clear it first")
         entry = await self._tried(who, "resume", {"session": session}, self._daemon.orders.resume(session))
         self._daemon.wake()
@@ -142,8 +142,8 @@ class DaemonDesk:
     async def device(self, who: Who, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> Done:
         """Tell a device something by hand: what takes longer than a moment goes on when this returns, and its
         failure is an event."""
-        told: dict[str, JsonValue] = {"device": name, "verb": verb, "arguments": dict(arguments)}
-        text = await self._tried(who, "device", told, self._daemon.do_by_hand(name, verb, arguments))
+        order: dict[str, JsonValue] = {"device": name, "verb": verb, "arguments": dict(arguments)}
+        text = await self._tried(who, "device", order, self._daemon.do_by_hand(name, verb, arguments))
         return self._done("device", text)
 
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
@@ -160,13 +160,13 @@ class DaemonDesk:
 
     async def break_(self, who: Who, request: FaultRequest) -> Done:
         """Break something of the simulated laboratory, or mend it."""
-        told = request.model_dump(exclude_defaults=True)
-        return self._done("fault", await self._tried(who, "fault", told, break_or_mend(self._assembly, request)))
+        order = request.model_dump(exclude_defaults=True)
+        return self._done("fault", await self._tried(who, "fault", order, break_or_mend(self._assembly, request)))
 
     @property
     def patience(self) -> Patience:
         """Of a daemon that leaves."""
-        return self._daemon.house.patience
+        return self._daemon.open_stand.patience
 
     @property
     def _run(self) -> RunDesk | None:
@@ -174,11 +174,11 @@ class DaemonDesk:
         return None if guest is None else guest.desk
 
     def _fault(self) -> FaultState | None:
-        house = self._daemon.house
-        fault = house.latched
+        open_stand = self._daemon.open_stand
+        fault = open_stand.latched
         if fault is None:
             return None
-        return FaultState(rule=fault.rule, text=fault.text, since_ns=house.fault_ns, data=fault.data)
+        return FaultState(rule=fault.rule, text=fault.text, since_ns=open_stand.fault_ns, data=fault.data)
 
     def _of_run(
         self, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], call: Callable[[RunDesk], Result]

@@ -28,7 +28,7 @@ from stand.assembly import Assembly, assemble, register_map
 from stand.config.stand_config import StandConfig
 from stand.daemon.by_hand import ByHand
 from stand.running.opening.claim import claimed
-from stand.running.opening.house import close_devices, made_safe
+from stand.running.opening.open_stand import close_devices, made_safe
 from stand.running.opening.stop import Stop
 from stand.running.run_desk import device_kinds
 from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb

@@ -33,7 +33,7 @@ from stand.queueing.queue_run import Watch, interruption_of, is_complete
 from stand.queueing.queue_work import Halt, Notes, Stopped
 from stand.running.executing.settling_watch import load_for
 from stand.running.guest import Job
-from stand.running.opening.house import House
+from stand.running.opening.open_stand import OpenStand
 from stand.running.opening.stop import Interrupted, Stop
 from stand.running.order import Order, check_plan, parse_order
 from stand.running.resume import Interruption, repaired
@@ -45,15 +45,15 @@ _SHOWN = 50  # runs that have ended
 
 
 class Orders:
-    """Of the daemon that has `house`. texts: config.yaml, target.yaml and the record of `stand check` where there is
-    one, as they were when it began.
+    """Of the daemon that has `open_stand`. texts: config.yaml, target.yaml and the record of `stand check` where there
+    is one, as they were when it began.
 
     queued: as it was last read. stop: of the run under way. leaving: the daemon ends, and its run is interrupted by it.
     """
 
     def __init__(
         self,
-        house: House,
+        open_stand: OpenStand,
         disk: Disk,
         directory: Path,
         config_name: str,
@@ -64,12 +64,12 @@ class Orders:
         self.stop: Stop | None = None
         self.leaving = False
         self.directory = directory
-        clock = house.assembly.clock
+        clock = open_stand.assembly.clock
         # What writes is done by the disk's process: a thread that writes to a disk that hangs keeps its process.
         self.disk = DiskCalls(disk, QUEUE_LINE, clock)
         self.notes, self.repair = DiskCalls(disk, NOTES_LINE, clock), DiskCalls(disk, REPAIR_LINE, clock)
-        self.reading = Lane("orders", house.assembly.clock, patient=False)
-        self._house = house
+        self.reading = Lane("orders", open_stand.assembly.clock, patient=False)
+        self._open_stand = open_stand
         self._config_name = config_name
         self._texts = texts
         self._recorded_whole = recorded
@@ -103,7 +103,7 @@ class Orders:
         self._check_wires(order)
         digest = hashlib.sha256(request.model_dump_json().encode()).hexdigest()[:16]
         asked = Asked(key, digest, who.name, request.note, request.tags)
-        now_ns = self._house.assembly.clock.now_ns()
+        now_ns = self._open_stand.assembly.clock.now_ns()
         try:
             wanted = queue.entry_of(order, self._config_name, now_ns, asked)
             entry: Entry = await self.disk.call(queue.append, self.directory, wanted)
@@ -135,7 +135,7 @@ class Orders:
         if is_whole:
             raise Conflict(f"{session}: its run is complete; there is nothing to resume")
         order = await self.reading.call(self._recorded, session)
-        now_ns = self._house.assembly.clock.now_ns()
+        now_ns = self._open_stand.assembly.clock.now_ns()
         wanted = queue.entry_of(order, self._config_name, now_ns)
         entry: Entry = await self.disk.call(queue.put_first, self.directory, wanted, session)
         await self.read()
@@ -152,14 +152,14 @@ class Orders:
         config = order.config
         before = None if session is None else await self._interruption(session, config)
         watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
-        hub = self._house.assembly.hub
+        hub = self._open_stand.assembly.hub
 
         async def recorded(folder: Path) -> None:
             await notes.begun(folder)
             begun()
             if session is None and (said := _said(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
                 try:
-                    await keep(said, folder, hub, self._house.assembly.clock, self.notes)
+                    await keep(said, folder, hub, self._open_stand.assembly.clock, self.notes)
                 except SessionError as error:
                     tell(f"warning: {error}")
 
@@ -171,7 +171,7 @@ class Orders:
         job = Job(order, self.directory, None, follow, recorded, before)
         try:
             async with Stop(has_signals=False) as self.stop:
-                done = await run_in(self._house, job, self.stop)
+                done = await run_in(self._open_stand, job, self.stop)
         except Interrupted as error:
             if self.leaving:
                 raise
@@ -253,7 +253,7 @@ class Orders:
 
     def _here(self, order: Order) -> Order:
         """The same on the stand as it is open now."""
-        config = self._house.assembly.config
+        config = self._open_stand.assembly.config
         check_plan(order.recipe.plan(), config)
         record = self._texts.get(ATTACHMENT, "")
         return replace(order, config=config, config_text=self._texts["config.yaml"], commissioning_text=record)
@@ -283,7 +283,7 @@ class Orders:
 
     def _check_wires(self, order: Order) -> None:
         """What does not answer now, and what else would end the night at its beginning."""
-        assembly = self._house.assembly
+        assembly = self._open_stand.assembly
         lacks = [
             f"{channel} is not read: {reading.reason}"
             for channel, reading in assembly.hub.readings.items()

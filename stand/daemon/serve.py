@@ -20,12 +20,12 @@ from stand.config.stand_config import StandConfig
 from stand.daemon.daemon import Daemon
 from stand.daemon.daemon_desk import DaemonDesk
 from stand.daemon.daemon_file import KeptFile, kept_in
-from stand.daemon.house_record import HouseRecord
+from stand.daemon.day_record import DayRecord
 from stand.daemon.orders import Orders
 from stand.daemon.reports import Reports
 from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
-from stand.running.opening.house import opened
+from stand.running.opening.open_stand import opened
 from stand.running.opening.stop import Stop
 from stand.serving.alerts import alerting
 
@@ -57,21 +57,23 @@ async def serve(
         assembly.notifier.start()
         try:
             async with AsyncExitStack() as stack:
-                house = await stack.enter_async_context(opened(assembly, watch.run, stop, is_for_one=False))
-                await stack.enter_async_context(alerting(config.name, config.alerts, hub, clock, house.is_well))
-                if house.disk is None:
+                open_stand = await stack.enter_async_context(opened(assembly, watch.run, stop, is_for_one=False))
+                await stack.enter_async_context(alerting(config.name, config.alerts, hub, clock, open_stand.is_well))
+                if open_stand.disk is None:
                     raise ValueError("a daemon is on the host's clock, and has a process for its disk")
                 own = {name: text for name, text in texts.items() if name in ("config.yaml", ATTACHMENT)}
-                record = HouseRecord(assembly, own, out, clock, stop.patience)
-                keep = KeptFile(out, house.disk.line(FILES_LINE).run, hub, clock)
+                record = DayRecord(assembly, own, out, clock, stop.patience)
+                keep = KeptFile(out, open_stand.disk.line(FILES_LINE).run, hub, clock)
                 reports = Reports(hub, clock)
                 stack.push_async_callback(reports.close)
-                orders = Orders(house, house.disk, out, config_name, texts, reports.add if has_reports else None)
+                orders = Orders(
+                    open_stand, open_stand.disk, out, config_name, texts, reports.add if has_reports else None
+                )
                 for segment in await orders.repair.call(salvage_unfinished, out):
                     hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
                 if accepted := config.accepted():
                     hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
-                daemon = Daemon(house, orders, record, kept, keep)
+                daemon = Daemon(open_stand, orders, record, kept, keep)
                 await daemon.serve(lambda hub, clock: front(DaemonDesk(daemon), hub, clock))
             if unsafe := assembly.stand.safety.unconfirmed:
                 raise StandTripped(f"the daemon ends, but NOT SAFE: {'; '.join(unsafe)}")

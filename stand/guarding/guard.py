@@ -128,7 +128,7 @@ class Guard:
         """Whether the stand is already held for a fault that aborts."""
         return self.keeps_on and self.held is not None and self.held.action == "abort"
 
-    async def told(self) -> None:
+    async def notified(self) -> None:
         """Return when each notify command of a trip has ended, or could not be run."""
         while self._telling:
             await asyncio.wait(self._telling)

@@ -69,7 +69,7 @@ class CameraEquilibrium:
         self.is_lost = False
 
     def soaked_s(self) -> float | None:
-        """For how long the camera has been soaked anew; None when it need not be."""
+        """For how long the camera has been soaked since its equilibrium was lost; None when it need not be."""
         return (self._clock.now_ns() - self._since_ns) / NS_PER_S if self.is_lost else None
 
     async def regained(self, is_disturbed: Callable[[], bool]) -> None:

@@ -160,7 +160,7 @@ class _Run:
 
     async def _end(self, state: State, reason: str = "", *, halt: bool = False) -> None:
         """Noted when the disk takes that in time: one that hangs keeps nobody from leaving."""
-        told = f"{self._name} {state}" + (f": {reason}" if reason else "")
+        sentence = f"{self._name} {state}" + (f": {reason}" if reason else "")
         now_ns = self._clock.now_ns()
         change = partial(finish, self._directory, self._entry.id, state, now_ns, reason, halt=halt)
         noting = asyncio.create_task(self._noted_last(change))
@@ -170,8 +170,8 @@ class _Run:
         finally:
             if not noting.done():
                 noting.cancel()
-                told += "; the disk has not answered, so the queue does not know it yet"
-            self._tell(told)
+                sentence += "; the disk has not answered, so the queue does not know it yet"
+            self._tell(sentence)
 
     async def _noted_last(self, change: Callable[[], None]) -> None:
         await self._noted()

@@ -35,7 +35,7 @@ from stand.running.memory.entries import Cleared, Ended, Gap, Written
 from stand.running.memory.fold import fold
 from stand.running.memory.journal import Journal, Logbook
 from stand.running.opening.holds import end_endless_holds
-from stand.running.opening.house import House
+from stand.running.opening.open_stand import OpenStand
 from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
 from stand.running.opening.to_ambient import to_ambient
 from stand.running.order import Order, check_plan
@@ -75,8 +75,8 @@ class Guest:
     its journal is begun.
     """
 
-    def __init__(self, job: Job, house: House, recorder: Recorder, stop: Stop) -> None:
-        assembly, plan, before = house.assembly, tuple(job.order.recipe.plan()), job.before
+    def __init__(self, job: Job, open_stand: OpenStand, recorder: Recorder, stop: Stop) -> None:
+        assembly, plan, before = open_stand.assembly, tuple(job.order.recipe.plan()), job.before
         load_for(plan)
         self.job = job
         self.recorder = recorder
@@ -85,7 +85,7 @@ class Guest:
         self.board: StatusBoard | None = None
         self.executor: Executor | None = None
         self.desk: RunDesk | None = None
-        self._house = house
+        self._open_stand = open_stand
         self._assembly = assembly
         assembly.stand.attended = job.order.attended
 
@@ -106,9 +106,9 @@ class Guest:
     async def run(self, recording: asyncio.Task[None]) -> None:
         """The whole plan, or what is not done of it; the actuators are safe before anything else is taken down. The end
         of `recording` ends the run."""
-        house, assembly, stop, log = self._house, self._assembly, self.stop, self.log
-        house.guest, house.recorder = self, self.recorder
-        house.prepare()
+        open_stand, assembly, stop, log = self._open_stand, self._assembly, self.stop, self.log
+        open_stand.guest, open_stand.recorder = self, self.recorder
+        open_stand.prepare()
         preload()
         target = parse_document(self.job.order.target_text, Target, "target.yaml")
         settling = SettlingWatch(assembly.stand, assembly.hub, assembly.clock, target)
@@ -116,22 +116,22 @@ class Guest:
         ended = Ended(0, "failed", "")
         async with AsyncExitStack() as leaving:
             try:
-                executor = await watched(self._begun(settling, leaving), (*house.tasks, recording))
+                executor = await watched(self._begun(settling, leaving), (*open_stand.tasks, recording))
                 self.board = await self._board(leaving)
                 self.executor = executor
                 self.desk = self._desk(self.board, executor, leaving)
-                if house.is_for_one:
+                if open_stand.is_for_one:
                     watchers.append(asyncio.create_task(self._answer(self.desk)))
-                house.start()
+                open_stand.start()
                 if isinstance(assembly.clock, VirtualClock):
                     limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
                     watchers.append(
                         asyncio.create_task(end_endless_holds(assembly.stand.gate, assembly.clock, limit_h))
                     )
                 stop.started()
-                await watched(executor.run(), [*house.tasks, recording, *watchers])
+                await watched(executor.run(), [*open_stand.tasks, recording, *watchers])
                 at_last = to_ambient(assembly.stand, assembly.hub, assembly.clock, assembly.config)
-                await watched(at_last, [*house.tasks, recording, *watchers])
+                await watched(at_last, [*open_stand.tasks, recording, *watchers])
                 ended = Ended(0, "complete", "complete")
             except BaseException as error:
                 ended = _ending(stop.fault, error)
@@ -143,20 +143,26 @@ class Guest:
                     level = "info" if ended.status == "complete" else "error"
                     log.tell(level, RUN_END, ended.text, {"status": ended.status})
                 finally:  # also when a subscriber fails
-                    await house.rest(watchers)
+                    await open_stand.rest(watchers)
                     settling.close()
                     stop.ended()
                     await log.end(ended, stop.patience)
 
     async def _begun(self, settling: SettlingWatch, leaving: AsyncExitStack) -> Executor:
         """Everything read and judged once, and the journal begun or continued: nothing moves before that."""
-        house, assembly, log, before, recorder = self._house, self._assembly, self.log, self.job.before, self.recorder
-        await house.read_once()
+        open_stand, assembly, log, before, recorder = (
+            self._open_stand,
+            self._assembly,
+            self.log,
+            self.job.before,
+            self.recorder,
+        )
+        await open_stand.read_once()
         if before is None:
             log.tell("info", "run.start", f"recipe {self.job.order.recipe.name}", self._begin_data())
         else:
             self._tell_interruption(before)
-        if not house.guard.look():
+        if not open_stand.guard.look():
             raise StandTripped("a rule of the guard is violated")
         await recorder.flushed()  # a session with a journal can be opened and resumed
         journal = Journal.create(recorder.directory) if before is None else before.journal
@@ -166,8 +172,8 @@ class Guest:
             await self.job.begun(recorder.directory)
         gate, hub, clock = assembly.stand.gate, assembly.hub, assembly.clock
         gate.subscribe(log.held)
-        if house.latched is not None:  # by the first look, when there was no journal yet
-            log.tripped(house.latched)
+        if open_stand.latched is not None:  # by the first look, when there was no journal yet
+            log.tripped(open_stand.latched)
             log.held(INTERLOCK, True)
         holding = _hold_while_not_recorded(gate)
         hub.subscribe(holding)
@@ -199,14 +205,16 @@ class Guest:
         lane = Lane("night", assembly.clock, patient=False)  # nothing moves yet: the disk may take its time
         leaving.callback(lane.close)
         night = await lane.call(price_night, state.plan, self.job.order.config, recorder.directory.parent)
-        gate, clock, house = assembly.stand.gate, assembly.clock, self._house
+        gate, clock, open_stand = assembly.stand.gate, assembly.clock, self._open_stand
         name = self.job.order.recipe.name
         supply = assembly.stand.imaging.supply
 
         def soaked_again_s() -> float | None:
             return supply.equilibrium.soaked_s() if supply.is_on else None
 
-        board = StatusBoard(name, night, kept, gate, self.stop, lambda: house.latched, recorder, clock, soaked_again_s)
+        board = StatusBoard(
+            name, night, kept, gate, self.stop, lambda: open_stand.latched, recorder, clock, soaked_again_s
+        )
         assembly.hub.subscribe(board)
         leaving.callback(assembly.hub.unsubscribe, board)
         if not isinstance(clock, VirtualClock):  # there nobody waits for the end
@@ -217,7 +225,7 @@ class Guest:
 
     def _desk(self, board: StatusBoard, executor: Executor, leaving: AsyncExitStack) -> RunDesk:
         """What may be asked of the run."""
-        assembly, directory, house = self._assembly, self.recorder.directory, self._house
+        assembly, directory, open_stand = self._assembly, self.recorder.directory, self._open_stand
         notes = DiskCalls(self.recorder.disk, NOTES_LINE, assembly.clock)
         leaving.callback(notes.close)
         desk = RunDesk(
@@ -227,7 +235,7 @@ class Guest:
             self.log,
             executor,
             board.status,
-            lambda: house.latched,
+            lambda: open_stand.latched,
             notes,
             board.priced_s,
         )

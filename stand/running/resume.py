@@ -118,8 +118,8 @@ def _interruption(
     session = Session.open(directory)
     begun = first if isinstance(first, Begun) else _recorded_begun(session)
     lost = _recorded_end(session, entries) if journal.damage else ()  # what else is lost is unknown
-    told = (*with_recorded(entries, _recorded_items(session), _recorded_frames(session)), *lost)
-    _check_may_go_on(directory, folded((), told), clear)
+    all_entries = (*with_recorded(entries, _recorded_items(session), _recorded_frames(session)), *lost)
+    _check_may_go_on(directory, folded((), all_entries), clear)
     order = _order(session, begun)
     info = SessionInfo.of(session.metadata)
     config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
@@ -129,7 +129,7 @@ def _interruption(
         replace(order, config=config),
         info,
         journal,
-        folded(order.recipe.plan(), told),
+        folded(order.recipe.plan(), all_entries),
         last_ns,
         begun.seed,
         salvaged,

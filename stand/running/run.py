@@ -23,8 +23,8 @@ from stand.config.safe_ranges import accepted_text
 from stand.running.guest import Guest, Job
 from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
-from stand.running.opening.house import House, Time, opened
 from stand.running.opening.one_cpu import one_cpu
+from stand.running.opening.open_stand import OpenStand, Time, opened
 from stand.running.opening.stop import Interrupted, Stop
 from stand.running.opening.temperature_check import check_temperature
 from stand.running.order import Order
@@ -88,25 +88,25 @@ async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s:
         before.release()
 
 
-async def run_in(house: House, job: Job, stop: Stop) -> Path:
+async def run_in(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
     """Run, or resume, on a stand that stays open behind it; returns the session's folder, and raises as run_virtual."""
-    hub, early = house.assembly.hub, _Early()
+    hub, early = open_stand.assembly.hub, _Early()
     hub.subscribe(early)
     try:
         job.watch(hub)
-        await _announce(job, house.assembly, house.disk, has_own=True)
-        directory = _directory(job, house.assembly.clock)
-        async with _telling_failure(house.assembly, directory, stop), AsyncExitStack() as stack:
+        await _announce(job, open_stand.assembly, open_stand.disk, has_own=True)
+        directory = _directory(job, open_stand.assembly.clock)
+        async with _telling_failure(open_stand.assembly, directory, stop), AsyncExitStack() as stack:
             disk = Disk()
             stack.push_async_callback(disk.ended_within, stop.patience)
-            stack.callback(house.unrecorded)
+            stack.callback(open_stand.unrecorded)
             stack.push_async_callback(stop.settled)
-            stop.watch(house.assembly.stand)
-            recorder = await _stay(job, directory, house, early, stop, disk)
-            _check_outcome(directory, recorder, house.assembly)
+            stop.watch(open_stand.assembly.stand)
+            recorder = await _stay(job, directory, open_stand, early, stop, disk)
+            _check_outcome(directory, recorder, open_stand.assembly)
         return directory
     finally:
-        house.left()
+        open_stand.left()
         hub.unsubscribe(early)
         if job.before is not None:
             job.before.release()
@@ -153,10 +153,10 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
         await _announce(job, assembly)
         assembly.notifier.start()
         try:
-            told = alerting(assembly.config.name, assembly.config.alerts, hub, clock)
-            async with told, _telling_failure(assembly, directory, stop):
-                async with opened(assembly, time, stop, is_for_one=True) as house:
-                    recorder = await _stay(job, directory, house, early, stop, house.disk)
+            alerts = alerting(assembly.config.name, assembly.config.alerts, hub, clock)
+            async with alerts, _telling_failure(assembly, directory, stop):
+                async with opened(assembly, time, stop, is_for_one=True) as open_stand:
+                    recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk)
                 _check_outcome(directory, recorder, assembly)
         finally:
             assembly.notifier.close()
@@ -213,17 +213,19 @@ async def _telling_failure(assembly: Assembly, directory: Path, stop: Stop) -> A
         raise
 
 
-async def _stay(job: Job, directory: Path, house: House, early: _Early, stop: Stop, disk: Disk | None) -> Recorder:
+async def _stay(
+    job: Job, directory: Path, open_stand: OpenStand, early: _Early, stop: Stop, disk: Disk | None
+) -> Recorder:
     """From the camera's start to the end of the recording."""
     is_camera_on = job.before is None or job.before.kept.set_up.camera_on
     async with AsyncExitStack() as stack:
-        tell_identities(house.assembly)
+        tell_identities(open_stand.assembly)
         if is_camera_on:
-            await house.or_safe(_with_camera(house.assembly), stop)
-        recorder = await house.or_safe(_recording(job, directory, house.assembly, early, disk), stop)
+            await open_stand.or_safe(_with_camera(open_stand.assembly), stop)
+        recorder = await open_stand.or_safe(_recording(job, directory, open_stand.assembly, early, disk), stop)
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording, stop)
-        await Guest(job, house, recorder, stop).run(recording)
+        await Guest(job, open_stand, recorder, stop).run(recording)
     return recorder
 
 

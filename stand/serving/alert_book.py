@@ -103,7 +103,7 @@ class AlertBook:
     _open: dict[tuple[Cause, str], tuple[Event, bool]] = field(
         default_factory=dict[tuple[Cause, str], tuple[Event, bool]]
     )  # the event, and whether it was sent
-    _told_ns: deque[int] = field(default_factory=deque[int])
+    _sent_ns: deque[int] = field(default_factory=deque[int])
     _left_out: int = 0
     _run_ended: bool = False
 
@@ -138,8 +138,8 @@ class AlertBook:
     def due(self, now_ns: int) -> list[Message]:
         """What has lasted for the grace time by now."""
         found: list[tuple[Cause, str, str]] = []
-        for (cause, key), (event, was_told) in self._open.items():
-            if not was_told and now_ns - event.time_ns >= self.grace_ns:
+        for (cause, key), (event, was_sent) in self._open.items():
+            if not was_sent and now_ns - event.time_ns >= self.grace_ns:
                 self._open[cause, key] = (event, True)
                 found.append((cause, _TITLES[cause], event.text))
         return self._limited(found, now_ns)
@@ -147,16 +147,16 @@ class AlertBook:
     def _limited(self, found: Iterable[tuple[Cause, str, str]], now_ns: int) -> list[Message]:
         """Those that are wanted, and within what an hour may have."""
         messages: list[Message] = []
-        while self._told_ns and now_ns - self._told_ns[0] >= _HOUR_NS:
-            self._told_ns.popleft()
+        while self._sent_ns and now_ns - self._sent_ns[0] >= _HOUR_NS:
+            self._sent_ns.popleft()
         for cause, title, text in found:
             if cause not in self.causes:
                 continue
-            if len(self._told_ns) >= self.most_per_h and cause != "trip":
+            if len(self._sent_ns) >= self.most_per_h and cause != "trip":
                 self._left_out += 1
                 continue
             more = f"\n{self._left_out} messages before this one were left out" if self._left_out else ""
             self._left_out = 0
-            self._told_ns.append(now_ns)
+            self._sent_ns.append(now_ns)
             messages.append(Message(cause, f"{self.name}: {title}", f"{text}{more}"))
         return messages

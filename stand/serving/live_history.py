@@ -186,7 +186,7 @@ class History:
             ring.make_room(self._room)
         self._rows: dict[str, int] = {}
         self._units: dict[str, str] = {}
-        self._told: deque[Mark] = deque(maxlen=MOST_MARKS)  # so many of what is only worth knowing
+        self._infos: deque[Mark] = deque(maxlen=MOST_MARKS)  # so many of what is only worth knowing
         self._warned: deque[Mark] = deque(maxlen=MOST_MARKS)  # and so many of what is more
         self._steps: deque[Mark] = deque(maxlen=MOST_MARKS)
         self._last_ns: dict[str, int] = {}
@@ -236,7 +236,7 @@ class History:
                 for ring, others in zip(self._rings, other._rings, strict=True):
                     ring.absorb(row, others, other_row)
         for marks, others in (
-            (self._told, other._told),
+            (self._infos, other._infos),
             (self._warned, other._warned),
             (self._steps, other._steps),
         ):
@@ -247,7 +247,7 @@ class History:
     def mark(self, item: Event | StepMark) -> None:
         """Keep an event, or where a step is."""
         if isinstance(item, Event):
-            kept = self._told if item.level == "info" else self._warned
+            kept = self._infos if item.level == "info" else self._warned
             kept.append(Mark(item.time_ns, item.level, item.kind, item.text))
             return
         if item.state is StepState.STARTED:
@@ -313,7 +313,7 @@ class History:
     def _marks(self, from_ns: int, to_ns: int) -> Iterator[Mark]:
         found = [
             mark
-            for marks in (self._told, self._warned, self._steps)
+            for marks in (self._infos, self._warned, self._steps)
             for mark in marks
             if mark.time_ns < to_ns and (mark.time_ns if mark.level != "step" else mark.end_ns or to_ns) >= from_ns
         ]

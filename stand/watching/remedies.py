@@ -22,7 +22,7 @@ _SWITCHED = "find what else switches it: a key of the unit, a second program on 
 _CLEAR_FOLDER = "have its disk mounted, or the folder moved back, then `stand clear`"
 _SENSOR = "compare it with another thermometer at its place, and look at its cable"
 _SHOW_SESSION = "`stand session info {folder}` shows what is missing"
-_CAREFUL = "`stand session note {folder} TEXT` tells whoever fits it"
+_CAREFUL = "`stand session note {folder} TEXT` informs those who fit it"
 _NOTHING = "nothing is to be done"
 _NEW_END = "nothing is to be done; `stand status` has the new end"
 _STAGE = "see whether it has lost its supply or slipped; "
@@ -44,7 +44,7 @@ _OF_KIND = {
     "compressor_not_kept": _SEE_DISK,
     "cool_down_unsure": "see by the first readings whether the camera was cold when it was switched on; " + _CAREFUL,
     "daemon_not_kept": _SEE_DISK,
-    "dead_man_tested": "take a board whose timed-on begins anew each time (docs/drivers.md); `stand check --moves`",
+    "dead_man_tested": "take a board whose timed-on each command restarts (docs/drivers.md); `stand check --moves`",
     "device_lost": _CONNECTED,
     "device_slow": "look at its line: speed, cable, how many units are on it; `stand check` times each device",
     "disk_nearly_full": _ROOM,

@@ -21,7 +21,7 @@ from foundation.clock import WallClock
 from foundation.errors import StandError
 from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
-from stand.running.opening.house import close_devices
+from stand.running.opening.open_stand import close_devices
 from stand.simulator import Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
 from tests.system.simulated_orders import simulated_order

@@ -13,7 +13,7 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.readings import Frame
 from recording.format.images import decode_image
-from recording.reading.gaps import told_blocks
+from recording.reading.gaps import reported_blocks
 from recording.reading.session import Session
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import tmpfs
@@ -84,7 +84,7 @@ def readable_blocks(directory):
 
 def lost_blocks(night):
     """The block ids that the events name."""
-    for blocks in told_blocks(night.events):
+    for blocks in reported_blocks(night.events):
         yield from blocks
 
 

@@ -5,7 +5,7 @@ import pytest
 from foundation.items import Event
 from recording.format.messages import decode_event, encode_event
 from recording.format.restarts import restarted_step
-from recording.reading.gaps import told_blocks
+from recording.reading.gaps import reported_blocks
 
 
 def decoded(kind: str, text: str, data: dict[str, object] | None = None) -> Event:
@@ -31,7 +31,7 @@ def test_a_capture_that_was_restarted_is_named():
     ],
 )
 def test_lost_blocks_are_counted(text: str, blocks: list[range]):
-    assert told_blocks([decoded("frames_dropped", text)]) == blocks
+    assert reported_blocks([decoded("frames_dropped", text)]) == blocks
 
 
 def test_a_home_check_has_its_residual():
@@ -41,9 +41,9 @@ def test_a_home_check_has_its_residual():
 
 def test_data_that_were_recorded_count_whatever_the_sentence_says():
     event = decoded("frames_dropped", "frames lost: 1 (block 9 of step a)", {"blocks": [[1, 2]]})
-    assert told_blocks([event]) == [range(1, 3)]
+    assert reported_blocks([event]) == [range(1, 3)]
 
 
 @pytest.mark.parametrize("blocks", ["9", [[1]], [[2, 1]], [["1", 2]], [[-1, 2]], [[1, 2**80]], {"1": 2}, None])
 def test_blocks_that_are_no_pairs_of_numbers_are_none(blocks: object):
-    assert told_blocks([Event(0, "error", "frames_dropped", "", {"blocks": blocks})]) == []
+    assert reported_blocks([Event(0, "error", "frames_dropped", "", {"blocks": blocks})]) == []

@@ -64,7 +64,7 @@ REGISTER_MAP = {
     "Write",
     "Command",
     "Probe",
-    "Told",
+    "IdentityPoint",
 }
 
 

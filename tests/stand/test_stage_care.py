@@ -26,7 +26,7 @@ async def bench(kind: Kind, tmp_path: Path) -> AsyncIterator[Bench]:
         yield bench
 
 
-class Told:
+class IdentityPoint:
     """A hub, and what was published on it."""
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ each_kind = pytest.mark.parametrize("kind", ["linear", "rotary"])
 async def test_a_home_check_tells_lost_steps_in_units_and_steps(
     bench: Bench, lost_steps: float, expected: tuple[str, str]
 ) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.lost_steps = lost_steps
     residual = await check_home(axis, told.hub, bench.clock)
@@ -68,7 +68,7 @@ async def test_a_home_check_tells_lost_steps_in_units_and_steps(
 @pytest.mark.parametrize("kind", ["rotary"])
 @pytest.mark.parametrize("place", [-40.0, -5.0, 0.0, 12.0, 40.0])
 async def test_a_home_check_never_turns_the_table_round(bench: Bench, place: float) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(place)
     bench.trajectory, began_s = [], bench.now_s
     await check_home(axis, told.hub, bench.clock)
@@ -79,7 +79,7 @@ async def test_a_home_check_never_turns_the_table_round(bench: Bench, place: flo
 
 
 async def test_the_limit_of_a_home_check_is_the_callers(bench: Bench) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.lost_steps = 4.0
     await check_home(axis, told.hub, bench.clock, limit_steps=5.0)
@@ -87,7 +87,7 @@ async def test_the_limit_of_a_home_check_is_the_callers(bench: Bench) -> None:
 
 
 async def test_an_axis_without_scale_is_homed_and_has_no_residual(bench: Bench) -> None:
-    told = Told()
+    told = IdentityPoint()
     await bench.axis.open()
     assert math.isnan(await check_home(bench.axis, told.hub, bench.clock))
     assert await bench.axis.homed()
@@ -95,7 +95,7 @@ async def test_an_axis_without_scale_is_homed_and_has_no_residual(bench: Bench) 
 
 
 async def test_a_stage_whose_motor_went_off_is_approached_again_from_below(bench: Bench) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(120))
     assert (await bench.position()).quality is Quality.STALE
@@ -109,7 +109,7 @@ async def test_a_stage_whose_motor_went_off_is_approached_again_from_below(bench
 
 
 async def test_a_stage_with_current_in_its_place_is_left_alone(bench: Bench) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     moves = bench.tap.count("move")
     await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
@@ -117,14 +117,14 @@ async def test_a_stage_with_current_in_its_place_is_left_alone(bench: Bench) -> 
 
 
 async def test_an_axis_the_plan_never_moved_is_left_alone(bench: Bench) -> None:
-    told = Told()
+    told = IdentityPoint()
     await bench.axis.open()
     await ready({"linear": bench.axis}, {}, told.hub, bench.clock)
     assert (bench.tap.count("move"), told.events) == (0, [])
 
 
 async def test_a_stage_stopped_on_its_way_is_brought_to_its_place(bench: Bench) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(20.0)
     await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
     assert bench.mechanical == pytest.approx(30.0, abs=1e-4)
@@ -132,7 +132,7 @@ async def test_a_stage_stopped_on_its_way_is_brought_to_its_place(bench: Bench) 
 
 
 async def test_a_stage_that_lost_its_scale_is_homed_before_it_is_approached(bench: Bench) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.power_cycle()
     await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
@@ -142,7 +142,7 @@ async def test_a_stage_that_lost_its_scale_is_homed_before_it_is_approached(benc
 
 
 async def test_an_alarm_is_not_moved_away(bench: Bench) -> None:
-    axis, told = await bench.ready(), Told()
+    axis, told = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.alarm = True
     with pytest.raises(DeviceFault, match="alarm"):

@@ -24,7 +24,7 @@ from stand.assembly import assemble
 from stand.config.stand_config import load_config, packaged
 from stand.daemon.daemon import Daemon
 from stand.daemon.daemon_desk import DaemonDesk
-from stand.daemon.house_record import HouseRecord
+from stand.daemon.day_record import DayRecord
 from stand.daemon.serve import serve as serve_stand
 from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
@@ -153,8 +153,8 @@ def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve
     served.process.send_signal(signal.SIGTERM)
     told = served.told()
     assert served.process.returncode == 0, told
-    (house,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
-    session = Session.open(house)
+    (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
+    session = Session.open(folder)
     assert session.incomplete == ()
     assert any(event.kind == "command" and event.data.get("verb") == "device" for event in session.events())
     assert len(list(session.frames())) == 1
@@ -232,10 +232,10 @@ def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
 def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(serve: Callable[[], Served]):
     served = serve()
     served.until(is_idle)
-    (house,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
+    (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
     served.post("devices/regulator/set", arguments={"setpoint_degC": 30.0})
     served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
-    house.rename(house.with_name("elsewhere"))
+    folder.rename(folder.with_name("elsewhere"))
     tripped = served.until(lambda state: state.fault is not None)
     assert tripped.fault is not None
     assert tripped.fault.rule == "folder_lost"
@@ -356,7 +356,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
     config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
     texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
     day = ["20261122"]
-    monkeypatch.setattr(HouseRecord, "_today", lambda _: day[0])
+    monkeypatch.setattr(DayRecord, "_today", lambda _: day[0])
     told: list[Event] = []
 
     @asynccontextmanager
@@ -378,7 +378,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
             await until(lambda: clock.now_ns() > turned_ns + 3_000_000_000)  # the guard looks each second
             assert desk.state().heater_permitted
             assert desk.state().fault is None
-            assert daemon.house.recorder is daemon.record.recorder
+            assert daemon.open_stand.recorder is daemon.record.recorder
 
         working = asyncio.create_task(work())
         working.add_done_callback(lambda _: daemon.leave())

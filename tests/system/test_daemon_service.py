@@ -77,14 +77,14 @@ async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
             while time.monotonic() < end_s:
                 began_s = time.monotonic()
                 await asyncio.to_thread(server_of(out).state, 20.0)
-                if (took_s := time.monotonic() - began_s) > 2.0 or not daemon.house.guard.is_on_time:
+                if (took_s := time.monotonic() - began_s) > 2.0 or not daemon.open_stand.guard.is_on_time:
                     late.append(f"{took_s:.1f} s")
                 await asyncio.sleep(0.1)
             assert fed(manager) >= 3
             fed(manager)
             threading.Event().wait(WATCHDOG_S)  # the event loop is blocked: nobody feeds from beside it
             assert fed(manager) == 0
-            monkeypatch.setattr(type(daemon.house.guard), "is_on_time", property(lambda _: False))
+            monkeypatch.setattr(type(daemon.open_stand.guard), "is_on_time", property(lambda _: False))
             await asyncio.sleep(0.2)
             fed(manager)
             await asyncio.sleep(WATCHDOG_S)

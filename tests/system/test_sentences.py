@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-HOUSE = Path(__file__).parents[2]
+BETWEEN_RUNS = Path(__file__).parents[2]
 ROOMS = ("foundation", "drivers", "experiments", "recording", "markers", "stand", "compensation")
 SENTENCES = {"text", "reason"}  # attributes
 TAKEN_APART = {"startswith", "endswith", "removeprefix", "removesuffix", "partition", "rpartition", "split", "rsplit"}
@@ -110,8 +110,8 @@ def read_sentences(source: str) -> Iterator[tuple[str, int]]:
 
 def test_no_sentence_is_read():
     found = []
-    for path in sorted(path for room in ROOMS for path in (HOUSE / room).rglob("*.py")):
-        name = str(path.relative_to(HOUSE))
+    for path in sorted(path for room in ROOMS for path in (BETWEEN_RUNS / room).rglob("*.py")):
+        name = str(path.relative_to(BETWEEN_RUNS))
         places = read_sentences(path.read_text(encoding="utf-8"))
         found += [f"{name}:{line} in {function}" for function, line in places if (name, function) not in SHOWN]
     assert found == []
@@ -119,8 +119,8 @@ def test_no_sentence_is_read():
 
 def test_the_reader_of_old_sessions_sentences_is_asked_in_one_place():
     """Where events are decoded that have no data; nothing that is recorded now depends on it."""
-    files = [path for room in ROOMS for path in (HOUSE / room).rglob("*.py")]
-    askers = [str(path.relative_to(HOUSE)) for path in files if "old_sentences import" in path.read_text()]
+    files = [path for room in ROOMS for path in (BETWEEN_RUNS / room).rglob("*.py")]
+    askers = [str(path.relative_to(BETWEEN_RUNS)) for path in files if "old_sentences import" in path.read_text()]
     assert askers == ["recording/format/messages.py"]
 
 

@@ -15,7 +15,7 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from stand.assembly import Assembly, assemble
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.opening.house import House, opened
+from stand.running.opening.open_stand import OpenStand, opened
 from stand.running.opening.stop import Stop
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 from tests.sections import change
@@ -26,7 +26,7 @@ class VirtualStand:
     """The open stand, what was polled (channel -> instants in s since the begin, values), and its events."""
 
     assembly: Assembly
-    house: House
+    open_stand: OpenStand
     control: ControlSocket
     clock: VirtualClock
     begin_ns: int
@@ -93,13 +93,13 @@ async def virtual_stand(config: StandConfig) -> AsyncGenerator[VirtualStand]:
         await control.open()
         clock = VirtualClock(begin_ns, control.advance)
         assembly = assemble(relocated(config, simulator.addresses), Hub(), clock)
-        house = await stack.enter_async_context(opened(assembly, clock.run, stop, is_for_one=True))
-        stand = VirtualStand(assembly, house, control, clock, begin_ns)
+        open_stand = await stack.enter_async_context(opened(assembly, clock.run, stop, is_for_one=True))
+        stand = VirtualStand(assembly, open_stand, control, clock, begin_ns)
         assembly.hub.subscribe(stand.receive)
-        house.prepare()
-        await house.read_once()
-        house.start()
+        open_stand.prepare()
+        await open_stand.read_once()
+        open_stand.start()
         try:
             yield stand
         finally:
-            await house.close()
+            await open_stand.close()

@@ -63,7 +63,7 @@ class Ascii2Settings(ChamberUnitSettings):
     gap_s: float = Field(default=0.5, ge=0, le=5)  # other drivers pause as long
 
     @model_validator(mode="after")
-    def _told_apart(self) -> Self:
+    def _distinct(self) -> Self:
         if self.start_bit in self.off_bits:
             raise ValueError(f"start_bit {self.start_bit} is one of off_bits, too")
         nominal = 0 if self.order == "nominal_actual" else 1

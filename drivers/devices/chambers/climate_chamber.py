@@ -125,11 +125,11 @@ class ClimateChamber:
     # Below: in the lane's thread.
 
     def _check(self) -> None:
-        told = self._language.identity()
-        if self._settings.identity not in told:
-            raise DeviceFault(self.name, f"it says that it is {told!r}, not {self._settings.identity!r}; not used")
+        answer = self._language.identity()
+        if self._settings.identity not in answer:
+            raise DeviceFault(self.name, f"it says that it is {answer!r}, not {self._settings.identity!r}; not used")
         protocol = str(self._settings.model_dump()["protocol"])
-        found = Identity("", told or f"climate chamber that speaks {protocol}", "", "", by_map=not told)
+        found = Identity("", answer or f"climate chamber that speaks {protocol}", "", "", by_map=not answer)
         self.identity = same_device(self.name, found, self.identity)
         self._check_limits()
         self._is_checked = True

@@ -111,7 +111,7 @@ class ThermalImager:
         self._latest: tuple[Reading, ...] = ()
         self._latest_ns = 0
         self._is_stale = False
-        self._told: tuple[Reading, ...] = ()
+        self._last: tuple[Reading, ...] = ()
 
     async def open(self) -> None:
         """Look into the folder, which may come later; the pictures that are there first are none of this stand's."""
@@ -137,21 +137,21 @@ class ThermalImager:
         now_ns = self._clock.now_ns()
         self._tell_folder(listed if isinstance(listed, str) else "", now_ns)
         if isinstance(listed, str):
-            before, self._told = self._told, self._bad(listed, now_ns)
-            return () if [each.reason for each in before] == [each.reason for each in self._told] else self._told
+            before, self._last = self._last, self._bad(listed, now_ns)
+            return () if [each.reason for each in before] == [each.reason for each in self._last] else self._last
         if self._files is None:
             self._begin(listed)
         for name in self._due(listed, now_ns):
             for item in await self._lane.call(self._taken, name, now_ns):
                 self._publish(item)
         self._tell_age(now_ns)
-        before, self._told = self._told, self._present(now_ns)
-        return () if before == self._told else self._told
+        before, self._last = self._last, self._present(now_ns)
+        return () if before == self._last else self._last
 
     def _present(self, now_ns: int) -> tuple[Reading, ...]:
         if not self._latest:
-            if self._told and all(reading.reason == _NONE_YET for reading in self._told):
-                return self._told
+            if self._last and all(reading.reason == _NONE_YET for reading in self._last):
+                return self._last
             return self._bad(_NONE_YET, now_ns)
         if not self._is_stale:
             return self._latest
@@ -244,9 +244,9 @@ class ThermalImager:
         self._hashes[digest] = name
         while len(self._hashes) > _KNOWN_HASHES:
             del self._hashes[next(iter(self._hashes))]
-        told = self._follow_clock(image.camera_s, seen.first_ns, now_ns) if image.camera_s > 0 else []
+        clock_events = self._follow_clock(image.camera_s, seen.first_ns, now_ns) if image.camera_s > 0 else []
         taken = self._credit(name, digest, image, seen.first_ns, now_ns)
-        return [Original(now_ns, self.name, name, data), *told, taken]
+        return [Original(now_ns, self.name, name, data), *clock_events, taken]
 
     def _content(self, name: str) -> bytes:
         with (self._settings.folder / name).open("rb") as file:

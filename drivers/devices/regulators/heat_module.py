@@ -80,7 +80,7 @@ class HeatModule:
         self._differed = False  # at the last step it gave other than what it was left at
         self.uncontrolled = ""
         self._last: tuple[Reading, ...] = ()
-        self._unread = ""  # why the last exchange has not given it anew
+        self._unread = ""  # why the last exchange has given no new one
 
     @property
     def identity(self) -> Identity | None:

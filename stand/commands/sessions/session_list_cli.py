@@ -119,8 +119,8 @@ def _keep(directory: Path, add: Callable[..., None]) -> None:
     with one_line_errors():
         add(check_session(directory), by=user_name(), time_ns=WallClock().now_ns())
         said = read_notes(directory)
-        told = f"{len(said.notes)} note{'' if len(said.notes) == 1 else 's'}"
-        line = one_line(f"{directory}: {told}, tags: {', '.join(said.tags) or 'none'}")
+        count = f"{len(said.notes)} note{'' if len(said.notes) == 1 else 's'}"
+        line = one_line(f"{directory}: {count}, tags: {', '.join(said.tags) or 'none'}")
         show({"notes": [asdict(each) for each in said.notes], "tags": list(said.tags)}, [line])
 
 

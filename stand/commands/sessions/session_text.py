@@ -66,24 +66,24 @@ def _row(label: str, text: str) -> Iterator[str]:
 
 def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     seen = found.glance
-    told = seen.metadata.get
-    name, known_as = seen.path.resolve().name, told("session_id", "")
+    stated = seen.metadata.get
+    name, known_as = seen.path.resolve().name, stated("session_id", "")
     alias = f", recorded as {known_as}" if known_as not in ("", name) else ""
     yield from _row("session", f"{name}{alias}")
     yield from _row("run", str(seen.run))
     yield from _row("files", str(found.state))
-    yield from _row("recipe", told("recipe", "?") + (", simulated devices" if seen.simulated else ""))
+    yield from _row("recipe", stated("recipe", "?") + (", simulated devices" if seen.simulated else ""))
     if seen.begin_ns is not None and seen.end_ns is not None:
         span = f"{utc.date_time(seen.begin_ns)} to {utc.local_text(seen.end_ns)}"
         yield from _row(
-            "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {told('clock_source', '?')} clock"
+            "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {stated('clock_source', '?')} clock"
         )
     ending = "not recorded" if found.ending is None else found.ending.text
     yield from _row("ended", ending)
-    yield from _row("operator", told("operator", "") or "not named")
-    yield from _row("camera", told("camera_serial", "?") + (f"; {seen.lacks}" if seen.lacks else ""))
-    host = f", host {told('host')}" if told("host") else ""
-    yield from _row("software", f"thermostand {told('software_version', '?')}{host}")
+    yield from _row("operator", stated("operator", "") or "not named")
+    yield from _row("camera", stated("camera_serial", "?") + (f"; {seen.lacks}" if seen.lacks else ""))
+    host = f", host {stated('host')}" if stated("host") else ""
+    yield from _row("software", f"thermostand {stated('software_version', '?')}{host}")
     yield from _row("segments", _segments(seen))
     yield from _row("attached", ", ".join(seen.attachments) or "nothing")
     yield from _said(entry_of(seen))
@@ -131,7 +131,7 @@ def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
     planned = "" if found.planned_steps is None else f" of {found.planned_steps}"
     yield from _row("steps", f"{kinds.total()}{planned} done{f': {listed}' if listed else ''}" if steps else "none")
-    told = {
+    stated = {
         StepState.FAILED: "failed",
         StepState.SKIPPED: "was left out",
         StepState.STARTED: "has no end in the recording",
@@ -140,7 +140,7 @@ def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
         if step.state is not StepState.DONE:
             parameters = " ".join(f"{name}={value}" for name, value in step.parameters.items())
             begun = f"begun {utc.local_text(step.begin_ns)}"
-            text = f"{step.index} {step.kind} {parameters} {told[step.state]}, {begun}"
+            text = f"{step.index} {step.kind} {parameters} {stated[step.state]}, {begun}"
             yield from _row("  not done", text)
 
 
@@ -170,10 +170,10 @@ def _lost(frames: Frames) -> str:
 
 
 def _capture(step: Step, utc: UtcOffsets) -> str:
-    told = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
+    stated = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
     asked = step.parameters.get("frames", "?")
     begun = utc.date_time(step.begin_ns)
-    return f"{'':<{_LABEL}}step {step.index + 1:<4d} {step.frames} of {asked} frames from {begun}  {told}"
+    return f"{'':<{_LABEL}}step {step.index + 1:<4d} {step.frames} of {asked} frames from {begun}  {stated}"
 
 
 def _temperatures(temperatures: Sequence[Temperature]) -> Iterator[str]:

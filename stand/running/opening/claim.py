@@ -157,7 +157,7 @@ def _holder(file_name: str) -> str:
     for _ in range(_HOLDER_TRIES):
         for folder in runtime_folders():
             with suppress(OSError, ValueError, LookupError, TypeError):
-                return _told(folder / file_name)
+                return _described(folder / file_name)
         threading.Event().wait(_HOLDER_PAUSE_S)
     return "a run of another user or login"
 
@@ -182,7 +182,7 @@ def _said(path: Path) -> dict[str, object]:
         return cast("dict[str, object]", json.loads(file.read()))
 
 
-def _told(path: Path) -> str:
+def _described(path: Path) -> str:
     """Who has it, in words; raises as `_said`."""
     said = _said(path)
     daemon = f"`{said['command']}`" if said.get("command") else "the daemon of `stand serve`"

@@ -24,7 +24,7 @@ class ClockWatch:
         self._hub = hub
         self._clock = clock
         self._recorded_ns = recorded_ns
-        self._told_ns = 0  # when the offset was recorded last
+        self._reported_ns = 0  # when the offset was recorded last
         self._seen_ns = clock.now_ns()
         self._suspended_ns = clock.suspended_ns()
 
@@ -46,8 +46,8 @@ class ClockWatch:
             self._suspended_ns = suspended_ns
         if abs(offset_ns - self._recorded_ns) > _LIMIT_NS:
             self._tell_step(now_ns, offset_ns)
-        elif self._recorded_ns and now_ns - self._told_ns >= REPEATED_NS:
-            self._told_ns = now_ns
+        elif self._recorded_ns and now_ns - self._reported_ns >= REPEATED_NS:
+            self._reported_ns = now_ns
             self._hub.publish(offset_event(now_ns, self._recorded_ns))
         self._seen_ns = now_ns
 
@@ -69,5 +69,5 @@ class ClockWatch:
             "stand_ns": now_ns,
             "utc_ns": now_ns + offset_ns,
         }
-        self._recorded_ns, self._told_ns = offset_ns, now_ns
+        self._recorded_ns, self._reported_ns = offset_ns, now_ns
         self._hub.publish(Event(now_ns, "warning", CLOCK_STEP, text, data))

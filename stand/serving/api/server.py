@@ -93,11 +93,11 @@ def _tcp(option: str, host: str, port: int) -> socket.socket:
 
 def _reporter(hub: Hub, clock: Clock) -> Callable[[str, str], None]:
     """A function for any thread: a warning of this kind, once for each text."""
-    loop, told = asyncio.get_running_loop(), set[str]()
+    loop, reported = asyncio.get_running_loop(), set[str]()
 
     def report(kind: str, text: str) -> None:
-        if text not in told and len(told) < 100:
-            told.add(text)
+        if text not in reported and len(reported) < 100:
+            reported.add(text)
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(lambda: hub.publish(Event(clock.now_ns(), "warning", kind, text)))
 

@@ -130,7 +130,7 @@ class Stream:
         self._first = self._seq = bridge.snapshot.state.seq
         self._gone_events = self._gone_readings = self._seq  # the last numbers that are in no ring any more
         self._viewers: set[Viewer] = set()
-        self._told: Snapshot | None = None
+        self._reported: Snapshot | None = None
 
     @property
     def viewers(self) -> int:
@@ -153,8 +153,8 @@ class Stream:
             for viewer in self._viewers:
                 viewer.give(message)
         snapshot = self._bridge.snapshot
-        if snapshot is not self._told and self._viewers:
-            self._told, text = snapshot, state_json(snapshot, self.drops)
+        if snapshot is not self._reported and self._viewers:
+            self._reported, text = snapshot, state_json(snapshot, self.drops)
             for viewer in self._viewers:
                 viewer.tell(text)
 

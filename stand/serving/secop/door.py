@@ -79,11 +79,11 @@ class Door:
             await asyncio.gather(looking, *self._ending, return_exceptions=True)
 
     async def _look(self, node: Node) -> None:
-        told = None
+        sent = None
         while True:
             snapshot = self._bridge.snapshot
-            if snapshot is not told or snapshot.age_s > 1.0:
-                told = snapshot
+            if snapshot is not sent or snapshot.age_s > 1.0:
+                sent = snapshot
                 try:
                     node.look()
                 except Exception as error:  # noqa: BLE001 - what one value is must not end the door

@@ -50,7 +50,7 @@ Place = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _Reported:
     """A parameter as clients know it; t_s: s since the epoch, UTC."""
 
     report: Report
@@ -74,7 +74,7 @@ class Node:
         self._bridge = bridge
         self._tell, self._failed = tell, failed
         self._drives = {name: Drive() for name in self.modules}
-        self._told: dict[Place, _Told] = {}
+        self._reported: dict[Place, _Reported] = {}
         self.look()
 
     def look(self) -> None:
@@ -89,7 +89,7 @@ class Node:
 
     def places(self, module: str = "") -> list[Place]:
         """Every parameter, of one module or of all."""
-        return [place for place in self._told if module in ("", place[0])]
+        return [place for place in self._reported if module in ("", place[0])]
 
     def update(self, place: Place) -> bytes:
         """The line that tells a parameter's value, or why there is none."""
@@ -201,19 +201,19 @@ class Node:
         place, state = (name, parameter), snapshot.state
         seen = Seen(state, self._drives[name])
         now = _SILENT if snapshot.age_s > _OLD_S else self.modules[name].parameters[parameter].report(seen)
-        before = self._told.get(place)
+        before = self._reported.get(place)
         if before is not None and before.report == now:
             return False
         time_ns = now.time_ns if isinstance(now, Known) else None
-        self._told[place] = _Told(now, _utc_s(state, state.now_ns if time_ns is None else time_ns))
+        self._reported[place] = _Reported(now, _utc_s(state, state.now_ns if time_ns is None else time_ns))
         return True
 
     def _line(self, word: str, error_word: str, place: Place, specifier: str = "") -> bytes:
-        told, specifier = self._told[place], specifier or ":".join(place)
-        if isinstance(told.report, Refusal):
-            qualifiers = {"t": round(told.t_s, 6)}
-            return message(error_word, specifier, [told.report.error, told.report.text, qualifiers])
-        return message(word, specifier, report(told.report.value, told.t_s))
+        last, specifier = self._reported[place], specifier or ":".join(place)
+        if isinstance(last.report, Refusal):
+            qualifiers = {"t": round(last.t_s, 6)}
+            return message(error_word, specifier, [last.report.error, last.report.text, qualifiers])
+        return message(word, specifier, report(last.report.value, last.t_s))
 
     def _done(self, request: Request, result: JsonValue) -> bytes:
         return message("done", request.specifier, report(result, self._now_s()))

@@ -32,7 +32,7 @@ from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly
 from stand.running.session_files import recorder_in, tell_identities
 
-HOUSE = "house"  # in place of a recipe's name
+BETWEEN_RUNS = "house"  # in place of a recipe's name
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class _Recording:
             await self.disk.ended_within(patience)
 
 
-class HouseRecord:
+class DayRecord:
     """Records what passes the hub from `begin` to `end`, as often as wanted; of one day all is in one session. texts:
     attached, by their names there. patience: of a daemon that leaves, with its disk."""
 
@@ -69,7 +69,7 @@ class HouseRecord:
         self._cut_off: list[_Recording] = []  # they take nothing any more, and are not complete yet
         self._day = ""
         self._turn = asyncio.Lock()
-        self._lane = Lane("house-record", clock, patient=False)  # for a disk that may hang
+        self._lane = Lane("day-record", clock, patient=False)  # for a disk that may hang
 
     @property
     def recorder(self) -> Recorder | None:
@@ -128,7 +128,7 @@ class HouseRecord:
     def _place(self, day: str) -> str:
         """The name of the day's session; `-2`, `-3` ... when there is one that another program, or a stand with another
         configuration, has recorded, or that cannot be read."""
-        first = f"{day}-{HOUSE}"
+        first = f"{day}-{BETWEEN_RUNS}"
         names = itertools.chain([first], (f"{first}-{number}" for number in itertools.count(2)))
         return next(name for name in names if self._may_continue(self._out / name))
 
@@ -148,7 +148,7 @@ class HouseRecord:
         config = self._assembly.config
         return SessionInfo(
             session_id=name,
-            recipe=HOUSE,
+            recipe=BETWEEN_RUNS,
             operator=config.operator,
             camera_serial=", ".join(camera.serial_number or "" for camera in config.cameras.values()),
             software_version=importlib.metadata.version("thermostand"),
@@ -163,24 +163,24 @@ class _Tap(Hub):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__()
-        self._house = hub
+        self._hub = hub
         self._recorders: list[Subscriber] = []
 
     def subscribe(self, subscriber: Subscriber) -> None:
         self._recorders.append(subscriber)
-        self._house.subscribe(subscriber)
+        self._hub.subscribe(subscriber)
 
     def unsubscribe(self, subscriber: Callable[[Item], None]) -> None:
         self._recorders = [each for each in self._recorders if each != subscriber]
-        self._house.unsubscribe(subscriber)
+        self._hub.unsubscribe(subscriber)
 
     def publish(self, item: Item) -> None:
-        self._house.publish(item)
+        self._hub.publish(item)
 
     def close(self) -> None:
         """Nothing passes any more."""
         for recorder in self._recorders:
-            self._house.unsubscribe(recorder)
+            self._hub.unsubscribe(recorder)
 
     def give(self, item: Item) -> None:
         """To those who record, and nobody else."""

@@ -20,7 +20,7 @@ from recording.reading.session import Session
 from recording.repair.verify import verify
 from stand.assembly import Assembly
 from stand.config.stand_config import load_config, packaged
-from stand.daemon.house_record import HouseRecord
+from stand.daemon.day_record import DayRecord
 
 CONFIG = packaged("", "simulated")
 
@@ -41,12 +41,12 @@ class Calendar(WallClock):
 
 
 @pytest.fixture
-async def house(tmp_path: Path) -> AsyncGenerator[tuple[HouseRecord, Hub, Calendar]]:
+async def open_stand(tmp_path: Path) -> AsyncGenerator[tuple[DayRecord, Hub, Calendar]]:
     hub, clock = Hub(), Calendar()
     units = dict.fromkeys(("regulator", "heat_module", "relays", "thermometers", "inputs", "flap"))
     devices = SimpleNamespace(**units, axes={}, probes={})
     assembly = cast("Assembly", SimpleNamespace(hub=hub, clock=clock, devices=devices, config=load_config(CONFIG)))
-    record = HouseRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock, Patience())
+    record = DayRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock, Patience())
     yield record, hub, clock
     await record.end(20.0)
 
@@ -64,9 +64,9 @@ def times_ns(session: Session) -> list[int]:
 
 
 async def test_at_midnight_each_reading_is_in_one_of_two_sessions(
-    house: tuple[HouseRecord, Hub, Calendar], tmp_path: Path
+    open_stand: tuple[DayRecord, Hub, Calendar], tmp_path: Path
 ):
-    record, hub, clock = house
+    record, hub, clock = open_stand
     clock.go_to_midnight(0.3)
     published: list[int] = []
     publishing = asyncio.create_task(publish(hub, clock, published))
@@ -94,9 +94,9 @@ async def test_at_midnight_each_reading_is_in_one_of_two_sessions(
 
 
 async def test_yesterdays_record_goes_on_when_todays_cannot_be_begun(
-    house: tuple[HouseRecord, Hub, Calendar], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    open_stand: tuple[DayRecord, Hub, Calendar], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    record, _, clock = house
+    record, _, clock = open_stand
     clock.go_to_midnight(-1.0)  # a second after it
     yesterday = await record.begin()
     clock.go_to_midnight(-1.0)
@@ -104,7 +104,7 @@ async def test_yesterdays_record_goes_on_when_todays_cannot_be_begun(
     def no_place(self: object, day: str) -> str:
         raise SessionError("the disk is full")
 
-    monkeypatch.setattr(HouseRecord, "_place", no_place)
+    monkeypatch.setattr(DayRecord, "_place", no_place)
     with pytest.raises(SessionError):
         await record.begin()
     assert record.recorder is yesterday

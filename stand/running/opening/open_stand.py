@@ -58,7 +58,7 @@ class Guest(Protocol):
         ...
 
 
-class House:
+class OpenStand:
     """The open stand. `recorder` is what heat depends on; set it before `prepare`.
 
     is_for_one: it is closed with its one guest; else a trip is kept until an operator clears it (`latched`), guest or
@@ -165,7 +165,7 @@ class House:
             await cancelled([*tasks, *(self._tasks if self.is_for_one else ())])
             if self.is_for_one:
                 await safety.close()
-            await self.guard.told()
+            await self.guard.notified()
         for poller in self._pollers:
             await poller.poll()
 
@@ -237,24 +237,24 @@ class House:
 class _Recorded:
     """What the guard asks of the recording, whichever that is."""
 
-    def __init__(self, house: House) -> None:
-        self._house = house
+    def __init__(self, open_stand: OpenStand) -> None:
+        self._open_stand = open_stand
 
     @property
     def waiting_since_ns(self) -> int | None:
-        return None if self._house.recorder is None else self._house.recorder.waiting_since_ns
+        return None if self._open_stand.recorder is None else self._open_stand.recorder.waiting_since_ns
 
     @property
     def folder_lost(self) -> str:
-        return "" if self._house.recorder is None else self._house.recorder.folder_lost
+        return "" if self._open_stand.recorder is None else self._open_stand.recorder.folder_lost
 
     @property
     def writer_ended(self) -> str:
-        return "" if self._house.recorder is None else self._house.recorder.writer_ended
+        return "" if self._open_stand.recorder is None else self._open_stand.recorder.writer_ended
 
 
 @asynccontextmanager
-async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_one: bool) -> AsyncGenerator[House]:
+async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_one: bool) -> AsyncGenerator[OpenStand]:
     """The stand, open and harmless: heat and cold have lost what permission somebody left them, the flap is closed and
     the relay board's timer tested. Everything is closed at the end; what moves has to be safe before that.
 
@@ -266,16 +266,16 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
             stack.push_async_callback(disk.ended_within, stop.patience)
             assembly.stand.chamber.compressor_file.through(disk.line(FILES_LINE).run)
         stack.push_async_callback(assembly.stand.chamber.compressor_file.close, stop.patience)
-        house = House(assembly, disk, stop.patience, is_for_one=is_for_one)
-        stack.push_async_callback(cancelled, house.background)
+        open_stand = OpenStand(assembly, disk, stop.patience, is_for_one=is_for_one)
+        stack.push_async_callback(cancelled, open_stand.background)
         if time is not None:
-            house.background.append(asyncio.create_task(time()))
+            open_stand.background.append(asyncio.create_task(time()))
         stack.push_async_callback(close_devices, assembly)
         stack.callback(assembly.stand.gate.let_go)
         stack.push_async_callback(stop.settled)
         stop.watch(assembly.stand)
-        await house.or_safe(_open(assembly), stop)
-        yield house
+        await open_stand.or_safe(_open(assembly), stop)
+        yield open_stand
 
 
 async def _open(assembly: Assembly) -> None:
