@@ -172,18 +172,16 @@ class Answer:
     error: BaseException | None = None
 
 
-def send(connection: socket.socket, message: Request | Answer) -> None:
+def send(connection: socket.socket, data: bytes) -> None:
     """One message; OSError when the other end is gone."""
-    data = pickle.dumps(message, protocol=5)
     connection.sendall(_LENGTH.pack(len(data)))
     connection.sendall(data)
 
 
-def receive(connection: socket.socket) -> Any:
+def receive(connection: socket.socket) -> bytearray | None:
     """The next message; None when the other end is gone."""
     head = _exactly(connection, _LENGTH.size)
-    data = None if head is None else _exactly(connection, _LENGTH.unpack(head)[0])
-    return None if data is None else pickle.loads(data)
+    return None if head is None else _exactly(connection, _LENGTH.unpack(head)[0])
 
 
 def _exactly(connection: socket.socket, size_bytes: int) -> bytearray | None:
@@ -200,7 +198,21 @@ def _exactly(connection: socket.socket, size_bytes: int) -> bytearray | None:
     return data
 
 
-def answer(request: Request, kept: dict[str, object]) -> Answer:
+def answered(data: bytes | bytearray, kept: dict[str, object]) -> bytes:
+    """The answer to a request, both pickled. What cannot be unpickled here (the program was replaced by another version
+    while it ran), or pickled, is answered with an OSError: who asks waits for an answer."""
+    try:
+        return _pickled(_answer(pickle.loads(data), kept))
+    except Exception as error:  # noqa: BLE001 - as above
+        why = f"a call to another process failed ({type(error).__name__}: {error}); was the program replaced meanwhile?"
+        return _pickled(Answer(error=OSError(errno.EPROTO, why)))
+
+
+def _pickled(message: Request | Answer) -> bytes:
+    return pickle.dumps(message, protocol=5)
+
+
+def _answer(request: Request, kept: dict[str, object]) -> Answer:
     """What comes of the request."""
     try:
         if isinstance(request.function, str):
@@ -216,12 +228,12 @@ def answer(request: Request, kept: dict[str, object]) -> Answer:
 
 def answer_all(connection: socket.socket, kept: dict[str, object]) -> None:
     """In the process: one request after the other, until the other end is gone."""
-    while (request := receive(connection)) is not None:
-        found = answer(request, kept)
-        try:
-            send(connection, found)
-        except OSError:
-            return  # the daemon has gone
+    with connection:  # who asks must not wait for a thread that has ended
+        while (data := receive(connection)) is not None:
+            try:
+                send(connection, answered(data, kept))
+            except OSError:
+                return  # the daemon has gone
 
 
 class Line:
@@ -252,14 +264,16 @@ class Line:
         self._connection.close()
 
     def _asked(self, request: Request) -> Any:
+        data = _pickled(request)
         with self._lock:
             try:
-                send(self._connection, request)
-                found = receive(self._connection)
+                send(self._connection, data)
+                answer = receive(self._connection)
             except OSError:
-                found = None
-        if found is None:
+                answer = None
+        if answer is None:
             raise OSError(errno.EPIPE, self._ended)
+        found: Answer = pickle.loads(answer)
         if found.error is not None:
             raise found.error
         return found.result

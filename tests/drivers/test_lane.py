@@ -1,11 +1,14 @@
 import asyncio
+import importlib
+import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 
 import pytest
 
-from foundation.calls import Lane
+from foundation.calls import Lane, Line, answer_all
 from foundation.clock import Clock, VirtualClock, WallClock
 
 
@@ -82,7 +85,7 @@ async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goe
 HANGS = """
 import asyncio, threading
 from foundation.clock import WallClock
-from foundation.calls import Lane
+from foundation.calls import Lane, Line, answer_all
 
 async def main():
     asyncio.create_task(Lane("hangs", WallClock(), patient=False).call(threading.Event().wait))
@@ -114,3 +117,30 @@ async def test_a_thread_that_memory_does_not_suffice_for_fails_its_calls_and_the
     monkeypatch.undo()
     assert await died.call(int) == 0
     died.close()
+
+
+class Moved:
+    """Of a module that another version of the program has no more."""
+
+    def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
+        return importlib.import_module, ("foundation.not_there",)
+
+
+@pytest.mark.parametrize(
+    ("function", "argument", "why"),
+    [(len, Moved(), "ModuleNotFoundError"), (memoryview, b"x", "TypeError: cannot pickle")],
+    ids=["request", "result"],
+)
+def test_what_cannot_be_handed_over_is_answered_and_the_line_lives(
+    function: Callable[..., object], argument: object, why: str
+):
+    ours, theirs = socket.socketpair()
+    serving = threading.Thread(target=answer_all, args=(theirs, {}), daemon=True)
+    serving.start()
+    line = Line(ours, "the process has ended")
+    with pytest.raises(OSError, match=f"a call to another process failed .{why}"):
+        line.run(function, argument)
+    assert line.run(len, "abc") == 3
+    line.close()
+    serving.join(5)
+    assert not serving.is_alive()
