@@ -25,6 +25,9 @@ app = lazy_app(
         "calibrate-photographs": Lazy(
             "compensation.commands.photographs_cli", "Calibrate a camera from photographs of a board in any poses."
         ),
+        "calibrate-rig": Lazy(
+            "compensation.commands.rig_cli", "Calibrate cameras that are fixed to each other, from photographs."
+        ),
         "validate": Lazy("compensation.commands.validate_cli", "How far the target seems to move in space."),
         "budget": Lazy("compensation.commands.budget_cli", "The stand's error budget, in um and px."),
         "schema": Lazy("compensation.commands.schema_cli", "JSON Schemas of geometries and details, for editors."),

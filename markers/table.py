@@ -28,8 +28,8 @@ CENTRES = "x_px, y_px: centres of the outlines in the image; disc_x_px, disc_y_p
 def doubt(images: int) -> str:
     """What is said of so many images whose detections are doubtful."""
     return (
-        f"{images} images are not described by noise (texture, print, compression, flicker, motion): the variances of "
-        "their centres are estimates from how the residuals hang together, and may be too small by half"
+        f"noise alone does not describe {images} image{'s' * (images != 1)} (texture, print, compression, flicker): "
+        "the variances of their centres are estimates from how the residuals hang together, perhaps too small by half"
     )
 
 

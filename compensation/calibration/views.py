@@ -121,9 +121,9 @@ def calibrate_views(views: Views, board: Board) -> ViewCalibration:
         explained = chi2 <= 1 + _SETTLED and (discrepancy_px == 0 or chi2 >= 1 - _SETTLED)
         before = used
         if explained:
-            used = _inliers(residuals, views, discrepancy_px)
+            used = inliers(residuals, views, discrepancy_px)
         else:
-            discrepancy_px = _next_discrepancy(views, discrepancy_px, chi2)
+            discrepancy_px = next_discrepancy(views, discrepancy_px, chi2)
         solution, residuals, chi2 = _round(solution.state, views, used, board, discrepancy_px)
         if explained and np.array_equal(before, used):
             break
@@ -241,19 +241,19 @@ def _residuals(scene: Posed, discs_px: Float) -> Float:
     return scene.lens.project(seen) - discs_px
 
 
-def _inliers(residuals_px: Float, views: Views, discrepancy_px: float) -> NDArray[np.bool_]:
+def inliers(residuals_px: Float, views: Views, discrepancy_px: float) -> NDArray[np.bool_]:
     """Markers not far outside the scatter, unless those that are would be too many for accidents."""
     seen = views.seen
     covariance = views.covariance_px2[seen] + discrepancy_px**2 * np.eye(2)
     off = residuals_px[seen]
     lengths = np.sqrt(np.einsum("mi,mij,mj->m", off, np.linalg.inv(covariance), off))
-    inliers = seen.copy()
+    kept = seen.copy()
     if np.mean(lengths > _OUTLIER) <= _MOST_OUTLIERS:
-        inliers[seen] = lengths <= _OUTLIER
-    return inliers
+        kept[seen] = lengths <= _OUTLIER
+    return kept
 
 
-def _next_discrepancy(views: Views, discrepancy_px: float, chi2: float) -> float:
+def next_discrepancy(views: Views, discrepancy_px: float, chi2: float) -> float:
     """The discrepancy with which chi^2 would be 1 if the residuals stayed as they are."""
     sigma2 = float(np.nanmean(np.diagonal(views.covariance_px2, axis1=2, axis2=3)))
     return float(np.sqrt(max(0.0, (sigma2 + discrepancy_px**2) * chi2 - sigma2)))

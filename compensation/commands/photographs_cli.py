@@ -59,7 +59,7 @@ def calibrate_photographs(
     """
     with one_line_errors(), images_up_to(max_megapixels):
         check_folder_writable(export, EXPORTS)
-        board = _described(target)
+        board = described(target)
         failures: list[str] = []
         doubtful: list[str] = []
         with progress("find markers", len(images)) as report:
@@ -106,13 +106,13 @@ def summary(
     return "\n".join(lines)
 
 
-def _described(name: str) -> Target | BoardOfCorners:
+def described(name: str) -> Target | BoardOfCorners:
     """A board of squares or tags when the file says so, else a target of dots."""
     corners = load_corner_board(Path(name)) if Path(name).is_file() else None
     return corners or installed_target(name)
 
 
-def _look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
+def look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
     """Points (N, 2) px and their covariances (N, 2, 2) in a picture, and whether these are doubtful; DetectionError
     when the target is not in it."""
     if isinstance(target, Target):
@@ -131,7 +131,7 @@ def _views(
     for number, path in enumerate(images, 1):
         try:
             pixels = read_image(path)
-            *points, is_doubtful = _look(pixels, target)
+            *points, is_doubtful = look(pixels, target)
         except DetectionError as error:
             failures.append(f"{path.name}: {error}")
             continue

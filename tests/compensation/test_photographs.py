@@ -50,7 +50,9 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
         result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "not found" not in result.stderr
-    assert "images are not described by noise (texture, print, compression" in result.stderr
+    assert (
+        "images (texture, print, compression, flicker): the variances of their centres are estimates" in result.stderr
+    )
     return out, detections
 
 
