@@ -12,17 +12,18 @@ import resource
 import time
 from asyncio.events import Handle
 from collections.abc import Awaitable, Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
 from drivers.framing.aravis_library import library
 from foundation.clock import WallClock
-from foundation.errors import StandError
+from foundation.errors import DeviceError, StandError
 from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
 from stand.running.opening.open_stand import close_devices
-from stand.simulator import Simulator, laboratory_of
+from stand.running.order import Order
+from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
 from tests.system.simulated_orders import simulated_order
 
@@ -34,7 +35,7 @@ Call = Callable[[], Awaitable[object]]
 
 
 def figures(directory: Path) -> list[Figure]:
-    """The longest for each device, ms."""
+    """The longest for each device, ms: while all is well, and while it cannot be reached, its return included."""
     what = "event loop held by a driver's call"
     try:
         library()
@@ -43,7 +44,7 @@ def figures(directory: Path) -> list[Figure]:
     order = simulated_order(directory, RECIPE)
     simulator = Simulator(laboratory_of(order.config, virtual=False, seed=None))
     try:
-        found = asyncio.run(_longest_ms(assemble(order.config, Hub(), WallClock())))
+        found = asyncio.run(_longest_ms(assemble(order.config, Hub(), WallClock()), ControlSocket(_control(order))))
     finally:
         simulator.stop()
     return [
@@ -52,8 +53,15 @@ def figures(directory: Path) -> list[Figure]:
     ]
 
 
-async def _longest_ms(assembly: Assembly) -> dict[str, tuple[float, int]]:
+def _control(order: Order) -> str:
+    if order.config.simulation is None:
+        raise ValueError("the stand is not simulated")
+    return order.config.simulation.control
+
+
+async def _longest_ms(assembly: Assembly, control: ControlSocket) -> dict[str, tuple[float, int]]:
     devices, found = assembly.devices, dict[str, tuple[float, int]]()
+    await control.open()
     await assembly.bus.open()
     await devices.relays.open()
     await devices.relays.switch("camera_power", on=True)
@@ -83,6 +91,22 @@ async def _longest_ms(assembly: Assembly) -> dict[str, tuple[float, int]]:
                 for _ in range(times):
                     await call()
         found[name] = (1e3 * max(callbacks), len(callbacks))
+    gone: dict[str, tuple[str, list[Call]]] = {
+        "regulator": ("bus.unplugged", [devices.regulator.read]),
+        "stage": ("linear.unplugged", [linear.read, lambda: linear.move_to(3.0)]),
+        "flap": ("flap.unplugged", [devices.flap.read, devices.flap.move_closed]),
+        "camera": ("camera.silent", [camera.grab, camera.read, camera.open]),
+    }
+    for name, (fault, lost) in gone.items():
+        progress(f"{name} while {fault}")
+        with _timed() as callbacks:
+            for is_broken in (True, False):
+                await control.request({"do": "fault", "name": fault, "value": is_broken})
+                for call in [*lost, *lost]:
+                    with suppress(DeviceError):
+                        await call()
+        found[f"{name}, {fault}"] = (1e3 * max(callbacks), len(callbacks))
+    await control.close()
     await close_devices(assembly)
     return found
 
