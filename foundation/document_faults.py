@@ -58,6 +58,9 @@ _UNITS: Mapping[str, Mapping[str, float]] = {  # by the end of a key: what may b
 _WITH_UNIT = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:e[-+]?\d+)?)\s*([a-zA-Z°%]*)\s*")
 
 
+TAG = "<"  # begins the tags of our unions, which are no keys
+
+
 class _Written:
     """A document as its YAML has it. A mapping's keys are listed once, however many of them are looked up."""
 
@@ -84,6 +87,8 @@ class _Written:
             is_last = number == len(fault["loc"]) - 1
             is_between = isinstance(node, yaml.MappingNode) if not is_last else fault["type"] == "model_type"
             if number and node is not None and key is None and is_between:
+                continue
+            if isinstance(part, str) and part.startswith(TAG) and key is None:  # of what an older form lacks
                 continue
             kept.append(part)
             node = inner

@@ -36,6 +36,7 @@ ARAVIS_FUNCTIONS = {
     "arv_camera_set_boolean": "v PSbE",
     "arv_camera_is_feature_available": "b PSE",
     "arv_camera_dup_available_enumerations_as_strings": "P PS*E",
+    "arv_camera_is_gv_device": "b P",
     "arv_camera_gv_set_stream_options": "v Pi",
     "arv_camera_gv_set_packet_size_adjustment": "v Pi",
     "arv_camera_gv_set_packet_size": "v PiE",

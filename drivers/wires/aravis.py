@@ -1,5 +1,6 @@
-"""A GigE Vision camera and its stream over libaravis: what the camera driver calls, nothing else; frames come out as
-arrays. Bit layouts: GigE Vision 1.2, section 27 (Mono10Packed, Mono12Packed), PFNC 2.1, section 6 (Mono10p, Mono12p).
+"""A GigE or USB3 Vision camera and its stream over libaravis: what the camera driver calls, nothing else; frames come
+out as arrays. Bit layouts: GigE Vision 1.2, section 27 (Mono10Packed, Mono12Packed), PFNC 2.1, section 6 (Mono10p,
+Mono12p).
 
 A `GigeDevice` owns one ArvCamera, a `GigeStream` one ArvStream. Everything blocks; a feature call up to 2.5 s when
 the camera is silent (Aravis: five tries of 500 ms). Not thread-safe: one thread per device.
@@ -61,16 +62,19 @@ class _GValue(ctypes.Structure):
 
 
 class GigeDevice:
-    """One camera, opened by IP address; StandError without libaravis, AravisError when there is no answer.
+    """One camera, opened by IP address, or by Aravis' name for it when it is a USB3 Vision one; StandError without
+    libaravis, AravisError when there is no answer. is_gige: it has bootstrap registers, packets and a heartbeat.
 
-    Opening succeeds while another client controls the camera, read-only: ask `is_controller`.
+    Opening succeeds while another client controls a GigE camera, read-only: ask `is_controller`.
     """
 
     def __init__(self, address: str) -> None:
         self._library = library()
         self._camera = self._library.call("arv_camera_new", address.encode())
         self._device = self._library.call("arv_camera_get_device", self._camera)  # borrowed: never unref
-        self._library.call("arv_camera_gv_set_stream_options", self._camera, PACKET_SOCKET_DISABLED)
+        self.is_gige = bool(self._library.call("arv_camera_is_gv_device", self._camera))
+        if self.is_gige:
+            self._library.call("arv_camera_gv_set_stream_options", self._camera, PACKET_SOCKET_DISABLED)
         self._callback: Any = None
         self._handler = 0
 
@@ -101,7 +105,7 @@ class GigeDevice:
 
     def is_controller(self) -> bool:
         """Whether we may write."""
-        return bool(self._library.call("arv_gv_device_is_controller", self._device))
+        return not self.is_gige or bool(self._library.call("arv_gv_device_is_controller", self._device))
 
     def kind(self, feature: str) -> str:
         """The GenICam kind of a feature ("Float", "Command", "IntReg", ...); "" when the camera has none."""

@@ -12,7 +12,7 @@ from drivers.wires import camera_dialects as words
 from drivers.wires.aravis import FLOAT_KINDS, GigeDevice
 from drivers.wires.camera_errors import is_silence
 from drivers.wires.camera_line import packet_delay_ns
-from drivers.wires.camera_settings import EffectiveSettings, GigeCameraSettings
+from drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
 from foundation.clock import NS_PER_S
 from foundation.errors import Refused
 
@@ -33,13 +33,15 @@ RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
 def read_identity(device: GigeDevice) -> Identity:
     """Vendor, model, serial number and version."""
-    vendor, model, serial_number, version = (
-        device.read_text(*register) for register in (VENDOR, MODEL, SERIAL, VERSION)
-    )
+    if device.is_gige:
+        told = [device.read_text(*register) for register in (VENDOR, MODEL, SERIAL, VERSION)]
+    else:
+        told = [device.get_string(each) if (each := _found(device, names)) else "" for names in words.IDENTITY]
+    vendor, model, serial_number, version = told
     return Identity(vendor, model, serial_number, version)
 
 
-def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) -> EffectiveSettings:
+def apply_settings(name: str, device: GigeDevice, settings: AravisCameraSettings) -> EffectiveSettings:
     """Write everything, read it back and compare; Refused when the camera did otherwise, or lacks a feature.
 
     Acquisition must be off: cameras lock region, pixel format and packet size while they stream.
@@ -47,7 +49,7 @@ def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) 
     for feature in words.NECESSARY:
         if not device.kind(feature):
             raise Refused(name, f"the camera has no {feature}, without which there are no frames")
-    heartbeat_s = _set_heartbeat(device, settings.heartbeat_s)
+    heartbeat_s = _set_heartbeat(device, settings.heartbeat_s) if isinstance(settings, GigeCameraSettings) else 0.0
     _trigger_off(device)  # first: some features are there without a trigger only
     width, height = _set_region(name, device, settings)
     _set_modes(device)
@@ -55,7 +57,7 @@ def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) 
     exposure_s = set_exposure(name, device, settings, settings.exposure_s)
     gain, gain_dB = _set_gain(name, device, settings.gain_dB)
     source, rate, frame_rate_hz = _set_trigger(name, device, settings)
-    packet_size, delay_ns = _set_packets(name, device, settings)
+    packet_size, delay_ns = _set_packets(name, device, settings) if isinstance(settings, GigeCameraSettings) else (0, 0)
     payload_bytes = round(device.get_number("PayloadSize"))  # last: it follows from region, format and chunks
     raw_step = f" x {step_s:g} s" if exposure == words.EXPOSURE_RAW else ""
     return EffectiveSettings(
@@ -69,12 +71,12 @@ def apply_settings(name: str, device: GigeDevice, settings: GigeCameraSettings) 
         packet_delay_ns=delay_ns,
         heartbeat_s=heartbeat_s,
         payload_bytes=payload_bytes,
-        receive_buffer_bytes=_receive_buffer_bytes(payload_bytes),
+        receive_buffer_bytes=_receive_buffer_bytes(payload_bytes) if packet_size else 0,
         features={"exposure": exposure + raw_step, "gain": gain, "trigger": source, "frame_rate": rate},
     )
 
 
-def find_exposure(name: str, device: GigeDevice, settings: GigeCameraSettings) -> tuple[str, float]:
+def find_exposure(name: str, device: GigeDevice, settings: AravisCameraSettings) -> tuple[str, float]:
     """The exposure's feature and the seconds of its unit; Refused when there is none, or nobody knows its unit."""
     feature = _found(device, words.EXPOSURE)
     if not feature:
@@ -92,7 +94,7 @@ def find_exposure(name: str, device: GigeDevice, settings: GigeCameraSettings) -
     return feature, unit_s
 
 
-def set_exposure(name: str, device: GigeDevice, settings: GigeCameraSettings, exposure_s: float) -> float:
+def set_exposure(name: str, device: GigeDevice, settings: AravisCameraSettings, exposure_s: float) -> float:
     """Write the exposure; returns what the camera took. Refused when that is further off than quantisation explains."""
     feature, unit_s = find_exposure(name, device, settings)
     device.set_number(feature, exposure_s / unit_s)
@@ -151,7 +153,7 @@ def _choose(device: GigeDevice, feature: str, entry: str) -> None:
         device.set_string(feature, entry)
 
 
-def _set_region(name: str, device: GigeDevice, settings: GigeCameraSettings) -> tuple[int, int]:
+def _set_region(name: str, device: GigeDevice, settings: AravisCameraSettings) -> tuple[int, int]:
     """Pixel format, binning and region, to the letter."""
     formats = _offered(device, "PixelFormat")
     if settings.pixel_format not in formats:
@@ -208,7 +210,7 @@ def _set_gain(name: str, device: GigeDevice, gain_dB: float) -> tuple[str, float
     return raw, 0.0
 
 
-def _set_trigger(name: str, device: GigeDevice, settings: GigeCameraSettings) -> tuple[str, str, float]:
+def _set_trigger(name: str, device: GigeDevice, settings: AravisCameraSettings) -> tuple[str, str, float]:
     """Software trigger or free run: what starts a frame, the feature of the rate, and the rate in force, which is the
     configured one with a trigger."""
     if settings.trigger == "software":

@@ -33,7 +33,7 @@ from drivers.wires.camera_apply import (
     software_trigger,
 )
 from drivers.wires.camera_errors import NO_CONTROL_HINT
-from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
+from drivers.wires.camera_settings import AravisCameraSettings, GigeCameraSettings, TemperatureFeature
 from drivers.wires.camera_temperature import NoTemperature, find_temperature, read_temperature, temperature_place
 from foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
 from foundation.errors import Refused
@@ -106,7 +106,7 @@ class Connection:
     def __init__(
         self,
         name: str,
-        settings: GigeCameraSettings,
+        settings: AravisCameraSettings,
         clock: Clock,
         frames: FrameCount,
         counts: Counter[str],
@@ -130,6 +130,7 @@ class Connection:
         self._stamped_ns = 0  # the last time stamp, on the camera's clock
         self._phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
         self._device = _open_controlled(name, settings)
+        self._first_id = 0 if self._device.is_gige else 1  # USB3 Vision counts from 0
         try:
             self._device.on_control_lost(self.control_lost.set)
             self.identity = read_identity(self._device)
@@ -179,16 +180,20 @@ class Connection:
         self._stream = stream
 
     def _configure(self, stream: GigeStream) -> None:
+        if isinstance(self._settings, GigeCameraSettings):
+            self._configure_packets(stream, self._settings)
+        for _ in range(self._settings.buffers):
+            stream.add_buffer(self.effective.payload_bytes)
+
+    def _configure_packets(self, stream: GigeStream, settings: GigeCameraSettings) -> None:
         retention_s = self._timeout_s if self._is_virtual else FRAME_RETENTION_PERIODS / self.effective.frame_rate_hz
         stream.set_property("socket-buffer", SOCKET_BUFFER_FIXED, G_TYPE_INT)
         stream.set_property("socket-buffer-size", self.effective.receive_buffer_bytes, G_TYPE_INT)
-        stream.set_property("packet-resend", int(self._settings.resend), G_TYPE_INT)
+        stream.set_property("packet-resend", int(settings.resend), G_TYPE_INT)
         stream.set_property("packet-request-ratio", PACKET_REQUEST_RATIO, G_TYPE_DOUBLE)
         stream.set_property("initial-packet-timeout", INITIAL_PACKET_TIMEOUT_US, G_TYPE_UINT)
         stream.set_property("packet-timeout", PACKET_TIMEOUT_US, G_TYPE_UINT)
         stream.set_property("frame-retention", round(retention_s * 1e6), G_TYPE_UINT)
-        for _ in range(self._settings.buffers):
-            stream.add_buffer(self.effective.payload_bytes)
 
     def stop(self) -> None:
         """End acquisition and its stream; never raises."""
@@ -269,7 +274,7 @@ class Connection:
         stream = self._streaming()
         while (buffer := stream.pop(0)) is not None:
             self._counts["stale"] += 1
-            self._frames.advance(stream.info(buffer).frame_id)
+            self._frames.advance(stream.info(buffer).frame_id + self._first_id)
             stream.push(buffer)
 
     def _streaming(self) -> GigeStream:
@@ -296,7 +301,7 @@ class Connection:
                 image = self._image(stream, buffer, info)
             finally:
                 stream.push(buffer)
-            self._frames.advance(info.frame_id)
+            self._frames.advance(info.frame_id + self._first_id)
             if image is None:
                 break
             stamped_ns = self._stand_ns(info.timestamp_ns)
@@ -365,6 +370,8 @@ class Connection:
     def _latch(self) -> None:
         """Measure what the stand's clock is ahead of the camera's; the tightest of a few tries."""
         self._latched_at_ns = self._clock.now_ns()
+        if not self._device.is_gige:
+            return  # no such registers
         best_ns = None
         try:
             frequency_Hz = self._read_64(TICK_FREQUENCY_HIGH, TICK_FREQUENCY_LOW)
@@ -391,14 +398,18 @@ class Connection:
         return self._device.read_register(high) << 32 | self._device.read_register(low)
 
 
-def _open_controlled(name: str, settings: GigeCameraSettings) -> GigeDevice:
+def _open_controlled(name: str, settings: AravisCameraSettings) -> GigeDevice:
     """The camera with us in control.
 
     A client that died keeps the camera until its heartbeat runs out: try for that long and a little more.
     """
     pause = threading.Event()
-    for _ in range(math.ceil(settings.heartbeat_s + 2)):
+    wants_gige = isinstance(settings, GigeCameraSettings)
+    for _ in range(math.ceil(settings.heartbeat_s + 2) if isinstance(settings, GigeCameraSettings) else 1):
         device = GigeDevice(settings.address)
+        if device.is_gige != wants_gige:
+            device.close()
+            raise Refused(name, f"{settings.address} is {'no' if wants_gige else 'a'} GigE Vision camera")
         if device.is_controller():
             return device
         device.close()

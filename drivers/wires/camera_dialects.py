@@ -40,3 +40,11 @@ TEMPERATURE_ENTRIES = ("Sensor", "Sensorboard", "SensorBoard", "Mainboard", "Cor
 
 # Without these nothing can be done with a camera; what else is missing is reported where it is needed.
 NECESSARY = ("Width", "Height", "PixelFormat", "PayloadSize", "AcquisitionStart", "AcquisitionStop")
+
+# Vendor, model, serial number, version of a camera without bootstrap registers of ours: USB3 Vision.
+IDENTITY = (
+    ("DeviceVendorName",),
+    ("DeviceModelName",),
+    ("DeviceSerialNumber", "DeviceID"),
+    ("DeviceFirmwareVersion", "DeviceVersion"),
+)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Self, cast
+from typing import Annotated, Literal, Self, cast
 
 from pydantic import Field, model_validator
 
@@ -65,33 +65,21 @@ class TemperatureFeature(Document):
         return self
 
 
-class GigeCameraSettings(CameraSettings):
-    """A GigE Vision camera; all of it is written at each open.
+class AravisCameraSettings(CameraSettings):
+    """A camera that Aravis opens; all of it is written at each open.
 
-    address: IP. packet_size: bytes of an IP packet; none lets Aravis find it. packet_delay_ns: pause between two
-    packets; none leaves room for the cameras that the line is shared by. line_Mbps: rate of the line on which its
-    packets reach the host. line_shared_by: so many cameras, itself included; none: all of the stand. heartbeat_s: the
-    camera frees itself after so long without us (Aravis asks once a second). temperature: none looks for the usual
-    features. resend: lost packets are asked for again. buffers: frames that the host keeps in reserve. offset_x_px,
+    temperature: none looks for the usual features. buffers: frames that the host keeps in reserve. offset_x_px,
     offset_y_px: the first pixel of the region, from which the image's pixels count. binning: so many by so many pixels
     become one, and all sizes count those. exposure_step_s: of one step of ExposureTimeRaw, from its manual, for a
     camera that tells its exposure no other way.
     """
 
-    protocol: Literal["gige"] = "gige"
-    address: IpAddress
     pixel_format: PixelFormat = "Mono8"
     offset_x_px: int = Field(default=0, ge=0, le=65535)
     offset_y_px: int = Field(default=0, ge=0, le=65535)
     binning: int = Field(default=1, ge=1, le=16)
     exposure_step_s: float | None = Field(default=None, gt=0, le=1)
-    packet_size: int | None = Field(default=None, ge=220, le=16112)
-    packet_delay_ns: int | None = Field(default=None, ge=0, le=1_000_000_000)
-    line_Mbps: float = Field(default=1000.0, gt=0, le=100_000)
-    line_shared_by: int | None = Field(default=None, ge=1, le=64)
-    heartbeat_s: float = Field(default=3.0, ge=1.5, le=60)
     temperature: TemperatureFeature | None = None
-    resend: bool = True
     buffers: int = Field(default=6, ge=1, le=100)
 
     @model_validator(mode="after")
@@ -106,11 +94,39 @@ class GigeCameraSettings(CameraSettings):
         return 1 / self.frame_rate_hz
 
 
+class Usb3CameraSettings(AravisCameraSettings):
+    """A USB3 Vision camera, by the same calls of Aravis; none was seen. address: what Aravis calls it, its vendor and
+    serial number or its GUID (`arv-tool-0.8` lists them)."""
+
+    protocol: Literal["usb3"] = "usb3"
+    address: Annotated[str, Field(pattern=r"^[ -~]{1,128}$")]
+
+
+class GigeCameraSettings(AravisCameraSettings):
+    """A GigE Vision camera.
+
+    address: IP. packet_size: bytes of an IP packet; none lets Aravis find it. packet_delay_ns: pause between two
+    packets; none leaves room for the cameras that the line is shared by. line_Mbps: rate of the line on which its
+    packets reach the host. line_shared_by: so many cameras, itself included; none: all of the stand. heartbeat_s: the
+    camera frees itself after so long without us (Aravis asks once a second). resend: lost packets are asked for again.
+    """
+
+    protocol: Literal["gige"] = "gige"
+    address: IpAddress
+    packet_size: int | None = Field(default=None, ge=220, le=16112)
+    packet_delay_ns: int | None = Field(default=None, ge=0, le=1_000_000_000)
+    line_Mbps: float = Field(default=1000.0, gt=0, le=100_000)
+    line_shared_by: int | None = Field(default=None, ge=1, le=64)
+    heartbeat_s: float = Field(default=3.0, ge=1.5, le=60)
+    resend: bool = True
+
+
 @dataclass(frozen=True, slots=True)
 class EffectiveSettings:
     """What the camera made of the settings; exposure and gain as it quantised them.
 
-    receive_buffer_bytes: of the host's socket; below payload_bytes a camera that sends in bursts loses packets.
+    receive_buffer_bytes: of the host's socket; below payload_bytes a camera that sends in bursts loses packets. It,
+    packets and heartbeat are 0 for a USB3 camera.
     features: which of the camera's own features do what, {"exposure": "ExposureTimeAbs", ...}; "" where it has none.
     """
 

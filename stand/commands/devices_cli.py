@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from drivers.wires.camera_settings import GigeCameraSettings
 from drivers.wires.discovery import FoundCamera, SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
 from foundation.command_app import App
 from foundation.errors import ConfigError
@@ -41,7 +42,8 @@ def devices(
         addresses = list(ask or ())
         if config is not None:
             stand = load_config(packaged("", config))
-            addresses += [str(camera.address) for camera in stand.cameras.values() if hasattr(camera, "address")]
+            gige = (camera for camera in stand.cameras.values() if isinstance(camera, GigeCameraSettings))
+            addresses += [camera.address for camera in gige]
         try:
             cameras = asyncio.run(cameras_at(addresses, wait_s)) if addresses else ()
         except (OSError, ValueError) as error:

@@ -171,7 +171,7 @@ class Links:
         data["temperature_place"] = await camera.temperature_place()
         self._add(Finding(camera.name, "settings", "ok", f"{size}settings taken over and read back", data=data))
         packet_size = data.get("packet_size")
-        if isinstance(packet_size, int):
+        if isinstance(packet_size, int) and packet_size:  # a USB3 camera has none
             self._add(packet_finding(camera.name, camera.settings.address, packet_size))
 
     async def _has_supply(self) -> bool:

@@ -98,7 +98,7 @@ def test_the_keys_of_a_second_camera_protocol_are_checked(tmp_path: Path):
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert "packet_size: unknown key" in done.stderr
     other = used(tmp_path, {"protocol": "film", "address": "nowhere"})
-    assert other.stderr.endswith("stand.yaml: cameras.side: protocol has to be one of gige, still (line 32)\n")
+    assert other.stderr.endswith("stand.yaml: cameras.side: protocol has to be one of gige, still, usb3 (line 32)\n")
 
 
 def test_a_second_regulator_make_is_a_yaml(tmp_path: Path):

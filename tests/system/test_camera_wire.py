@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from drivers.devices.cameras.camera_gige import Camera
 from drivers.framing.aravis_library import library
 from drivers.sim.gige.camera import FakeCamera
+from drivers.wires import camera_connection
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
 from foundation.errors import Refused, StandError, Unreachable
@@ -277,7 +278,8 @@ async def test_lost_packets_are_asked_for_again_and_no_bit_differs(plant: WarmPl
         assert camera.counters()["n_resent_packets"] > 10
 
 
-async def test_without_resend_a_frame_with_holes_is_never_used(plant: WarmPlant):
+async def test_without_resend_a_frame_with_holes_is_never_used(plant: WarmPlant, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 1.0)  # what each of three frames is waited for
     async with virtual(plant) as (clock, fake):
         fake.faults.no_resend = True
         async with opened(clock, packet_size=1500) as camera:

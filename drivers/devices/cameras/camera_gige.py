@@ -13,7 +13,7 @@ from drivers.framing.aravis_library import AravisError
 from drivers.settings import Identity
 from drivers.wires.camera_connection import Connection, FrameCount, Shot
 from drivers.wires.camera_errors import device_error, lacks_control
-from drivers.wires.camera_settings import EffectiveSettings, GigeCameraSettings
+from drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
 from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
@@ -26,9 +26,9 @@ _CLOCK_SLACK_S = 1.0  # its clock is read that well, and it is heard for longer 
 
 
 class Camera:
-    """A GigE Vision camera under `name`; channels `<name>.image` and `<name>.temperature`."""
+    """A GigE or USB3 Vision camera under `name`; channels `<name>.image` and `<name>.temperature`."""
 
-    def __init__(self, name: str, settings: GigeCameraSettings, clock: Clock) -> None:
+    def __init__(self, name: str, settings: AravisCameraSettings, clock: Clock) -> None:
         self._name = name
         self.settings = settings
         self._clock = clock

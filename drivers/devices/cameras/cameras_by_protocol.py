@@ -16,6 +16,7 @@ import drivers.devices.cameras
 from drivers.devices.protocols import Camera
 from drivers.settings import CameraSettings
 from foundation.clock import Clock
+from foundation.document_faults import TAG
 
 _PREFIX, _USUAL = "camera_", "gige"
 
@@ -46,8 +47,8 @@ def make_camera(name: str, settings: CameraSettings, clock: Clock) -> Camera:
 
 def _protocol_of(value: object) -> object:
     if isinstance(value, dict):
-        return cast("dict[str, object]", value).get("protocol", _USUAL)
-    return getattr(value, "protocol", None)
+        return f"{TAG}{cast('dict[str, object]', value).get('protocol', _USUAL)}"
+    return f"{TAG}{getattr(value, 'protocol', None)}"
 
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
 elif len(PROTOCOLS) == 1:
     AnyCameraSettings = PROTOCOLS[_USUAL].Settings
 else:
-    _tagged = tuple(Annotated[driver.Settings, Tag(name)] for name, driver in PROTOCOLS.items())
+    _tagged = tuple(Annotated[driver.Settings, Tag(f"{TAG}{name}")] for name, driver in PROTOCOLS.items())
     _of_protocol = Discriminator(
         _protocol_of,
         custom_error_type="camera_protocol",
