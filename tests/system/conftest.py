@@ -21,6 +21,19 @@ from tests.sections import change
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.
 CORNER: dict[str, object] = {"width_px": 612, "height_px": 256}
+AS_INSTALLED: dict[str, dict[str, object]] = {
+    "regulator": {"poll_s": 5.0},
+    "thermometer_module": {"poll_s": 5.0},
+    "camera": {"poll_s": 5.0},
+    "guard": {"period_s": 5.0, "stale_after_s": 15.0, "heater_hold_s": 15.0, "heater_renew_s": 5.0},
+}
+# Half as often: a night of virtual time then takes half the processor time.
+CALM: dict[str, dict[str, object]] = {
+    "regulator": {"poll_s": 10.0},
+    "thermometer_module": {"poll_s": 10.0},
+    "camera": {"poll_s": 10.0},
+    "guard": {"period_s": 10.0, "stale_after_s": 20.0, "heater_hold_s": 30.0, "heater_renew_s": 10.0},
+}
 # For runs in real time: what happens each second or in seconds on a stand happens several times a second.
 FAST: dict[str, dict[str, object]] = {
     "regulator": {"poll_s": 0.25},
@@ -28,7 +41,7 @@ FAST: dict[str, dict[str, object]] = {
     "relays": {"poll_s": 0.5, "self_test_s": 0.6},
     "flap": {"poll_s": 0.5},
     "camera": {"poll_s": 0.5, "boot_s": 0.2},
-    "guard": {"period_s": 0.25, "heater_hold_s": 3.0, "heater_renew_s": 0.5},
+    "guard": {"period_s": 0.25, "stale_after_s": 15.0, "heater_hold_s": 3.0, "heater_renew_s": 0.5},
     # Longer than a commit takes on the busy disk of a shared machine: the fourth hold within an hour waits for `clear`.
     "recording": {"telemetry_commit_s": 0.2, "durable_within_s": 3.0},
 }
@@ -61,10 +74,12 @@ def require_aravis() -> None:
 def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[..., str]:
     """The installed simulated configuration at free addresses; keyword arguments replace whole sections' entries.
 
-    Frames show the upper left corner of the sensor; whoever needs the target says `camera=WHOLE_SENSOR`. By night all
-    have the whole sensor.
+    Frames show the upper left corner of the sensor; whoever needs the target says `camera=WHOLE_SENSOR`. Devices are
+    polled and guarded calmly, but in files that ask for another `POLLED`: those of the guard and the relays, whose
+    subject is time. By night all have the whole sensor and are polled as installed.
     """
-    frame = CORNER if request.node.get_closest_marker("nightly") is None else WHOLE_SENSOR
+    by_day = request.node.get_closest_marker("nightly") is None
+    frame, polled = (CORNER, getattr(request.module, "POLLED", CALM)) if by_day else (WHOLE_SENSOR, AS_INSTALLED)
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
         data: Any = yaml_data(packaged("", "simulated").read_text(), "simulated")
@@ -75,6 +90,7 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
         data["cameras"]["camera"] |= {"address": camera_address(), **frame}
         data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
         data["recording"]["alert_below_percent"] = 0  # of this machine's disk
+        change(data, polled)
         change(data, sections)
         return yaml.safe_dump(data)
 

@@ -23,7 +23,7 @@ from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_virtual
 from stand.serving.client import ask
-from tests.system.conftest import require_aravis
+from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher
 from tests.system.test_resume import end_laboratory
@@ -237,7 +237,7 @@ async def test_a_warm_up_that_is_paused_shortly_goes_on_and_says_what_was_not_se
 async def test_a_warm_up_that_is_paused_for_long_begins_anew_from_its_cool_down(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    ordered = order(WARM_UP)
+    ordered = order(WARM_UP, **AS_INSTALLED)
     session = await paused(ordered, tmp_path / "out", 100.0)
     begins_ns = begins_of(session.events())
     counted = [meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]

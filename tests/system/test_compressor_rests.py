@@ -9,9 +9,12 @@ from foundation.clock import seconds_ns
 from stand.chamber.compressor import restored
 from stand.config.stand_config import CompressorConfig
 from stand.running.order import Order
+from tests.system.conftest import AS_INSTALLED
 from tests.system.gateway import gateway
 from tests.system.test_guard_wire import Start, bench_from
 from tests.system.test_relay_keeper import COMPRESSOR, ON, RELAYS, another_master, seconds_until
+
+POLLED = AS_INSTALLED
 
 COMPRESSOR_FOR_A_TIME = bytes([RELAYS, 5, 0x02, COMPRESSOR])  # unit, function, address
 

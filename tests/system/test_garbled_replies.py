@@ -12,9 +12,11 @@ from foundation.readings import Quality
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from tests.system.conftest import require_aravis
+from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import SHORTER, break_now
+
+POLLED = AS_INSTALLED
 
 QUICK = {"timeout_s": 0.05}
 

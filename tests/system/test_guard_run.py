@@ -22,9 +22,11 @@ from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_virtual
 from stand.serving.client import ask, ask_status
-from tests.system.conftest import require_aravis
+from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step, fault
+
+POLLED = AS_INSTALLED
 
 LONG_SOAK = """
 name: soak

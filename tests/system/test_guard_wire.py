@@ -27,7 +27,9 @@ from stand.guarding.rules import Announcements, watches
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from stand.simulator import ControlSocket, Simulator
-from tests.system.conftest import CORNER, SHORT_RECIPE, require_aravis
+from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE, require_aravis
+
+POLLED = AS_INSTALLED
 
 Start = Callable[[StandConfig, bool], Simulator]
 

@@ -11,8 +11,10 @@ from stand.running.order import Order
 from stand.running.run import run_virtual
 from stand.simulator import Simulator
 from tests.stand.guarded_recipes import RECIPES
-from tests.system.conftest import CORNER, WHOLE_SENSOR, require_aravis
+from tests.system.conftest import AS_INSTALLED, CORNER, WHOLE_SENSOR, require_aravis
 from tests.system.test_guard_wire import Bench, bench_of
+
+POLLED = AS_INSTALLED
 
 Start = Callable[[StandConfig, bool], Simulator]
 HOT_DEGC = 52.0

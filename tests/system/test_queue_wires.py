@@ -20,8 +20,10 @@ from stand.running.opening.claim import claimed
 from stand.running.order import Order
 from stand.simulator import Simulator
 from tests.addresses import free_port
-from tests.system.conftest import require_aravis
+from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.gateway import Gateway
+
+POLLED = AS_INSTALLED
 
 READS = {1, 2, 3, 4, 0x11, 0x2B}  # Modbus function codes
 

@@ -12,7 +12,10 @@ from foundation.hub import Hub
 from stand.assembly import Assembly, assemble
 from stand.imaging.camera_opening import CameraOpening
 from stand.running.order import Order
+from tests.system.conftest import AS_INSTALLED
 from tests.system.test_guard_wire import Bench, Start, bench_of, write_by_another_master
+
+POLLED = AS_INSTALLED
 
 HEATER, COMPRESSOR = 0, 1  # coils
 RELAYS, REGULATOR = 2, 1  # units

@@ -23,7 +23,7 @@ from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
 from stand.simulator import ControlSocket
-from tests.system.conftest import SHORT_RECIPE, WHOLE_SENSOR, require_aravis
+from tests.system.conftest import AS_INSTALLED, SHORT_RECIPE, WHOLE_SENSOR, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 
@@ -286,8 +286,9 @@ async def test_frames_the_disk_refuses_are_counted_and_hold_the_run_until_it_tak
     watch = refusing_from_the_first_capture(
         until=lambda item: isinstance(item, Event) and item.kind == "guard.not_recorded"
     )
+    ordered = order(SHORTER, **AS_INSTALLED | {"camera": AS_INSTALLED["camera"] | WHOLE_SENSOR})
     with pytest.raises(SessionError, match="complete, but 2 frames were lost"):
-        await run_virtual(order(SHORTER, camera=WHOLE_SENSOR), tmp_path / "out", None, watch)
+        await run_virtual(ordered, tmp_path / "out", None, watch)
     session = Session.open(next((tmp_path / "out").iterdir()))
     assert session.frame_count == 1
     kinds = [event.kind for event in session.events()]
