@@ -9,9 +9,12 @@ import pytest_asyncio
 
 from foundation.clock import NS_PER_S
 from foundation.documents import parse_document
+from foundation.items import Batch
+from foundation.readings import Reading
 from stand.config.recipe import Recipe
 from stand.config.stand_config import packaged
 from stand.gate import NOT_RECORDED, OPERATOR
+from tests.recording.recorded import record
 from tests.stand.browser import DESKTOP, PHONE, a_page, browser, needs_chromium
 from tests.stand.page_desk import a_night, frame_of, free_port, target_image
 
@@ -333,6 +336,28 @@ async def test_markers_and_drift_of_the_last_frame_are_shown(night):
         assert "px" in await page.get_by_text("edge width").locator("+ dd").inner_text()
         label = await page.locator(".frame canvas").get_attribute("aria-label")
         assert "54 markers found; mean drift" in label
+
+
+async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
+    for name, warm_degC in (("monday", 24.0), ("tuesday", 30.0)):
+
+        def items(time_ns, index, warm_degC=warm_degC):
+            air, camera = warm_degC + 0.1 * index, warm_degC + 12 + 0.08 * index
+            yield Batch("thermometers", time_ns, (Reading("thermometers.air", air, "degC", time_ns),))
+            yield Batch("camera", time_ns, (Reading("camera.temperature", camera, "degC", time_ns),))
+
+        await record(tmp_path / "sessions" / name, 40, items, segment_s=3600, period_ns=60 * NS_PER_S)
+    async with a_page(night.chromium, night.port, "sessions") as page:
+        for name in ("monday", "tuesday"):
+            await page.get_by_label(f"Choose {name}").check()
+        await page.get_by_role("button", name="Compare these two nights").click()
+        curves = page.get_by_role("img", name="Temperatures of monday and tuesday")
+        await curves.locator("canvas").wait_for()
+        assert await curves.evaluate("(place) => place.querySelector('canvas').width") > 400
+        for text in ("solid: monday", "dashed: tuesday", "monday: no drift", "tuesday: no drift"):
+            await page.get_by_text(text).wait_for()
+        await page.get_by_role("button", name="Close").click()
+        await curves.wait_for(state="detached")
 
 
 async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path, chromium):

@@ -1,11 +1,13 @@
 // Recorded sessions, their reports, and two nights one over the other.
 import { command, get, tell } from "./api.js";
 import { look_of } from "./channels.js";
+import { swatch } from "./now.js";
 import { bytes, css, day_clock, duration, fill, h, seconds } from "./dom.js";
 import uPlot from "./uPlot.js";
 
 const MOST_ROWS = 200;
-const COMPARED = ["thermometers.air", "camera.temperature", "camera.drift_mean"];
+// A dash says which night: here colours alone tell air from camera, and must be far apart.
+const COMPARED = [["thermometers.air", "--c-granite"], ["camera.temperature", "--c-camera"]];
 
 export class Sessions {
   constructor(place, app) {
@@ -121,10 +123,10 @@ export class Sessions {
     const key = names.map((name, index) => h("p", {}, `${index ? "dashed" : "solid"}: `, h("b", {}, name)));
     fill(this.comparison, h("div", { class: "head" }, h("h2", {}, names.length > 1 ? "Two nights, hours since their beginnings" : "One night, hours since its beginning"),
       h("button", { type: "button", class: "small", onclick: () => { this.clear(); this.comparison.hidden = true; } }, "Close")), key,
-      h("p", { class: "curve-name" }, "Air and camera, °C"), place, h("p", { class: "curve-name" }, "Mean drift, px"), drift, this.drift_answers);
+      h("p", { class: "curve-name row" }, "°C: ", COMPARED.map(([channel, colour]) => h("span", { class: "row" }, swatch({ colour, dash: [], width: 2 }), look_of(channel).name))), place, h("p", { class: "curve-name" }, "Mean drift, px"), drift, this.drift_answers);
     this.drift_place = drift;
-    const series = nights.flatMap((night, index) => COMPARED.slice(0, 2).filter((channel) => night.low[channel]).map((channel) => ({
-      name: `${look_of(channel).name}, ${names[index]}`, colour: look_of(channel).colour, dash: index ? [6, 4] : [],
+    const series = nights.flatMap((night, index) => COMPARED.filter(([channel]) => night.low[channel]).map(([channel, colour]) => ({
+      name: `${look_of(channel).name}, ${names[index]}`, colour, dash: index ? [6, 4] : [],
       x: hours(night), y: night.high[channel] ?? night.low[channel] })));
     this.plots.push(new Lines(place, 280, series));
     this.draw_drift();
@@ -170,7 +172,7 @@ class Lines {
     const data = series.length > 1 ? uPlot.join(series.map((each) => [each.x, each.y])) : [series[0]?.x ?? [], series[0]?.y ?? []];
     this.plot = new uPlot({
       width: Math.max(200, place.clientWidth), height, legend: { show: false }, scales: { x: { time: false } },
-      axes: [{ ...axis, size: 28, values: (_, ticks) => ticks.map((tick) => `${tick} h`) }, { ...axis, size: 52 }],
+      axes: [{ ...axis, size: 28, space: 80, values: (_, ticks) => ticks.map((tick) => `${tick} h`) }, { ...axis, size: 52 }],
       series: [{}, ...series.map((each) => ({ label: each.name, stroke: css(each.colour), dash: each.dash, width: 1.8, spanGaps: true, points: { show: false } }))],
     }, data, place);
     this.plot.root.setAttribute("aria-hidden", "true");
