@@ -186,7 +186,8 @@ class Connection:
             stream.add_buffer(self.effective.payload_bytes)
 
     def _configure_packets(self, stream: GigeStream, settings: GigeCameraSettings) -> None:
-        retention_s = self._timeout_s if self._is_virtual else FRAME_RETENTION_PERIODS / self.effective.frame_rate_hz
+        waited_s = self._timeout_s if self._is_virtual else 1 / self.effective.frame_rate_hz
+        retention_s = FRAME_RETENTION_PERIODS * waited_s  # given up before we stop waiting for it
         stream.set_property("socket-buffer", SOCKET_BUFFER_FIXED, G_TYPE_INT)
         stream.set_property("socket-buffer-size", self.effective.receive_buffer_bytes, G_TYPE_INT)
         stream.set_property("packet-resend", int(settings.resend), G_TYPE_INT)
