@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,46 +20,6 @@ from compensation.budget.geometry import Geometry, Quantity, StandState
 from compensation.budget.refraction import Index, appears_px, ciddor_1996, saturation_Pa
 
 Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class StandCorrection:
-    """What the stand does to image points between two states; a function of points (..., 2), px."""
-
-    state: StandState
-    reference: StandState
-    geometry: Geometry
-
-    def __call__(self, xy_px: Float) -> Float:
-        """The points where they would be with the stand as it was in the reference state."""
-        return xy_px - self.displacement_px(xy_px)
-
-    def displacement_px(self, xy_px: Float) -> Float:
-        """How far the stand has moved each point since the reference, (..., 2)."""
-        return displacement_px(self.state, self.reference, self.geometry, xy_px)
-
-    def sigma_px(self, xy_px: Float) -> Float:
-        """Standard uncertainty of the displacement (..., 2), x and y: every uncertain input varied in turn.
-
-        The errors are common to all points and, but for the thermometers', to all frames: they do not average out.
-        """
-        nominal = self.displacement_px(xy_px)
-        square = np.zeros_like(nominal)
-        for state, geometry in varied(self.state, self.geometry):
-            square += (displacement_px(state, self.reference, geometry, xy_px) - nominal) ** 2
-        return np.sqrt(square)
-
-
-def stand_correction(state: StandState, reference: StandState, geometry: Geometry) -> StandCorrection:
-    """The correction of centres seen in `state` to what the stand was in `reference`.
-
-    Raises ValueError for a temperature that is not finite: there is no correction without the five thermometers.
-    """
-    for name in StandState.__dataclass_fields__:
-        for role, which in (("state", state), ("reference state", reference)):
-            if not math.isfinite(getattr(which, name)):
-                raise ValueError(f"{name} of the {role} is unknown: the stand's part cannot be computed")
-    return StandCorrection(state, reference, geometry)
 
 
 def displacement_px(state: StandState, reference: StandState, geometry: Geometry, xy_px: Float) -> Float:

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 from pydantic import ValidationError
 
 from foundation.errors import ConfigError, SessionError
-from stand.serving.desk import RunStatus, StandState
+from stand.serving.desk import StandState
 from stand.serving.presence import Daemon, address_in, living, opened_folder
 
 API = "/api/v1"
@@ -184,14 +184,6 @@ def ask(session: Path, verb: str, body: Mapping[str, object] | None = None, time
     """What the daemon that runs `session` answers to a command; SessionError when none runs, it does not answer, or it
     refuses."""
     return server_of(session).order(verb, body, timeout_s)
-
-
-def ask_status(session: Path, timeout_s: float = LIMIT_S) -> RunStatus:
-    """The status of the run; SessionError as `ask`, and when nothing is run there."""
-    state = server_of(session).state(timeout_s)
-    if state.run is None:
-        raise SessionError(f"{session}: nothing is run at the moment")
-    return state.run
 
 
 def running_sessions(root: Path | None = None) -> list[Path]:

@@ -10,6 +10,7 @@ from drivers.sim.gige.camera_registers import Registers
 from drivers.sim.gige.genicam import features
 from drivers.sim.gige.gvcp_device import ControlChannel
 from tests.drivers.canned_line import Feed, Parser
+from tests.sim.gvcp_client import decode_ack, decode_leader
 
 _MEMORY, _MEMORY_SIZE = 0x10000, 0x400  # of the features
 _PEER = ("127.0.0.1", 40001)
@@ -61,7 +62,7 @@ def gvcp_commands() -> Parser:
                 registers.reset()
             if not answer:
                 return wire[2:4] == b"\x00\x40"
-            ack = gvcp.decode_ack(answer)
+            ack = decode_ack(answer)
             assert (ack.command, ack.req_id) == struct.unpack_from(">H2xH", wire, 2)
             assert ack.status == gvcp.Status.OK or ack.payload == b""
             return ack.status == gvcp.Status.OK
@@ -80,8 +81,8 @@ def gvsp_packets() -> Parser:
         assert wire.endswith(packet.data)
         assert gvsp.decode(packet.encode()) == packet
         with suppress(gvsp.Malformed):
-            leader = gvsp.decode_leader(packet.data)
-            assert gvsp.decode_leader(leader.encode()) == leader
+            leader = decode_leader(packet.data)
+            assert decode_leader(leader.encode()) == leader
             assert leader.encode()[4:32] == packet.data[4:32]
         return True
 

@@ -4,13 +4,14 @@ from hypothesis import strategies as st
 
 from drivers.sim.gige import gvcp
 from drivers.sim.gige.gvcp import Ack, Command, Malformed, Nack, Request, Resend, Status
+from tests.sim.gvcp_client import decode_ack, pack_read_memory, pack_words
 
 # One line per datagram: the bytes, and what they mean. The same table serves encoder and decoder.
 REQUESTS = [
     ("42 01 0002 0000 ffff", Request(Command.DISCOVERY, 0xFFFF)),
-    ("42 01 0080 0004 0001 00000a00", Request(Command.READREG, 1, gvcp.pack_words([0x0A00]))),
-    ("42 01 0082 0008 0002 00000a00 00000002", Request(Command.WRITEREG, 2, gvcp.pack_words([0x0A00, 2]))),
-    ("42 01 0084 0008 0003 00000200 0000 0200", Request(Command.READMEM, 3, gvcp.pack_read_memory(0x200, 512))),
+    ("42 01 0080 0004 0001 00000a00", Request(Command.READREG, 1, pack_words([0x0A00]))),
+    ("42 01 0082 0008 0002 00000a00 00000002", Request(Command.WRITEREG, 2, pack_words([0x0A00, 2]))),
+    ("42 01 0084 0008 0003 00000200 0000 0200", Request(Command.READMEM, 3, pack_read_memory(0x200, 512))),
     (
         "42 01 0086 000c 0004 00010238 40d3880000000000",
         Request(Command.WRITEMEM, 4, gvcp.pack_write_memory(0x10238, bytes.fromhex("40d3880000000000"))),
@@ -22,7 +23,7 @@ REQUESTS = [
     ),
 ]
 ACKS = [
-    ("0000 0081 0004 0001 00000002", Ack(Command.READREG, 1, gvcp.pack_words([2]))),
+    ("0000 0081 0004 0001 00000002", Ack(Command.READREG, 1, pack_words([2]))),
     ("0000 0083 0004 0002 0000 0001", Ack(Command.WRITEREG, 2, gvcp.pack_written(1))),
     ("8006 0083 0000 0003", Ack(Command.WRITEREG, 3, status=Status.ACCESS_DENIED)),
 ]
@@ -40,8 +41,8 @@ def test_a_command_is_these_bytes_and_back_even_with_bytes_behind_it(wire: str, 
 def test_an_acknowledge_is_these_bytes_and_back_even_with_bytes_behind_it(wire: str, ack: Ack) -> None:
     datagram = bytes.fromhex(wire)
     assert ack.encode() == datagram
-    assert gvcp.decode_ack(datagram) == ack
-    assert gvcp.decode_ack(datagram + b"trailing") == ack
+    assert decode_ack(datagram) == ack
+    assert decode_ack(datagram + b"trailing") == ack
 
 
 @pytest.mark.parametrize("wire", [wire for wire, _ in REQUESTS])
@@ -63,7 +64,7 @@ def test_an_acknowledge_cut_short_anywhere_is_malformed(wire: str) -> None:
     datagram = bytes.fromhex(wire)
     for length in range(len(datagram)):
         with pytest.raises(Malformed):
-            gvcp.decode_ack(datagram[:length])
+            decode_ack(datagram[:length])
 
 
 def test_a_wrong_key_is_malformed() -> None:
@@ -82,7 +83,7 @@ def test_a_wrong_key_is_malformed() -> None:
 )
 def test_readmem_takes_1_to_128_whole_words(address: int, count: int, status: Status) -> None:
     with pytest.raises(Nack) as refused:
-        gvcp.unpack_read_memory(gvcp.pack_read_memory(address, count))
+        gvcp.unpack_read_memory(pack_read_memory(address, count))
     assert refused.value.status == status
 
 
@@ -114,12 +115,12 @@ def test_any_command_survives_the_round_trip(command: int, req_id: int, payload:
 @given(st.integers(0, 0xFFFE), u16, payloads, u16)
 def test_any_acknowledge_survives_the_round_trip(command: int, req_id: int, payload: bytes, status: int) -> None:
     ack = Ack(command, req_id, payload, status)
-    assert gvcp.decode_ack(ack.encode()) == ack
+    assert decode_ack(ack.encode()) == ack
 
 
 @given(st.lists(u32, min_size=1, max_size=135))
 def test_any_words_survive_the_round_trip(words: list[int]) -> None:
-    assert gvcp.unpack_words(gvcp.pack_words(words)) == tuple(words)
+    assert gvcp.unpack_words(pack_words(words)) == tuple(words)
 
 
 @given(

@@ -5,6 +5,7 @@ from drivers.sim.gige.camera_registers import Registers
 from drivers.sim.gige.genicam import features
 from drivers.sim.gige.gvcp import Ack, Command, Nack, Request, Resend, Status
 from drivers.sim.gige.gvcp_device import CCP, ControlChannel
+from tests.sim.gvcp_client import decode_ack, pack_read_memory, pack_words
 
 ALICE, BOB = ("127.0.0.1", 40001), ("127.0.0.1", 40002)
 PACKET_SIZE = 0x0D04
@@ -43,13 +44,13 @@ class Wire:
 
     def ask(self, peer: tuple[str, int], command: int, payload: bytes = b"") -> Ack:
         self.req_id += 1
-        return gvcp.decode_ack(self.channel.feed(Request(command, self.req_id, payload).encode(), peer, self.now_s))
+        return decode_ack(self.channel.feed(Request(command, self.req_id, payload).encode(), peer, self.now_s))
 
     def write(self, peer: tuple[str, int], address: int, value: int) -> int:
-        return self.ask(peer, Command.WRITEREG, gvcp.pack_words([address, value])).status
+        return self.ask(peer, Command.WRITEREG, pack_words([address, value])).status
 
     def read(self, peer: tuple[str, int], address: int) -> int:
-        (value,) = gvcp.unpack_words(self.ask(peer, Command.READREG, gvcp.pack_words([address])).payload)
+        (value,) = gvcp.unpack_words(self.ask(peer, Command.READREG, pack_words([address])).payload)
         return value
 
 
@@ -59,7 +60,7 @@ def wire() -> Wire:
 
 
 def test_discovery_gives_the_head_of_the_bootstrap_block(wire: Wire) -> None:
-    ack = gvcp.decode_ack(wire.channel.feed(Request(Command.DISCOVERY, 0xFFFF).encode(), BOB, 0.0))
+    ack = decode_ack(wire.channel.feed(Request(Command.DISCOVERY, 0xFFFF).encode(), BOB, 0.0))
     assert (ack.req_id, len(ack.payload)) == (0xFFFF, 0xF8)
     assert ack.payload[0x24:0x28] == bytes([127, 0, 0, 71])
     assert ack.payload[0x48:0x58].rstrip(b"\0") == b"Thermostand"
@@ -102,26 +103,26 @@ def test_control_is_lost_when_the_heartbeat_stops_but_any_packet_is_a_heartbeat(
 
 def test_a_repeated_command_is_answered_again_but_executed_once(wire: Wire) -> None:
     wire.write(ALICE, CCP, 2)
-    command = Request(Command.WRITEREG, 77, gvcp.pack_words([START, 1])).encode()
+    command = Request(Command.WRITEREG, 77, pack_words([START, 1])).encode()
     first = wire.channel.feed(command, ALICE, 0.0)
     assert wire.channel.feed(command, ALICE, 0.5) == first
     assert wire.device.events == ["AcquisitionStart"]
-    again = Request(Command.WRITEREG, 78, gvcp.pack_words([START, 1])).encode()
+    again = Request(Command.WRITEREG, 78, pack_words([START, 1])).encode()
     wire.channel.feed(again, ALICE, 0.6)
     assert wire.device.events == ["AcquisitionStart"] * 2
 
 
 def test_the_same_bytes_from_another_peer_are_another_command(wire: Wire) -> None:
-    claim = Request(Command.WRITEREG, 5, gvcp.pack_words([CCP, 2])).encode()
-    assert gvcp.decode_ack(wire.channel.feed(claim, ALICE, 0.0)).status == Status.OK
-    assert gvcp.decode_ack(wire.channel.feed(claim, BOB, 0.0)).status == Status.ACCESS_DENIED
+    claim = Request(Command.WRITEREG, 5, pack_words([CCP, 2])).encode()
+    assert decode_ack(wire.channel.feed(claim, ALICE, 0.0)).status == Status.OK
+    assert decode_ack(wire.channel.feed(claim, BOB, 0.0)).status == Status.ACCESS_DENIED
 
 
 def test_one_command_reads_or_writes_several_registers(wire: Wire) -> None:
     wire.write(ALICE, CCP, 2)
-    ack = wire.ask(ALICE, Command.WRITEREG, gvcp.pack_words([PACKET_SIZE, 576, 0x0D08, 7]))
+    ack = wire.ask(ALICE, Command.WRITEREG, pack_words([PACKET_SIZE, 576, 0x0D08, 7]))
     assert ack.payload == gvcp.pack_written(2)
-    ack = wire.ask(BOB, Command.READREG, gvcp.pack_words([PACKET_SIZE, 0x0D08]))
+    ack = wire.ask(BOB, Command.READREG, pack_words([PACKET_SIZE, 0x0D08]))
     assert gvcp.unpack_words(ack.payload) == (576, 7)
 
 
@@ -129,7 +130,7 @@ def test_memory_is_written_and_read_in_blocks(wire: Wire) -> None:
     wire.write(ALICE, CCP, 2)
     ack = wire.ask(ALICE, Command.WRITEMEM, gvcp.pack_write_memory(0x00E8, b"left".ljust(16, b"\0")))
     assert ack.payload == gvcp.pack_written(16)
-    ack = wire.ask(BOB, Command.READMEM, gvcp.pack_read_memory(0x00E8, 8))
+    ack = wire.ask(BOB, Command.READMEM, pack_read_memory(0x00E8, 8))
     assert ack.payload == gvcp.pack_write_memory(0x00E8, b"left\0\0\0\0")
 
 
@@ -137,12 +138,12 @@ def test_memory_is_written_and_read_in_blocks(wire: Wire) -> None:
     ("command", "payload", "status"),
     [
         (0x0004, b"", Status.NOT_IMPLEMENTED),
-        (Command.READREG, gvcp.pack_words([0x0A02]), Status.BAD_ALIGNMENT),
-        (Command.READREG, gvcp.pack_words([0x90000]), Status.BAD_ADDRESS),
+        (Command.READREG, pack_words([0x0A02]), Status.BAD_ALIGNMENT),
+        (Command.READREG, pack_words([0x90000]), Status.BAD_ADDRESS),
         (Command.READREG, b"\0\0", Status.BAD_PARAMETER),
-        (Command.WRITEREG, gvcp.pack_words([PACKET_SIZE]), Status.BAD_PARAMETER),
-        (Command.WRITEREG, gvcp.pack_words([PACKET_SIZE, 219]), Status.BAD_PARAMETER),
-        (Command.READMEM, gvcp.pack_read_memory(TEMPERATURE, 8), Status.ACCESS_DENIED),
+        (Command.WRITEREG, pack_words([PACKET_SIZE]), Status.BAD_PARAMETER),
+        (Command.WRITEREG, pack_words([PACKET_SIZE, 219]), Status.BAD_PARAMETER),
+        (Command.READMEM, pack_read_memory(TEMPERATURE, 8), Status.ACCESS_DENIED),
     ],
 )
 def test_a_command_that_cannot_be_done_is_refused_by_its_status(
@@ -161,7 +162,7 @@ def test_a_packet_resend_is_passed_on_and_never_acknowledged(wire: Wire) -> None
 
 
 def test_a_command_without_the_acknowledge_flag_is_executed_in_silence(wire: Wire) -> None:
-    claim = Request(Command.WRITEREG, 5, gvcp.pack_words([CCP, 2]), flags=0)
+    claim = Request(Command.WRITEREG, 5, pack_words([CCP, 2]), flags=0)
     assert wire.channel.feed(claim.encode(), ALICE, 0.0) == b""
     assert wire.read(BOB, CCP) == 2
 

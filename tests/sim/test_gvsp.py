@@ -4,6 +4,7 @@ from hypothesis import strategies as st
 
 from drivers.sim.gige import gvsp
 from drivers.sim.gige.gvsp import Block, Kind, Leader, Malformed, Packet, PixelFormat
+from tests.sim.gvcp_client import decode_leader
 
 PACKETS = [
     ("0000 0001 01000000", Packet(Kind.LEADER, 1, 0)),
@@ -44,15 +45,15 @@ def test_a_packet_of_unknown_kind_is_malformed() -> None:
 
 def test_the_leader_is_these_36_bytes_and_back() -> None:
     assert LEADER.encode() == LEADER_BYTES
-    assert gvsp.decode_leader(LEADER_BYTES + b"trailing") == LEADER
+    assert decode_leader(LEADER_BYTES + b"trailing") == LEADER
     for length in range(len(LEADER_BYTES)):
         with pytest.raises(Malformed):
-            gvsp.decode_leader(LEADER_BYTES[:length])
+            decode_leader(LEADER_BYTES[:length])
 
 
 def test_a_leader_of_something_else_than_an_image_is_malformed() -> None:
     with pytest.raises(Malformed, match="type"):
-        gvsp.decode_leader(b"\0\0\0\4" + LEADER_BYTES[4:])
+        decode_leader(b"\0\0\0\4" + LEADER_BYTES[4:])
 
 
 def block_of(pixels: bytes, packet_size: int, extended: bool) -> Block:
@@ -85,7 +86,7 @@ def test_any_block_is_whole_again_after_the_wire(pixels: bytes, packet_size: int
     packets = [gvsp.decode(b"".join(block.packet(packet_id))) for packet_id in range(block.trailer_id + 1)]
     leader, *payload, trailer = packets
     assert (leader.kind, trailer.kind) == (Kind.LEADER, Kind.TRAILER)
-    assert gvsp.decode_leader(leader.data) == LEADER
+    assert decode_leader(leader.data) == LEADER
     assert [packet.packet_id for packet in payload] == list(range(1, len(payload) + 1))
     assert {packet.kind for packet in payload} == {Kind.PAYLOAD}
     assert {len(packet.data) for packet in payload[:-1]} <= {block.data_size}

@@ -21,6 +21,7 @@ from drivers.sim.gige.gvsp import Kind, Packet
 from drivers.sim.gige.gvsp_sender import CameraFaults
 from foundation.clock import FollowedClock, seconds_ns
 from tests.addresses import camera_address
+from tests.sim.gvcp_client import decode_ack, decode_leader, pack_read_memory, pack_words
 
 ADDRESS = camera_address()
 WIDTH, HEIGHT = 320, 240
@@ -64,7 +65,7 @@ class Client:
         self.req_id += 1
         self.control.settimeout(WAIT_s)
         self.control.sendto(Request(command, self.req_id, payload).encode(), (ADDRESS, gvcp.PORT))
-        return gvcp.decode_ack(self.control.recv(1024))
+        return decode_ack(self.control.recv(1024))
 
     def is_ignored(self) -> bool:
         self.control.settimeout(SILENCE_s)
@@ -82,7 +83,7 @@ class Client:
 
     def get(self, name: str) -> float:
         feature = FEATURES[name]
-        payload = gvcp.pack_read_memory(feature.address, feature.length)
+        payload = pack_read_memory(feature.address, feature.length)
         ack = self.ask(Command.READMEM, payload)
         assert ack.status == Status.OK
         data = ack.payload[4:]
@@ -159,7 +160,7 @@ def client(camera: FakeCamera) -> Iterator[Client]:
 
 
 def image_of(packets: list[Packet]) -> NDArray[np.uint8]:
-    leader = gvsp.decode_leader(packets[0].data)
+    leader = decode_leader(packets[0].data)
     pixels = b"".join(packet.data for packet in packets if packet.kind == Kind.PAYLOAD)
     return np.frombuffer(pixels, np.uint8).reshape(leader.height, leader.width)
 
@@ -185,7 +186,7 @@ def test_a_triggered_frame_is_the_rendered_array_bit_for_bit(
     assert [packet.packet_id for packet in packets] == list(range(len(packets)))
     assert {packet.block_id for packet in packets} == {1}
     assert {len(packet.data) + 36 for packet in packets[1:-2]} == {packet_size}
-    assert gvsp.decode_leader(packets[0].data).timestamp == seconds_ns(2.0)
+    assert decode_leader(packets[0].data).timestamp == seconds_ns(2.0)
 
 
 def test_every_trigger_gives_one_frame_with_the_next_id(client: Client, clock: FollowedClock) -> None:
@@ -212,7 +213,7 @@ def test_a_free_run_in_virtual_time_sends_only_the_latest_frame(
     camera.advance(clock.now_ns())
     packets = client.packets()
     assert packets[0].block_id == 3
-    assert gvsp.decode_leader(packets[0].data).timestamp == seconds_ns(1.0)
+    assert decode_leader(packets[0].data).timestamp == seconds_ns(1.0)
     np.testing.assert_array_equal(image_of(packets), expected(1.0))
     camera.advance(clock.now_ns())
     assert client.stream_is_silent()
@@ -226,7 +227,7 @@ def test_a_region_is_cut_from_the_sensor(client: Client) -> None:
     client.arm()
     client.set("TriggerSoftware", 1)
     packets = client.packets()
-    leader = gvsp.decode_leader(packets[0].data)
+    leader = decode_leader(packets[0].data)
     assert (leader.width, leader.height, leader.offset_x, leader.offset_y) == (64, 32, 8, 4)
     np.testing.assert_array_equal(image_of(packets), expected(0.0)[4:36, 8:72])
 
@@ -314,7 +315,7 @@ def test_only_the_last_four_frames_can_be_asked_for_again(client: Client, camera
 
 
 def test_a_camera_without_resend_says_so_and_ignores_requests(client: Client, faults: CameraFaults) -> None:
-    capability = gvcp.pack_words([0x0934])
+    capability = pack_words([0x0934])
     assert client.ask(Command.READREG, capability).payload[-1] & 0b100
     faults.no_resend = True
     assert not client.ask(Command.READREG, capability).payload[-1] & 0b100
@@ -328,7 +329,7 @@ def test_a_camera_without_resend_says_so_and_ignores_requests(client: Client, fa
 
 def test_the_test_packet_has_exactly_the_packet_size(client: Client) -> None:
     client.connect(8000)
-    client.ask(Command.WRITEREG, gvcp.pack_words([0x0D04, 1 << 31 | 8000]))
+    client.ask(Command.WRITEREG, pack_words([0x0D04, 1 << 31 | 8000]))
     client.stream.settimeout(WAIT_s)
     assert len(client.stream.recv(65536)) == 8000 - 28
 
@@ -441,7 +442,7 @@ def test_the_temperature_can_be_zero_stuck_or_refused(client: Client, plant: Stu
     faults.temperature = "zero"
     assert client.get("DeviceTemperature") == 0.0
     faults.temperature = "access"
-    payload = gvcp.pack_read_memory(FEATURES["DeviceTemperature"].address, 8)
+    payload = pack_read_memory(FEATURES["DeviceTemperature"].address, 8)
     assert client.ask(Command.READMEM, payload).status == Status.ACCESS_DENIED
     assert client.get("ExposureTime") == 10_000.0
     faults.temperature = None
@@ -537,6 +538,6 @@ def test_datagrams_of_any_command_leave_the_camera_answering(client: Client) -> 
         client.control.sendto(Request(command, 7).encode(), (ADDRESS, gvcp.PORT))
     client.control.settimeout(WAIT_s)
     client.req_id = 100
-    while (ack := gvcp.decode_ack(client.control.recv(1024))).command != 0xFFFE:
+    while (ack := decode_ack(client.control.recv(1024))).command != 0xFFFE:
         assert ack.status != Status.OK
     assert client.ask(Command.DISCOVERY, b"").status == Status.OK

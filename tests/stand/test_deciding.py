@@ -18,9 +18,10 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.items import Event
 from foundation.readings import Frame
 from stand.running.executing.deciding import Decider
-from stand.running.memory.entries import Edited, read_lines
+from stand.running.memory.entries import Edited
 from stand.running.memory.fold import fold
 from stand.running.memory.journal import JOURNAL_NAME
+from tests.journals import read_lines
 from tests.stand.decisions_process import ANSWERS, ASKED
 from tests.stand.small_stand import Life
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from foundation.clock import WallClock
 from foundation.errors import SessionError
-from stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, encode_line, read_lines
+from stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, encode_line
 from stand.running.memory.journal import JOURNAL_NAME, Journal
+from tests.journals import read_lines
 
 ENTRIES = [
     Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),

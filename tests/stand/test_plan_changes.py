@@ -33,19 +33,10 @@ from foundation.errors import ConfigError
 from foundation.items import Event, StepMark, StepState
 from foundation.readings import Frame
 from stand.gate import OPERATOR
-from stand.running.memory.entries import (
-    Change,
-    Edited,
-    Extended,
-    Skipped,
-    Step,
-    change_of,
-    data_of,
-    encode_line,
-    read_lines,
-)
+from stand.running.memory.entries import Change, Edited, Extended, Skipped, Step, change_of, data_of, encode_line
 from stand.running.memory.fold import fold, refusal
 from stand.running.memory.journal import JOURNAL_NAME
+from tests.journals import read_lines
 from tests.stand.small_stand import Life
 
 CAPTURE = Capture(4, 5.0, 0.1, Role.FIT, 24.0)

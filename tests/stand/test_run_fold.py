@@ -28,11 +28,11 @@ from stand.running.memory.entries import (
     Tripped,
     Written,
     encode_line,
-    read_lines,
 )
 from stand.running.memory.fold import after, fold
 from stand.running.memory.state import RunState
 from stand.running.resume import folded
+from tests.journals import read_lines
 from tests.stand.test_run_table import ID, PLAN, SOAK, S
 
 ids = st.sampled_from([*ID, "unknown"])

@@ -31,9 +31,10 @@ from foundation.readings import Frame
 from stand.fault import Fault
 from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from stand.running.executing.actions import CREDITED_WITHIN_K
-from stand.running.memory.entries import Again, Dwell, Step, read_lines
+from stand.running.memory.entries import Again, Dwell, Step
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.opening.stop import Interrupted
+from tests.journals import read_lines
 from tests.stand.small_stand import Life
 
 FRAMES = 4

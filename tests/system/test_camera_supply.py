@@ -11,10 +11,11 @@ import pytest
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
 from recording.reading.session import Session
-from stand.running.memory.entries import Dwell, Gap, read_lines
+from stand.running.memory.entries import Dwell, Gap
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.run import run_virtual
+from tests.journals import read_lines
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher

@@ -20,10 +20,11 @@ from recording.reading.session import Session
 from recording.reading.using import open_whole
 from recording.repair.salvage import salvage_session
 from recording.repair.verify import verify
-from stand.running.memory.entries import Tripped, read_lines
+from stand.running.memory.entries import Tripped
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
+from tests.journals import read_lines
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import end_laboratory

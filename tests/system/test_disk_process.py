@@ -16,8 +16,9 @@ from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 from recording.writing import locks
 from recording.writing.disk import LEFT_NAME
-from stand.running.memory.entries import Ended, read_lines
+from stand.running.memory.entries import Ended
 from stand.running.memory.journal import Journal
+from tests.journals import read_lines
 from tests.recording.disks import ext4, run
 
 LIMIT_S = 60.0  # for what takes milliseconds, on a machine that has other things to do

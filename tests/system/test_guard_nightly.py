@@ -14,7 +14,7 @@ import pytest
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
 from stand.running.order import Order
-from stand.serving.client import ask_status
+from tests.asking import ask_status
 from tests.recording.disks import ext4, run
 from tests.stand.test_listening import STATE, connected
 from tests.system.conftest import require_aravis

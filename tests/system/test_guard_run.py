@@ -16,12 +16,14 @@ from foundation.errors import SessionError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item
 from recording.reading.session import Session
-from stand.running.memory.entries import Cleared, Tripped, read_lines
+from stand.running.memory.entries import Cleared, Tripped
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_virtual
-from stand.serving.client import ask, ask_status
+from stand.serving.client import ask
+from tests.asking import ask_status
+from tests.journals import read_lines
 from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step, fault

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from stand.running.memory.entries import Ended, Gap, Written, read_lines
+from stand.running.memory.entries import Ended, Gap, Written
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
+from tests.journals import read_lines
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import check, check_soaks, revived

@@ -11,9 +11,10 @@ from experiments.steps import Capture, Decide
 from foundation.clock import WallClock
 from recording.reading.session import Session
 from stand.running.executing.deciding import MODULE, Decider
-from stand.running.memory.entries import Edited, read_lines
+from stand.running.memory.entries import Edited
 from stand.running.order import Order
 from stand.running.run import run_virtual
+from tests.journals import read_lines
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 pytestmark = pytest.mark.nightly

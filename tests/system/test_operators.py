@@ -13,11 +13,13 @@ from foundation.errors import SessionError, StandError
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from recording.reading.session import Session
-from stand.running.memory.entries import Held, read_lines
+from stand.running.memory.entries import Held
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from stand.serving.client import ask, ask_status
+from stand.serving.client import ask
+from tests.asking import ask_status
+from tests.journals import read_lines
 from tests.system.conftest import require_aravis
 from tests.system.test_attended import PROMPTED
 from tests.system.test_guard_run import check_safe

@@ -20,13 +20,15 @@ from recording.reading.glance import glance
 from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.repair.verify import verify
-from stand.running.memory.entries import Dwell, Gap, Step, encode_line, read_lines
+from stand.running.memory.entries import Dwell, Gap, Step, encode_line
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import Interruption, interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.serving.client import ask, ask_status
+from stand.serving.client import ask
 from stand.simulator import ControlSocket
+from tests.asking import ask_status
+from tests.journals import read_lines
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_run import at_step, fault

@@ -11,9 +11,10 @@ from foundation.clock import NS_PER_S
 from foundation.items import StepState
 from foundation.progress import progress
 from recording.reading.session import Session
-from stand.running.memory.entries import Dwell, read_lines
+from stand.running.memory.entries import Dwell
 from stand.running.order import Order
 from stand.running.run import run_virtual
+from tests.journals import read_lines
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
 RECIPE = """

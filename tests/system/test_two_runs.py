@@ -15,9 +15,10 @@ import pytest
 from foundation.errors import SessionError
 from stand.config.stand_config import load_config
 from stand.running.order import Order
-from stand.serving.client import ask_status, running_sessions
+from stand.serving.client import running_sessions
 from stand.simulator import ControlSocket
 from tests import forked
+from tests.asking import ask_status
 from tests.stand.test_listening import connected
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF

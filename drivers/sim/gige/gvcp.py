@@ -7,7 +7,6 @@ Everything is big endian. A command is `0x42, flags, command, length, req_id` an
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -111,16 +110,6 @@ def decode_request(datagram: bytes) -> Request:
     return Request(command, req_id, _body(datagram, length), flags)
 
 
-def decode_ack(datagram: bytes) -> Ack:
-    """The acknowledge in a datagram; bytes behind its stated length are ignored. Malformed when it is none."""
-    if len(datagram) < _ACK.size:
-        raise Malformed(f"{len(datagram)} bytes are no GVCP header")
-    status, code, length, req_id = _ACK.unpack_from(datagram)
-    if code == 0:
-        raise Malformed("an acknowledge of no command")
-    return Ack(code - 1, req_id, _body(datagram, length), status)
-
-
 def _body(datagram: bytes, length: int) -> bytes:
     body = datagram[8 : 8 + length]
     if len(body) < length:
@@ -131,22 +120,11 @@ def _body(datagram: bytes, length: int) -> bytes:
 # ----------------------------------------------------------------------------------------------- payloads of commands
 
 
-def pack_words(words: Iterable[int]) -> bytes:
-    """32-bit words: the payload of READREG (addresses), of its acknowledge (values) and of WRITEREG (pairs)."""
-    values = tuple(words)
-    return struct.pack(f">{len(values)}I", *values)
-
-
 def unpack_words(payload: bytes) -> tuple[int, ...]:
     """The 32-bit words of a payload; Nack when it is empty or no multiple of 4 bytes."""
     if not payload or len(payload) % 4:
         raise Nack(Status.BAD_PARAMETER, f"{len(payload)} bytes are no words")
     return struct.unpack(f">{len(payload) // 4}I", payload)
-
-
-def pack_read_memory(address: int, count: int) -> bytes:
-    """The payload of READMEM."""
-    return struct.pack(">IHH", address, 0, count)
 
 
 def unpack_read_memory(payload: bytes) -> tuple[int, int]:

@@ -122,16 +122,6 @@ class Leader:
         )
 
 
-def decode_leader(data: bytes) -> Leader:
-    """The leader in the data of a leader packet; Malformed when short or no image."""
-    if len(data) < _LEADER.size:
-        raise Malformed(f"leader of {len(data)} bytes")
-    _, payload_type, timestamp, pixel_format, width, height, offset_x, offset_y, _, _ = _LEADER.unpack_from(data)
-    if payload_type != _IMAGE:
-        raise Malformed(f"payload of type {payload_type:#x}")
-    return Leader(timestamp, pixel_format, width, height, offset_x, offset_y)
-
-
 @dataclass(frozen=True)
 class Block:
     """One image cut into packets of `packet_size` bytes (IP and UDP header included), on demand.

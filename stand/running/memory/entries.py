@@ -38,7 +38,7 @@ from pydantic import TypeAdapter, ValidationError
 from experiments.steps import Step as PlanStep
 from experiments.steps import kind_of, parameters_of
 from foundation.errors import SessionError
-from recording.reading.journal_lines import JOURNAL_NAME, journal_line, lines_of
+from recording.reading.journal_lines import JOURNAL_NAME, journal_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,15 +236,6 @@ def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
 def encode_line(entry: Written) -> bytes:
     """The entry as a line."""
     return journal_line(json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode())
-
-
-def read_lines(data: bytes) -> tuple[list[Written], int]:
-    """The entries of all sound lines, and how many bytes there are up to the end of the last one.
-
-    SessionError when a sound line holds an entry that is not known here.
-    """
-    lines = lines_of(data)
-    return [decoded(text) for text in lines.sound], lines.size_bytes
 
 
 def decoded(text: bytes) -> Written:
