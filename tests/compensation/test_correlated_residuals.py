@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
-import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from markers.band import NARROW_SIGMA, WIDE_SIGMA
 from markers.detection import Detection, detect
 from markers.sandwich import variance_growth
 
-from .rendered import Float, photograph, render, true_centres_px
+from .rendered import Float, render, true_centres_px
+from .spoiled import (
+    Picture,
+    as_jpeg,
+    flickering_rows,
+    moved_while_exposed,
+    noise_alone,
+    on_grained_paper,
+    unequal_pixels,
+    with_gamma,
+)
 from .test_markers import HALF, PAPER
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 SCENE = replace(HALF, roll_deg=7, tilt_y_deg=10, distance_mm=1100)
 FRAMES = 4
@@ -29,52 +34,9 @@ def clean() -> Float:
     return render(SCENE)
 
 
-def noise_alone(seed: int) -> Image:
-    return photograph(SCENE, clean(), seed)
-
-
-def as_jpeg(quality: int) -> Callable[[int], Image]:
-    def picture(seed: int) -> Image:
-        stored = cv2.imencode(".jpg", photograph(SCENE, clean(), seed), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        return np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), np.uint8)
-
-    return picture
-
-
-def moved_while_exposed(length_px: float) -> Callable[[int], Image]:
-    """Along a line at 20 deg to the rows."""
-    kernel = np.zeros((31, 31))
-    for t in np.linspace(-length_px / 2, length_px / 2, 400):
-        x, y = 15 + t * np.cos(np.radians(20)), 15 + t * np.sin(np.radians(20))
-        column, row = int(x), int(y)
-        right, down = x - column, y - row
-        kernel[row : row + 2, column : column + 2] += np.outer([1 - down, down], [1 - right, right]) / 400
-    return lambda seed: photograph(SCENE, np.asarray(cv2.filter2D(clean(), -1, kernel), np.float64), seed)
-
-
-def unequal_pixels(seed: int) -> Image:
-    gains = 1 + 0.02 * np.random.default_rng(seed + 1000).standard_normal(clean().shape)
-    return photograph(SCENE, clean() * gains, seed)
-
-
-def with_gamma(seed: int) -> Image:
-    image = photograph(SCENE, clean(), seed) / 255
-    return np.round(255 * image ** (1 / 2.2)).astype(np.uint8)
-
-
-def flickering_rows(seed: int) -> Image:
-    rows = np.random.default_rng(seed + 1000).standard_normal((SCENE.size[1], 1))
-    return photograph(SCENE, clean() + 3 * rows, seed)
-
-
-def on_grained_paper(seed: int) -> Image:
-    grain = cv2.GaussianBlur(np.random.default_rng(seed + 1000).standard_normal(clean().shape), (0, 0), 5)
-    return photograph(SCENE, clean() * (1 + 0.05 * grain / grain.std()), seed)
-
-
-def errors_px(picture: Callable[[int], Image]) -> tuple[Float, Float, list[Detection]]:
+def errors_px(picture: Picture) -> tuple[Float, Float, list[Detection]]:
     """Errors and claimed variances (K, 2) of the unflagged markers of a few frames."""
-    found = [detect(picture(seed), PAPER) for seed in range(FRAMES)]
+    found = [detect(picture(SCENE, clean(), seed), PAPER) for seed in range(FRAMES)]
     clear = np.array([one.flags == 0 for one in found])
     assert clear.mean() > 0.85
     errors = np.array([one.centres_px for one in found]) - true_centres_px(SCENE)
@@ -100,7 +62,7 @@ def errors_px(picture: Callable[[int], Image]) -> tuple[Float, Float, list[Detec
         *("unequal pixels", "gamma 2.2"),
     ],
 )
-def test_the_claimed_variance_is_that_of_the_errors(picture: Callable[[int], Image]):
+def test_the_claimed_variance_is_that_of_the_errors(picture: Picture):
     """The chi^2 of 432 coordinates scatters by 7 %."""
     errors, variances, _ = errors_px(picture)
     assert 0.8 < np.mean(errors**2 / variances) < 1.25
@@ -127,12 +89,13 @@ def test_grained_ground_is_fitted_in_a_narrow_band_where_that_is_better_and_fram
     assert {detection.band_sigma for detection in found} == {NARROW_SIGMA}
     assert 0.8 < np.mean(errors**2 / variances) < 1.25
     wide = [
-        detect(on_grained_paper(seed), PAPER, replace(one, band_sigma=WIDE_SIGMA)) for seed, one in enumerate(found)
+        detect(on_grained_paper(SCENE, clean(), seed), PAPER, replace(one, band_sigma=WIDE_SIGMA))
+        for seed, one in enumerate(found)
     ]
     clear = np.array([(one.flags | other.flags) == 0 for one, other in zip(found, wide, strict=True)])
     off = [np.array([one.centres_px for one in group]) - true_centres_px(SCENE) for group in (found, wide)]
     assert np.std(off[0][clear]) < 0.7 * np.std(off[1][clear])
-    after = detect(on_grained_paper(9), PAPER, found[0])
+    after = detect(on_grained_paper(SCENE, clean(), 9), PAPER, found[0])
     assert after.band_sigma == NARROW_SIGMA
     assert after.excess_px2.tolist() == found[0].excess_px2.tolist()
 
@@ -142,7 +105,7 @@ def test_a_picture_that_noise_does_not_describe_is_doubtful_and_one_with_noise_a
     _, _, noisy = errors_px(noise_alone)
     assert all(one.is_doubtful for one in grained)
     assert not any(one.is_doubtful for one in noisy)
-    assert detect(on_grained_paper(9), PAPER, grained[0]).is_doubtful
+    assert detect(on_grained_paper(SCENE, clean(), 9), PAPER, grained[0]).is_doubtful
 
 
 def test_growth_within_its_chance_is_none_and_beyond_it_is_kept():

@@ -1,0 +1,80 @@
+"""Claimed variances of marker centres against true errors: chi^2 per coordinate, 1 when they are honest.
+
+The worse of x and y, as chi^2 or its inverse. Two scenes, with discs of 17 and 10 px radius, of poses, seeds and angles
+of motion that nothing was chosen on. Where frames are said to be doubtful there is no goal: that is what is to be said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from markers.detection import Detection, detect
+from markers.target import load_target
+from stand.config.stand_config import packaged
+from tests.bench.figures import Figure, absolute, at_most, progress
+from tests.compensation.rendered import Float, Scene, render, true_centres_px
+from tests.compensation.spoiled import (
+    Picture,
+    as_jpeg,
+    flickering_rows,
+    moved_while_exposed,
+    noise_alone,
+    on_grained_paper,
+    unequal_pixels,
+    with_gamma,
+)
+
+FRAMES = 8
+FIRST_SEED = 7000
+GOAL = 1.25
+SCENES = {
+    "17 px": Scene(size=(1224, 1024), f_px=4386, roll_deg=31, tilt_x_deg=-14, distance_mm=1150),
+    "10 px": Scene(size=(1224, 1024), f_px=2700, roll_deg=12, tilt_y_deg=-20, distance_mm=1080),
+}
+PICTURES: dict[str, Picture] = {
+    "noise alone": noise_alone,
+    **{f"JPEG {quality}": as_jpeg(quality) for quality in (95, 90, 80)},
+    **{f"motion of {length} px": moved_while_exposed(length, 110) for length in (2, 4, 6, 8)},
+    "unequal pixels, 2 %": unequal_pixels,
+    "gamma 2.2": with_gamma,
+    "flickering rows, 3 DN": flickering_rows,
+    "grained paper": on_grained_paper,
+}
+
+
+def figures(directory: Path) -> list[Figure]:
+    """chi^2 of each kind of picture, blur included, and how many of its frames are said to be doubtful."""
+    cv2.setNumThreads(1)
+    lines: list[Figure] = []
+    for size, scene in SCENES.items():
+        progress(f"claimed variances, discs of {size}")
+        clean = render(scene)
+        for name, picture in PICTURES.items():
+            lines.append(_figure(f"{name}, discs of {size}", scene, clean, picture))
+        for blur in (0.6, 2.5):
+            blurred = replace(scene, psf_px=blur)
+            lines.append(_figure(f"blur {blur} px, discs of {size}", blurred, render(blurred), noise_alone))
+    return lines
+
+
+def _figure(name: str, scene: Scene, clean: Float, picture: Picture) -> Figure:
+    target = load_target(packaged("targets", "paper-9x6"))
+    found = [detect(picture(scene, clean, FIRST_SEED + number), target) for number in range(FRAMES)]
+    chi2 = _chi2(found, true_centres_px(scene))
+    doubtful = sum(detection.is_doubtful for detection in found)
+    told = f" ({doubtful} of {FRAMES} frames doubtful)" if doubtful else ""
+    figure = absolute(f"claimed variances, {name}{told}", "chi^2", [max(*chi2, *(1 / chi2))])
+    return figure if doubtful > FRAMES / 2 else at_most(GOAL, figure)
+
+
+def _chi2(found: list[Detection], truth: Float) -> Float:
+    """Of the unflagged markers, along x and y."""
+    squares = np.array(
+        [(one.centres_px - truth) ** 2 / np.diagonal(one.covariance_px2, axis1=1, axis2=2) for one in found]
+    )
+    clear = np.array([one.flags == 0 for one in found])
+    return np.nanmean(np.where(clear[:, :, None], squares, np.nan), axis=(0, 1))
