@@ -4,6 +4,7 @@ from compensation.calibration.calibrate import calibrate as calibrate
 from compensation.calibration.session_centres import Positions as Positions
 from compensation.calibration.session_centres import observe_positions as observe_positions
 from compensation.calibration.stage_geometry import TableSigma as TableSigma
+from compensation.drift.anchoring import anchored as anchored
 from compensation.drift.choosing import fit as fit
 from compensation.drift.drift_model import DriftModel as DriftModel
 from compensation.drift.evaluation import Evaluation as Evaluation

@@ -74,7 +74,7 @@ class Evaluation:
 def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
     """Score the model on the VALIDATION frames; a session without any is scored by leaving out one temperature at a
     time, each time with a new fit of the same terms. SessionError when the frames are of another camera or target."""
-    _check_same(model, observations)
+    check_same(model, observations)
     observations = around_bumps(observations, model.facts.bumps)
     frames = observations.of(Role.VALIDATION)
     states = frame_states(observations, model.memory)
@@ -103,7 +103,8 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
     )
 
 
-def _check_same(model: DriftModel, observations: Observations) -> None:
+def check_same(model: DriftModel, observations: Observations) -> None:
+    """SessionError when the observations are of another camera, or of images of another size."""
     facts, serial = model.facts, observations.sessions[0].camera_serial
     if serial != facts.camera_serial:
         raise SessionError(f"the model is of camera {facts.camera_serial}, the session of camera {serial}")

@@ -23,10 +23,12 @@ from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import exponents
 from compensation.drift.terms import Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from compensation.drift.training import frame_states
 from compensation.drift_runtime import Drift
 from compensation.history.states import States, row_of, state_of
 from compensation.history.thermal_history import recorded_history, states_at
-from compensation.observations import session_target
+from compensation.observations import observe, session_target
+from experiments.steps import Role
 from foundation.errors import SessionError
 from markers.detection import detect
 from recording.reading.session import Session
@@ -331,6 +333,23 @@ def test_a_camera_temperature_alone_is_enough_for_the_form_that_needs_no_history
     assert (tmp_path / "both.tiff").read_bytes() == (tmp_path / "paper.tiff").read_bytes()
     refused = run("apply", files["thermal"], photo, "--camera-degC", 44, "-o", tmp_path / "none.tiff", status=2)
     assert "a model of the form thermal needs the thermal state" in refused
+
+
+def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
+    recorded: Recorded, files: dict[str, Path], tmp_path: Path
+):
+    at_first_px = recorded.true_px[3] + 0.5
+    elsewhere = replace(thermal(), facts=replace(thermal().facts, reference_centres_px=at_first_px))
+    save_model(replace(elsewhere, other=paper()), tmp_path / "elsewhere.json")
+    assert "thermal: " in run("anchor", tmp_path / "elsewhere.json", recorded.path, "-o", tmp_path / "here.json")
+    here, observed = load_model(tmp_path / "here.json"), observe(recorded.path)
+    assert (here.form, here.other) == ("thermal", None)
+    states = frame_states(observed, here.memory)
+    at_reference = np.flatnonzero(observed.of(Role.REFERENCE)).tolist()
+    corrected = [here.correct(recorded.true_px[k], states.where(np.array([k]))) for k in at_reference]
+    assert np.abs(np.mean(corrected, axis=0) - at_first_px).max() < 0.02
+    refused = run("anchor", files["paper"], recorded.path, "-o", tmp_path / "none.json", status=1)
+    assert "the model has no thermal form" in refused
 
 
 def test_a_session_is_corrected_with_the_form_in_use_and_so_is_an_export(

@@ -1,0 +1,42 @@
+"""`compensate anchor`: a drift model for a session in which the target, or the camera, was put back in place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.commands.options import CameraName, Finding
+from compensation.drift.anchoring import anchored, thermal_of
+from compensation.drift.model_file import load_model, save_model
+from foundation.command_app import App
+from foundation.exit_codes import one_line_errors
+from foundation.files import check_writable
+from foundation.output import show
+
+app = App()
+
+
+@app.command()
+def anchor(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")],
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session, with a few reference frames.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write, for this session.")],
+    camera: CameraName = None,
+    *,
+    finding: Finding,
+) -> None:
+    """Fit a model to where the target is in a new session, with a few reference frames of the session itself.
+
+    Camera or target were taken out since the model was fitted: what that moved is the same in all states, and is taken
+    out, with its uncertainty. The new model has the thermal form alone.
+
+    Example: compensate anchor model.json sessions/20260108T180000Z-short -o model-of-the-8th.json
+    """
+    with one_line_errors():
+        check_writable(out)
+        known = thermal_of(load_model(model))
+        found = anchored(known, finding.observed([session], camera))
+        save_model(found, out)
+        show({"model": out, "form": found.form, "title": found.title}, [f"{found.form}: {found.title}"])

@@ -1,0 +1,100 @@
+"""A model for one session, from a few frames of the session itself.
+
+Target or camera have been taken out and put back: the image is elsewhere, and what the model says is off by the same in
+all states. The coefficients of the thermal form are Gaussian, so frames of the new session make them more certain (a
+Kalman update: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 2.1), with the constant of
+each motion as good as unknown before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from compensation.drift.condensed import condense_instants
+from compensation.drift.displacements import Displacements
+from compensation.drift.drift_model import DriftModel
+from compensation.drift.evaluation import check_same
+from compensation.drift.terms import MOTIONS, Kind, Origin, features
+from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.training import frame_states
+from compensation.history.states import Float
+from compensation.observations import Mask, Observations
+from experiments.steps import Role
+from foundation.errors import SessionError
+
+_UNKNOWN_PX = 1.0
+_SAME_PLACE_PX = 10.0
+"""Further away a camera sees the target through another part of its lens."""
+
+
+def anchored(model: DriftModel, observations: Observations, frames: Mask | None = None) -> ThermalModel:
+    """The thermal form of the model, for this session: it takes points of it to where the model's first night has its
+    reference, as if nothing had been moved in between, with the uncertainty of that.
+
+    frames (F,): of the session, by default its REFERENCE frames; where they were taken in another thermal state than
+    the model's reference, that is taken into account. SessionError when the model has no thermal form, the session is
+    of another camera or target, there is more than one, no frame of a known thermal state is usable, or the target is
+    more than 10 px away.
+    """
+    thermal = thermal_of(model)
+    check_same(thermal, observations)
+    if observations.target.name != model.facts.target_name or len(observations.sessions) > 1:
+        raise SessionError(f"a model is anchored in one session of its target, {model.facts.target_name}")
+    wanted = observations.of(Role.REFERENCE) if frames is None else frames & observations.usable
+    states = frame_states(observations, thermal.memory)
+    origin = Origin(thermal.facts.reference_degC, thermal.reference_ambient_degC)
+    found = features(states, thermal.terms, origin) - thermal.reference_features
+    rows = _rows(thermal, observations, wanted & np.isfinite(found).all(axis=1))
+    if len(rows.frame) == 0:
+        raise SessionError("the session has no usable reference frames of a known thermal state to anchor a model in")
+    away_px = float(np.linalg.norm(rows.displacement_px.mean(axis=0)))
+    if away_px > _SAME_PLACE_PX:
+        raise SessionError(
+            f"the target is {away_px:.1f} px from where the model has it; put it back to {_SAME_PLACE_PX:g}"
+        )
+    return _updated(thermal, observations, rows, found)
+
+
+def thermal_of(model: DriftModel) -> ThermalModel:
+    """The thermal form of a model, which alone can be anchored; SessionError when it has none."""
+    for one in (model, model.other):
+        if isinstance(one, ThermalModel):
+            return one
+    raise SessionError("the model has no thermal form, which alone can be anchored in a session")
+
+
+def _updated(model: ThermalModel, observations: Observations, rows: Displacements, found: Float) -> ThermalModel:
+    """What forms leave unexplained, `discrepancy_px`, counts as noise of these frames, of all of them together."""
+    seen = condense_instants(observations, rows, found, np.zeros(len(found), bool))
+    if len(seen.amounts_px) == 0:
+        raise SessionError("the markers of the session's reference frames do not determine how the image has moved")
+    coefficients, covariance = model.coefficients.copy(), model.coefficient_covariance.copy()
+    constant = [term.kind is Kind.CONSTANT for term in model.terms].index(True)
+    covariance[:, constant, constant] += _UNKNOWN_PX**2
+    feature, told = seen.features.mean(axis=0), seen.amounts_px.mean(axis=0)
+    noise_px2 = seen.variance_px2.mean(axis=0) / len(seen.amounts_px)
+    noise_px2 += np.append(model.discrepancy_px**2, np.zeros(MOTIONS - 2))
+    for motion, own in enumerate(covariance):
+        toward = own @ feature
+        gain = toward / (feature @ toward + noise_px2[motion])
+        coefficients[motion] += gain * (told[motion] - feature @ coefficients[motion])
+        own -= np.outer(gain, toward)
+    return replace(model, coefficients=coefficients, coefficient_covariance=covariance, other=None)
+
+
+def _rows(model: ThermalModel, observations: Observations, frames: Mask) -> Displacements:
+    """The centres of these frames against where the model's first night had them at the reference."""
+    away = model.facts.reference_centres_px - observations.centres_px
+    frame, marker = np.nonzero(frames[:, None] & np.isfinite(away).all(axis=2))
+    variance: Float = np.diagonal(observations.covariance_px2, axis1=2, axis2=3)
+    return Displacements(
+        measured_px=observations.centres_px[frame, marker],
+        displacement_px=away[frame, marker],
+        variance_px2=variance[frame, marker],
+        camera_degC=observations.camera_degC[frame],
+        chamber_degC=observations.chamber_degC[frame],
+        frame=frame,
+        marker=marker,
+    )
