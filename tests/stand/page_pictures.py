@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import sys
 import tempfile
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 from PIL import Image
 
+from stand.serving.desk import Who
 from tests.stand.browser import PHONE, a_page, browser
 from tests.stand.page_desk import a_night, free_port
 
@@ -20,27 +22,33 @@ async def take(folder: Path) -> None:
     """Each in the view and the colours that show most."""
     port = free_port()
     with tempfile.TemporaryDirectory() as sessions:
-        async with a_night(Path(sessions) / "sessions", port, with_frames=True) as desk, browser() as chromium:
-            for name, view, size, scheme in (
-                ("page-now", "now", WIDE, "light"),
-                ("page-plan", "plan", (1280, 620), "dark"),
-                ("page-camera", "camera", WIDE, "dark"),
-                ("page-phone", "now", PHONE, "dark"),
-            ):
-                async with a_page(chromium, port, view, size, scheme) as page:
-                    await page.locator("#phase", has_text="Running").wait_for()
-                    if view == "now":
-                        await page.get_by_role("button", name="12 h").click()
-                        await page.get_by_text("markers found").wait_for()
-                    if view == "plan":
-                        await page.get_by_text("Soak").first.wait_for()
+        async with browser() as chromium, AsyncExitStack() as pages:
+            async with a_night(Path(sessions) / "sessions", port, with_frames=True) as desk:
+                for name, view, size, scheme in (
+                    ("page-now", "now", WIDE, "light"),
+                    ("page-plan", "plan", (1280, 620), "dark"),
+                    ("page-camera", "camera", WIDE, "dark"),
+                    ("page-phone", "now", PHONE, "dark"),
+                ):
+                    async with a_page(chromium, port, view, size, scheme) as page:
+                        await page.locator("#phase", has_text="Running").wait_for()
+                        if view == "now":
+                            await page.get_by_role("button", name="12 h").click()
+                            await page.get_by_text("markers found").wait_for()
+                        if view == "plan":
+                            await page.get_by_text("Soak").first.wait_for()
+                        await page.wait_for_timeout(2000)
+                        await page.screenshot(path=folder / f"{name}.png")
+                desk.trip()
+                async with a_page(chromium, port, "now", WIDE, "dark") as page:
+                    await page.get_by_role("button", name="Look at it and clear").click()
                     await page.wait_for_timeout(2000)
-                    await page.screenshot(path=folder / f"{name}.png")
-            desk.trip()
-            async with a_page(chromium, port, "now", WIDE, "dark") as page:
-                await page.get_by_role("button", name="Look at it and clear").click()
-                await page.wait_for_timeout(2000)
-                await page.screenshot(path=folder / "page-tripped.png")
+                    await page.screenshot(path=folder / "page-tripped.png")
+                desk.clear(Who(name="anna", how="loopback"))
+                lost = await pages.enter_async_context(a_page(chromium, port, "plan", PHONE, "dark"))
+                await lost.locator(".steps li", has_text="soak").first.wait_for()
+            await lost.get_by_text("No connection to the stand").wait_for()
+            await lost.screenshot(path=folder / "page-lost.png")
     for path in folder.glob("page-*.png"):
         Image.open(path).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 

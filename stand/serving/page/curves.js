@@ -84,7 +84,7 @@ export class Curves {
       scales: { x: { time: options.time !== false }, y: { range: options.range ?? padded } },
       axes: [
         { ...axis, show: options.axis !== false, size: 26, values: options.values ?? times, space: 70 },
-        { ...axis, size: 52, label: undefined, values: (_, ticks) => ticks.map((tick) => short(tick)) , space: options.space ?? 28 },
+        { ...axis, size: 52, label: undefined, values: (plot, ticks) => ticks.map((tick) => (plot.is_empty ? "" : short(tick))), space: options.space ?? 28 },
       ],
       series: [{}, ...series],
       bands,
@@ -217,7 +217,8 @@ function times(_, ticks, _axis, _space, step_s) {
 
 // At least half a unit high, so that noise does not fill the panel.
 function padded(plot, low, high) {
-  if (low === null || high === null) return [0, 1];
+  plot.is_empty = low === null || high === null; // an axis of nothing has no numbers
+  if (plot.is_empty) return [0, 1];
   const room = Math.max((high - low) * 0.08, 0.05), least = plot.series.length > 6 ? 2 : 0.02;
   const more = Math.max(0, least - (high - low)) / 2;
   return [low - room - more, high + room + more];

@@ -31,7 +31,7 @@ export class Notices {
     if (!key) return null;
     const made = { key, ...make() };
     this.parts[kind] = made;
-    this.place.append(made.element);
+    kind === "lost" ? this.place.prepend(made.element) : this.place.append(made.element); // all else is then of before
     return made;
   }
 
