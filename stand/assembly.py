@@ -136,7 +136,7 @@ class Assembly:
 
 
 def _obeyed(regulator: Controller) -> tuple[Watch, ...]:
-    """Of a regulator of our own: that what it heats by does what it is told."""
+    """Of a regulator of our own: that what it heats by obeys its command."""
     if not isinstance(regulator, SoftwareRegulator):
         return ()
     return (Watch(heat_uncontrolled(lambda: regulator.heat_uncontrolled), action="hold"),)

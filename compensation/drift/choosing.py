@@ -86,8 +86,8 @@ def _asked_on_the_way(observations: Observations, paper: PaperModel, thermal: Th
     asked = training(observations, thermal.terms, thermal.memory).moving_rows
     rows = displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
     found = moving_rms_px(left_out(rows, paper.degree, paper.scaling, asked))
-    told = tuple(one.model_copy(update={"moving_rms_px": found if one.chosen else None}) for one in paper.candidates)
-    return replace(paper, candidates=told)
+    scored = tuple(one.model_copy(update={"moving_rms_px": found if one.chosen else None}) for one in paper.candidates)
+    return replace(paper, candidates=scored)
 
 
 def better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:

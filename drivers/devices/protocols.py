@@ -80,7 +80,7 @@ class Switches(Sensor, Actuator, Protocol):
 
 class HeatOutput(Protocol):
     """By what a regulator of our own heats: pulses of a relay, or a current. Without us it ends by itself.
-    uncontrolled: why it may heat though it was told not to, "" while it obeys, and once it was confirmed `off`."""
+    uncontrolled: why it may heat though it was commanded off, "" while it obeys, and once it was confirmed `off`."""
 
     uncontrolled: str
 

@@ -34,10 +34,10 @@ RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 def read_identity(device: GigeDevice) -> Identity:
     """Vendor, model, serial number and version."""
     if device.is_gige:
-        told = [device.read_text(*register) for register in (VENDOR, MODEL, SERIAL, VERSION)]
+        stated = [device.read_text(*register) for register in (VENDOR, MODEL, SERIAL, VERSION)]
     else:
-        told = [device.get_string(each) if (each := _found(device, names)) else "" for names in words.IDENTITY]
-    vendor, model, serial_number, version = told
+        stated = [device.get_string(each) if (each := _found(device, names)) else "" for names in words.IDENTITY]
+    vendor, model, serial_number, version = stated
     return Identity(vendor, model, serial_number, version)
 
 

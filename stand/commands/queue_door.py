@@ -98,7 +98,7 @@ class FileDoor:
         return queue.add(self._directory, order, self._config, WallClock().now_ns()).id
 
     def _check_wires(self, config: StandConfig) -> None:
-        """SessionError for what keeps the run from beginning; that a stand is busy is told, and keeps it from nothing:
+        """SessionError for what keeps the run from beginning; that a stand is busy is shown, and keeps it from nothing:
         what is queued has its turn later."""
         try:
             lacks = asyncio.run(not_answering(config))

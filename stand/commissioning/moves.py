@@ -122,7 +122,7 @@ class Moves:
         end, also when an operator breaks the check off: it is then made safe with what moved."""
         stand = self._assembly.stand
         if not self._assembly.devices.cameras or self._assembly.devices.relays.name not in self._links.opened:
-            return  # there are none, or that their relay does not answer was told
+            return  # there are none, or that their relay does not answer was reported
         try:
             await self._supplied_cameras()
         finally:

@@ -85,7 +85,7 @@ class SoftwareRegulator:
 
     @property
     def heat_uncontrolled(self) -> str:
-        """Why what it heats by may give heat though it was told not to; "" while it obeys."""
+        """Why what it heats by may give heat though it was commanded off; "" while it obeys."""
         return self._heat.uncontrolled
 
     async def open(self) -> None:

@@ -167,7 +167,7 @@ def camera_before(session: Session) -> CameraBefore:
             lost = ""
     if any(mark.kind == "PowerCamera" and mark.time_ns > lost_ns for mark in session.steps()):
         lost = ""  # by the plan, which soaks it as it needs it
-    if CAMERA not in session.channels():  # a stand without a camera, or one that has told nothing yet
+    if CAMERA not in session.channels():  # a stand without a camera, or one that has reported nothing yet
         return CameraBefore(None, boot_id, lost)
     return CameraBefore(_last_word(session), boot_id, lost, settled_offsets(session))
 

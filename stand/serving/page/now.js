@@ -200,12 +200,12 @@ export class Now {
   }
 
   show_events(marks) {
-    const told = marks.filter((mark) => mark.level !== "step").slice(-100).reverse();
-    const key = told.map((mark) => mark.time_ns).join();
-    if (key === this.told) return;
-    this.told = key;
+    const listed = marks.filter((mark) => mark.level !== "step").slice(-100).reverse();
+    const key = listed.map((mark) => mark.time_ns).join();
+    if (key === this.listed) return;
+    this.listed = key;
     const glyph = { error: "▲", warning: "◆" };
-    fill(this.events, told.length ? told.map((mark) => h("li", { class: `level-${mark.level}` },
+    fill(this.events, listed.length ? listed.map((mark) => h("li", { class: `level-${mark.level}` },
       h("span", { class: "number" }, day_clock(seconds(mark.time_ns) + this.offset_s)), h("span", { "aria-label": mark.level }, glyph[mark.level] ?? "·"), h("span", {}, mark.text)))
       : h("li", {}, h("span"), h("span"), h("span", { class: "quiet" }, "nothing in the time shown")));
   }

@@ -10,7 +10,7 @@ export function arm(button, notices) {
     if (is_trying) return;
     is_trying = true;
     button.setAttribute("data-sent", "");
-    const told = notices.set("stop", String(Date.now()), () => {
+    const notice = notices.set("stop", String(Date.now()), () => {
       const text = h("p", {}, "stopping …");
       return { text, element: h("section", { class: "notice error", role: "alert" }, h("h2", {}, "STOP"), text) };
     });
@@ -18,10 +18,10 @@ export function arm(button, notices) {
       try {
         const answer = await fetch("/api/v1/run/stop", { method: "POST", keepalive: true, signal: AbortSignal.timeout(LIMIT_MS) });
         const body = await answer.json().catch(() => ({}));
-        if (answer.ok) { say(told.text, body.text || "The stand is being made safe."); break; }
-        say(told.text, `NOT STOPPED: ${body.error ?? answer.status}. Trying again; use the emergency stop at the stand.`);
+        if (answer.ok) { say(notice.text, body.text || "The stand is being made safe."); break; }
+        say(notice.text, `NOT STOPPED: ${body.error ?? answer.status}. Trying again; use the emergency stop at the stand.`);
       } catch {
-        say(told.text, `NOT STOPPED: the stand has not answered (${tries}). Trying again; use the emergency stop at the stand.`);
+        say(notice.text, `NOT STOPPED: the stand has not answered (${tries}). Trying again; use the emergency stop at the stand.`);
       }
       await new Promise((done) => setTimeout(done, AGAIN_MS));
     }
