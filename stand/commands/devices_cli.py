@@ -63,7 +63,9 @@ def _lines(
     lines += [f"  {each.vendor:04x}:{each.product:04x}  {each.what}{_numbered(each.serial)}" for each in usb]
     if not asked:
         return [*lines, "cameras: not asked for; `--ask ADDRESS` asks one, or a whole network at its broadcast address"]
-    lines.append("cameras" + ("" if cameras else f": none has answered at {', '.join(asked)}"))
+    lines.append(
+        "cameras" + ("" if cameras else f": none has answered at {', '.join(asked)} (without supply none does)")
+    )
     lines += [
         f"  {each.address}  {each.make} {each.model}, firmware {each.firmware}{_numbered(each.serial)}"
         for each in cameras

@@ -144,7 +144,7 @@ def _argument(text: str) -> tuple[str, object]:
     """`setpoint_degC=20`: a number, true or false where it is one, else a text."""
     name, is_given, value = text.partition("=")
     if not is_given or not name:
-        raise ConfigError(f"{text}: expected NAME=VALUE")
+        raise ConfigError(f"{text}: expected NAME=VALUE; `stand device` lists what each verb takes")
     try:
         found: object = json.loads(value)
     except ValueError:
