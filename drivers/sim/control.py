@@ -44,7 +44,9 @@ class Control:
             if not isinstance(request, dict):
                 raise ValueError(f"expected an object, got {line[:80]!r}")
             return self._perform({str(key): value for key, value in request.items()})
-        except (ValueError, KeyError, TypeError, ConfigError) as error:
+        except ConfigError as error:
+            return {"error": str(error)}
+        except (ValueError, KeyError, TypeError) as error:
             return {"error": f"{type(error).__name__}: {error}"}
 
     def _perform(self, request: dict[str, object]) -> dict[str, object]:
