@@ -286,6 +286,13 @@ def test_a_replay_prints_steps_and_events_as_they_come(session: Path, speed: str
     assert len(lines) == 3 * COUNT
 
 
+def test_a_replay_gives_programs_steps_and_events_one_a_line(session: Path):
+    told = [json.loads(line) for line in ask("replay", session, "--speed", "max", "--json").stdout.splitlines()]
+    assert len(told) == 3 * COUNT
+    assert [each["kind"] for each in told[:3]] == ["Capture", "Capture", "note"]
+    assert (told[0]["state"], told[2]["text"]) == ("started", "half second 0, 5 µm")
+
+
 @pytest.mark.parametrize("speed", ["0", "-1", "fast", "nan", "1e9", ""])
 def test_a_speed_is_a_number_or_max(session: Path, speed: str):
     assert "expected max or a number from 0.001 to 1000000" in refused("replay", session, f"--speed={speed}")

@@ -19,7 +19,7 @@ from foundation.exit_codes import FAILED, one_line_errors
 from foundation.hub import Hub
 from foundation.instants import parse_instant
 from foundation.items import Event, Item, StepMark
-from foundation.output import output, say, show
+from foundation.output import json_line, output, say, show
 from foundation.progress import Report, late_progress, progress
 from foundation.usage import one_line
 from recording.exporting.export import export
@@ -147,7 +147,8 @@ def replay_session(
     record: Annotated[Path | None, typer.Option(help="Record the replay as this new session.")] = None,
     incomplete: IncompleteOption = False,
 ) -> None:
-    """Publish a session again, at its own pace or faster; its steps and events are printed as they come.
+    """Publish a session again, at its own pace or faster; its steps and events are printed as they come, with --json
+    one a line, but for a replay that is recorded.
 
     Example: stand session replay sessions/20260101T180000Z-thermal-cycle --speed 60
     """
@@ -156,7 +157,7 @@ def replay_session(
         if record is not None:
             _check_new(record, directory)
         seen = glance(check_session(directory))
-        with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session) as watch:
+        with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session, record) as watch:
             if record is None:
                 asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
             else:
@@ -182,15 +183,19 @@ def _check_new(out: Path, session: Path) -> None:
 
 
 @contextmanager
-def _replay_progress(seen: Glance, session: Session) -> Generator[Callable[[Hub], None]]:
-    """Progress in seconds of the session; its steps and events as lines, in local time."""
+def _replay_progress(seen: Glance, session: Session, record: Path | None) -> Generator[Callable[[Hub], None]]:
+    """Progress in seconds of the session; its steps and events as lines, in local time or as JSON."""
     begin_ns, end_ns, utc = seen.begin_ns or 0, seen.end_ns or 0, session.utc
     with progress("replay", (end_ns - begin_ns) / NS_PER_S) as report:
 
         def follow(item: Item) -> None:
             at = utc.date_time(item.time_ns)
             report((item.time_ns - begin_ns) / NS_PER_S, at)
-            if output().quiet or output().as_json:
+            if output().as_json:
+                if record is None and isinstance(item, StepMark | Event):
+                    typer.echo(json_line(item))
+                return
+            if output().quiet:
                 return
             if isinstance(item, StepMark):
                 typer.echo(f"{at}  step {item.index + 1} {one_line(item.kind)} {item.state}")
