@@ -20,7 +20,8 @@ Float = NDArray[np.float64]
 STEP_S = 10
 CHIP, BODY, CELL, GLASS, MOUNT = range(5)
 REFERENCE_DEGC = 24.0
-_FOCAL_PX, _DISTANCE_MM, _PITCH_MM = 7246.0, 826.0, 30.0
+FOCAL_PX, RADIAL = 7246.0, -0.12
+_DISTANCE_MM, _PITCH_MM = 826.0, 30.0
 
 
 @dataclass(frozen=True)
@@ -227,23 +228,31 @@ def _fixings(camera: Camera, rng: np.random.Generator, count: int, changes: NDAr
     return np.stack([lagged(wanted[:, axis], 1200.0) for axis in (0, 1)], axis=1)
 
 
-def centres_px(camera: Camera, nodes: Float, moved: Float) -> Float:
-    """(K, 54, 2): where the 9 x 6 discs are seen, with temperatures (K, 5) and motions (K, 2)."""
+def target_mm(linear_mm: float = 0.0, rotary_deg: float = 0.0) -> Float:
+    """(54, 3): the 9 x 6 discs before the camera, further away by linear_mm, turned about the vertical."""
+    row, column = np.divmod(np.arange(54), 9)
+    along, up, turn = _PITCH_MM * (column - 4.0), -_PITCH_MM * (row - 2.5), np.radians(rotary_deg)
+    return np.stack([along * np.cos(turn), up, _DISTANCE_MM + linear_mm + along * np.sin(turn)], axis=1)
+
+
+def centres_px(camera: Camera, nodes: Float, moved: Float, place_mm: Float | None = None) -> Float:
+    """(K, 54, 2): where the discs are seen, with temperatures (K, 5) and motions (K, 2); place_mm (54, 3): where they
+    are, by default `target_mm()`."""
     away_K = nodes - settled_degC(camera, REFERENCE_DEGC)
     bent = away_K * (1 + camera.bend_per_K * away_K)
-    row, column = np.divmod(np.arange(54), 9)
-    world = np.stack([_PITCH_MM * (column - 4.0), -_PITCH_MM * (row - 2.5)], axis=1) / _DISTANCE_MM
+    place_mm = target_mm() if place_mm is None else place_mm
+    world = place_mm[:, :2] / place_mm[:, 2:]
     mount = away_K[:, MOUNT, None]
     turn = mount * camera.turn_per_K
     x = world[:, 0] + turn[:, 1:2] - turn[:, 2:3] * world[:, 1]
     y = world[:, 1] - turn[:, 0:1] + turn[:, 2:3] * world[:, 0]
     stretch = 1 + bent[:, CELL, None] * camera.scale_per_K[0] + bent[:, GLASS, None] * camera.scale_per_K[1]
-    radial = 1 + (-0.12 + camera.distortion_per_K * away_K[:, GLASS, None]) * (x**2 + y**2)
+    radial = 1 + (RADIAL + camera.distortion_per_K * away_K[:, GLASS, None]) * (x**2 + y**2)
     tilt = (away_K[:, BODY] - away_K[:, CELL] / 2)[:, None, None] * camera.tilt_per_K
     lean = 1 + tilt[:, :, 0] * x + tilt[:, :, 1] * y
     shift = bent[:, BODY, None] * camera.body_px_per_K + bent[:, CELL, None] * camera.cell_px_per_K + moved
-    i = _FOCAL_PX * stretch * radial * lean * x + 1223.5 + shift[:, 0:1]
-    j = _FOCAL_PX * stretch * radial * lean * y + 1023.5 + shift[:, 1:2]
+    i = FOCAL_PX * stretch * radial * lean * x + 1223.5 + shift[:, 0:1]
+    j = FOCAL_PX * stretch * radial * lean * y + 1023.5 + shift[:, 1:2]
     return np.stack([i, j], axis=2)
 
 

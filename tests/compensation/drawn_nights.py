@@ -117,8 +117,10 @@ def night(
     session_id: str = "night-1",
     noise_px: float = NOISE_PX,
     unrecorded: Sequence[Stretch] = (),
+    place_mm: Float | None = None,
 ) -> Night:
-    """One session of a camera that begins as cold as the chamber, or with what happened before and was not recorded."""
+    """One session of a camera that begins as cold as the chamber, or with what happened before and was not recorded.
+    place_mm (54, 3): of the target; else where it always is."""
     rng = np.random.default_rng([17, seed])
     plan = _Plan([*unrecorded, *parts])
     before = len(_Plan(unrecorded).powered)
@@ -130,7 +132,7 @@ def night(
     grid_s = np.asarray(STEP_S * (1.0 + np.arange(len(air))), np.float64)
     at_nodes = np.stack([np.interp(at_s, grid_s, node) for node in nodes.T], axis=1)
     at_moved = np.stack([np.interp(at_s, grid_s, axis) for axis in moved.T], axis=1)
-    truth = centres_px(camera, at_nodes, at_moved)
+    truth = centres_px(camera, at_nodes, at_moved, place_mm)
     seen = truth + noise_px * rng.standard_normal(truth.shape)
     for bump in bumps:
         seen[at_s >= 3600 * bump.after_h] += bump.shift_px

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from .drawn_cameras import ALL_EFFECTS, Camera, Float, centres_px, drawn_camera, nodes_degC, settled_degC
+from .drawn_cameras import ALL_EFFECTS, Camera, Float, centres_px, drawn_camera, nodes_degC, settled_degC, target_mm
 from .drawn_nights import cycle, full_night, night, reference, unseen_begin, warm_up
 
 STILL = np.zeros((1, 2))
@@ -74,3 +74,14 @@ def test_what_was_before_the_record_moves_the_image_and_is_not_in_the_history() 
     before_s = (unseen.observed.time_ns[0] - history.ambient_ns[0]) / 1e9
     assert before_s == pytest.approx(2700, abs=20)
     assert history.camera_degC[0] - history.ambient_degC[0] > 4
+
+
+def test_a_target_further_away_is_seen_smaller_and_a_turned_one_narrower() -> None:
+    camera = drawn_camera(3)
+    nodes = settled_degC(camera, 24.0)[None]
+    usual, far, turned = (
+        centres_px(camera, nodes, STILL, target_mm(*place))[0] for place in ((0.0, 0.0), (82.6, 0.0), (0.0, 60.0))
+    )
+    assert np.array_equal(usual, settled_px(camera, 24.0))
+    assert width_px(far) == pytest.approx(width_px(usual) / 1.1, rel=2e-3)  # distortion is the rest
+    assert width_px(turned) == pytest.approx(width_px(usual) / 2, rel=0.03)
