@@ -58,8 +58,10 @@ def _own_order(root: Path, workers: int) -> list[str]:
 
 
 def pytest_collection_finish() -> None:
-    """The garbage of the tests is collected, as of any program."""
+    """The garbage of the tests is collected, as of any program, but less often: they make many objects, few of them
+    rings."""
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
     gc.enable()
 
 

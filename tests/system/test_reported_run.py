@@ -1,4 +1,4 @@
-"""`stand run --report`: one command to a complete report, for a small recipe of every sequence and for the night."""
+"""`stand run --report`: one command to a complete report, for small recipes and for the night."""
 
 import os
 import shutil
@@ -22,15 +22,10 @@ from stand.running.session_report import MODEL_NAME, REPORT_NAME
 from tests import forked
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
-EVERY_SEQUENCE = """
-name: every-sequence
+NIGHT = """
+name: a-night
 experiments:
   - warm_up: {table_position: {linear: 0, rotary: 0}, frames: 3, interval_s: 60}
-  - calibration:
-      equilibrium_s: 120
-      linear_mm: [0, 30]
-      rotary_deg: [-5, 5]
-      frames_per_position: 1
   - thermal_cycle:
       table_position: {linear: 0, rotary: 0}
       equilibrium_s: 120
@@ -38,6 +33,15 @@ experiments:
       held_out_degC: [22]
       dwell_s: 120
       reference_frames: 2
+"""
+EVERY_SEQUENCE = (
+    NIGHT
+    + """
+  - calibration:
+      equilibrium_s: 120
+      linear_mm: [0, 30]
+      rotary_deg: [-5, 5]
+      frames_per_position: 1
   - validation:
       temperatures_degC: [24, 30]
       positions: [{linear_mm: 20, rotary_deg: 0}, {linear_mm: 25, rotary_deg: 4}]
@@ -46,6 +50,7 @@ experiments:
       reference_frames: 1
       frames_per_position: 1
 """
+)
 TOO_FEW_TEMPERATURES = """
 name: too-few
 experiments:
@@ -120,11 +125,18 @@ def check_reported(ended: subprocess.CompletedProcess[str]) -> Path:
 
 
 @pytest.mark.usefixtures("_aravis")
-def test_one_command_runs_every_sequence_to_a_report(out: Path, config_text: Callable[..., str]):
+@pytest.mark.parametrize(
+    ("text", "frames"),
+    [
+        pytest.param(NIGHT, 3 + 2 + 4, id="warm-up and cycle"),
+        pytest.param(EVERY_SEQUENCE, 3 + 2 + 4 + 4 + 2 * 3, id="every sequence", marks=pytest.mark.nightly),
+    ],
+)
+def test_one_command_runs_a_recipe_to_a_report(out: Path, config_text: Callable[..., str], text: str, frames: int):
     recipe = out.parent / "recipe.yaml"
-    recipe.write_text(EVERY_SEQUENCE)
+    recipe.write_text(text)
     directory = check_reported(run_reported(str(recipe), config_text(camera=WHOLE_SENSOR), out, 900))
-    assert Session.open(directory).frame_count == 3 + 4 + 2 + 4 + 2 * 3
+    assert Session.open(directory).frame_count == frames
 
 
 @pytest.mark.usefixtures("_aravis")
