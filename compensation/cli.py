@@ -19,6 +19,7 @@ app = lazy_app(
         "datasheet": Lazy(
             "compensation.commands.datasheet_cli", "Write a camera's thermal datasheet, with uncertainties."
         ),
+        "fit-like": Lazy("compensation.commands.like_cli", "Fit a new unit of a camera type to few frames."),
         "anchor": Lazy("compensation.commands.anchor_cli", "Fit a model to where the target is in a new session."),
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
         "export": Lazy(_APPLY, "Write the model for other programs: in Python with numpy only, in C, for ROS 2."),

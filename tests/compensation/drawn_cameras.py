@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 STEP_S = 10
+UNIT_SCATTER = 0.15
 CHIP, BODY, CELL, GLASS, MOUNT = range(5)
 REFERENCE_DEGC = 24.0
 FOCAL_PX, RADIAL = 7246.0, -0.12
@@ -121,6 +122,20 @@ def drawn_camera(seed: int, *effects: str) -> Camera:
         air_lag_s=rng.uniform(120, 600),
         air_share=rng.uniform(0.85, 1.0),
     )
+
+
+def drawn_unit(seed: int, number: int, *effects: str) -> Camera:
+    """A unit of the type that the camera of this seed is the middle of: each of its numbers 15 % off, one standard
+    deviation; of the heat flows all together, as the sizes of its parts are."""
+    rng, middle = np.random.default_rng([31, seed, number]), drawn_camera(seed, *effects)
+    quicker = 1 + UNIT_SCATTER * rng.standard_normal()
+    changed: dict[str, object] = {name: getattr(middle, name) * quicker for name in ("rates", "to_air", "heat_K_per_s")}
+    for field in fields(middle):
+        value = getattr(middle, field.name)
+        if field.name not in (*changed, "effects", "air_share"):
+            told = np.asarray(value) * (1 + UNIT_SCATTER * rng.standard_normal(np.shape(value)))
+            changed[field.name] = told if isinstance(value, np.ndarray) else tuple(told) if told.ndim else float(told)
+    return replace(middle, **changed)
 
 
 def _direction(rng: np.random.Generator) -> Float:

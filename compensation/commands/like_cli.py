@@ -1,0 +1,40 @@
+"""`compensate fit-like`: the drift of a new unit of a camera type, from few frames and the models of other units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from compensation.commands.options import CameraName, Finding
+from compensation.drift.anchoring import thermal_of
+from compensation.drift.model_file import load_model, save_model
+from compensation.drift.type_prior import fit_like as fit_like_units
+from foundation.command_app import App
+from foundation.exit_codes import one_line_errors
+from foundation.files import check_writable
+from foundation.output import show
+
+app = App()
+
+
+@app.command("fit-like")
+def fit_like(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Of the new unit, at two temperatures or more.")],
+    units: Annotated[list[Path], typer.Argument(metavar="MODEL...", help="Of three other units or more of its type.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
+    camera: CameraName = None,
+    *,
+    finding: Finding,
+) -> None:
+    """Fit the drift model of a new unit of a camera type to few frames, with what other units of the type have shown.
+
+    Example: compensate fit-like sessions/20260108T180000Z-short unit-1.json unit-2.json unit-3.json -o unit-4.json
+    """
+    with one_line_errors():
+        check_writable(out)
+        known = [thermal_of(load_model(path)) for path in units]
+        found = fit_like_units(finding.observed([session], camera), known)
+        save_model(found, out)
+        show({"model": out, "form": found.form, "title": found.title}, [f"{found.form}: {found.title}"])
