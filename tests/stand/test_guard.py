@@ -101,7 +101,7 @@ class Bench:
         watching = asyncio.create_task(self.guard.run())
         await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
         still = not watching.done()
-        await self.guard.told()
+        await self.guard.notified()
         for task in (watching, time):
             task.cancel()
         await asyncio.gather(watching, time, return_exceptions=True)
@@ -165,7 +165,7 @@ async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, sc
     time = asyncio.create_task(bench.clock.run())
     with pytest.raises(KeyError):
         await bench.guard.run()
-    await bench.guard.told()
+    await bench.guard.notified()
     time.cancel()
     assert bench.log == ["stop guard_failed", "revoke", "safe"]
     text = "the guard failed (KeyError: 'channel')"
@@ -424,7 +424,7 @@ async def test_a_run_that_is_taken_down_waits_until_somebody_was_told(tmp_path: 
         await asyncio.sleep(0)
     await asyncio.wait([watching])
     assert not told.exists()
-    await bench.guard.told()
+    await bench.guard.notified()
     assert told.exists()
     assert [event.kind for event in bench.events] == ["guard.rule0", "notify_failed"]
 
@@ -435,7 +435,7 @@ async def test_what_is_not_safe_is_told_with_the_trip(tmp_path: Path, script: Ca
     bench.actuator.failure = "no answer"
     bench.objecting = {0}
     assert not bench.guard.look()
-    await bench.guard.told()
+    await bench.guard.notified()
     unsafe = "relays did not confirm its safe state: relays: no answer"
     assert told.read_text() == f"it is so; NOT SAFE: {unsafe}"
     await bench.safety.close()
@@ -462,7 +462,7 @@ async def test_a_command_that_fails_is_an_event_and_no_more(script: Callable[[st
     bench = Bench("abort", command=(script("exit 7"),))
     bench.objecting = {0}
     assert not bench.guard.look()
-    await bench.guard.told()
+    await bench.guard.notified()
     assert [(event.level, event.kind) for event in bench.events[1:]] == [("warning", "notify_failed")]
     assert bench.events[1].text.endswith("notify ended with status 7")
 
