@@ -204,8 +204,11 @@ def answered(data: bytes | bytearray, kept: dict[str, object]) -> bytes:
     try:
         return _pickled(_answer(pickle.loads(data), kept))
     except Exception as error:  # noqa: BLE001 - as above
-        why = f"a call to another process failed ({type(error).__name__}: {error}); was the program replaced meanwhile?"
-        return _pickled(Answer(error=OSError(errno.EPROTO, why)))
+        return _pickled(Answer(error=OSError(errno.EPROTO, _garbled(error))))
+
+
+def _garbled(error: Exception) -> str:
+    return f"a call to another process failed ({type(error).__name__}: {error}); was the program replaced meanwhile?"
 
 
 def _pickled(message: Request | Answer) -> bytes:
@@ -273,7 +276,10 @@ class Line:
                 answer = None
         if answer is None:
             raise OSError(errno.EPIPE, self._ended)
-        found: Answer = pickle.loads(answer)
+        try:
+            found: Answer = pickle.loads(answer)
+        except Exception as error:
+            raise OSError(errno.EPROTO, _garbled(error)) from error
         if found.error is not None:
             raise found.error
         return found.result

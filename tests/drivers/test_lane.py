@@ -126,10 +126,18 @@ class Moved:
         return importlib.import_module, ("foundation.not_there",)
 
 
+def moved(_: object) -> Moved:
+    return Moved()
+
+
 @pytest.mark.parametrize(
     ("function", "argument", "why"),
-    [(len, Moved(), "ModuleNotFoundError"), (memoryview, b"x", "TypeError: cannot pickle")],
-    ids=["request", "result"],
+    [
+        (len, Moved(), "ModuleNotFoundError"),
+        (memoryview, b"x", "TypeError: cannot pickle"),
+        (moved, None, "ModuleNotFoundError"),
+    ],
+    ids=["request", "result", "answer"],
 )
 def test_what_cannot_be_handed_over_is_answered_and_the_line_lives(
     function: Callable[..., object], argument: object, why: str
