@@ -184,9 +184,9 @@ class _TcpClient(ModbusTcpClient):
             self.socket = socket.create_connection((peer.host, peer.port), timeout=timeout_s)
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self.socket.settimeout(None)
-            limit_s = struct.pack("@ll", int(timeout_s), round(timeout_s % 1 * 1e6))
+            limit = struct.pack("@ll", *divmod(max(1, round(timeout_s * 1e6)), 1_000_000))  # 0 would be for ever
             for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
-                self.socket.setsockopt(socket.SOL_SOCKET, option, limit_s)
+                self.socket.setsockopt(socket.SOL_SOCKET, option, limit)
         return True
 
     def recv(self, size: int | None) -> bytes:
