@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 
-from foundation.errors import ConfigError, Refused
+from foundation.errors import ConfigError, Refused, Unreachable
 from stand.assembly import Assembly
 from stand.serving.desk import Conflict, FaultRequest, SimulatedFaults
 from stand.simulator import ControlSocket
+
+_ANSWERS_S = 5.0
 
 
 async def simulated_faults(assembly: Assembly) -> SimulatedFaults:
@@ -37,7 +40,7 @@ async def break_or_mend(assembly: Assembly, request: FaultRequest) -> str:
 
 @asynccontextmanager
 async def _simulator(assembly: Assembly) -> AsyncGenerator[ControlSocket]:
-    """Virtual time stands still meanwhile."""
+    """Virtual time stands still meanwhile. Unreachable when the simulator does not answer."""
     simulation = assembly.config.simulation
     if simulation is None:
         raise Conflict(f"{assembly.config.name} is no simulated stand: nothing of it is broken on purpose")
@@ -45,6 +48,9 @@ async def _simulator(assembly: Assembly) -> AsyncGenerator[ControlSocket]:
     with assembly.clock.hold():
         await control.open()
         try:
-            yield control
+            async with asyncio.timeout(_ANSWERS_S):
+                yield control
+        except TimeoutError as error:
+            raise Unreachable("simulator", f"no answer within {_ANSWERS_S:g} s; is its process stopped?") from error
         finally:
             await control.close()
