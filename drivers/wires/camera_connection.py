@@ -35,6 +35,7 @@ from drivers.wires.camera_apply import (
 from drivers.wires.camera_errors import NO_CONTROL_HINT
 from drivers.wires.camera_settings import AravisCameraSettings, GigeCameraSettings, TemperatureFeature
 from drivers.wires.camera_temperature import NoTemperature, find_temperature, read_temperature, temperature_place
+from drivers.wires.frame_count import FrameCount
 from foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
 from foundation.errors import Refused
 from foundation.readings import Cause
@@ -62,28 +63,6 @@ FUTURE_NS = NS_PER_S
 TRANSFER_TIMEOUT_S = 2.0  # real seconds beyond the exposure: read-out, 5 MB on the wire, resends, a busy host
 VIRTUAL_TIMEOUT_S = 20.0  # in virtual time a host that is busy must not make another session: a frame may stop half way
 CONTROL_RETRY_S = 1.0
-FRAME_ID_WRAP = 65535  # 16-bit frame ids count 1..65535 and skip 0
-
-
-class FrameCount:
-    """Turns the camera's frame ids (from 1 at each start, mostly 16 bits) into one count that only rises."""
-
-    def __init__(self) -> None:
-        self.total = 0
-        self._last_id = 0
-
-    def restart(self) -> None:
-        """Ids start again with the next frame."""
-        self._last_id = 0
-
-    def advance(self, frame_id: int) -> int:
-        """Count up to this frame, those missing before it included; returns the total."""
-        step = frame_id - self._last_id
-        if step <= 0:
-            step += FRAME_ID_WRAP
-        self._last_id = frame_id
-        self.total += step
-        return self.total
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +109,6 @@ class Connection:
         self._stamped_ns = 0  # the last time stamp, on the camera's clock
         self._phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
         self._device = _open_controlled(name, settings)
-        self._first_id = 0 if self._device.is_gige else 1  # USB3 Vision counts from 0
         try:
             self._device.on_control_lost(self.control_lost.set)
             self.identity = read_identity(self._device)
@@ -170,7 +148,7 @@ class Connection:
         stream = self._device.create_stream()
         try:
             self._configure(stream)
-            self._frames.restart()
+            self._frames.restart(1 if self._device.is_gige else 0)
             self._latch()
             self._device.start_acquisition()
         except BaseException:
@@ -275,7 +253,7 @@ class Connection:
         stream = self._streaming()
         while (buffer := stream.pop(0)) is not None:
             self._counts["stale"] += 1
-            self._frames.advance(stream.info(buffer).frame_id + self._first_id)
+            self._frames.advance(stream.info(buffer).frame_id)
             stream.push(buffer)
 
     def _streaming(self) -> GigeStream:
@@ -302,7 +280,7 @@ class Connection:
                 image = self._image(stream, buffer, info)
             finally:
                 stream.push(buffer)
-            self._frames.advance(info.frame_id + self._first_id)
+            self._frames.advance(info.frame_id)
             if image is None:
                 break
             stamped_ns = self._stand_ns(info.timestamp_ns)

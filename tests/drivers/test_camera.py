@@ -11,9 +11,9 @@ import pytest
 
 from drivers.devices.cameras.camera_gige import Camera
 from drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
-from drivers.wires.camera_connection import FrameCount
 from drivers.wires.camera_errors import device_error
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
+from drivers.wires.frame_count import FrameCount
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
 from foundation.errors import DeviceError, Refused, Unreachable
 from foundation.readings import Quality

@@ -11,9 +11,10 @@ from collections.abc import Callable
 
 from drivers.framing.aravis_library import AravisError
 from drivers.settings import Identity
-from drivers.wires.camera_connection import Connection, FrameCount, Shot
+from drivers.wires.camera_connection import Connection, Shot
 from drivers.wires.camera_errors import device_error, lacks_control
 from drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
+from drivers.wires.frame_count import FrameCount
 from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
