@@ -279,15 +279,15 @@ async def test_lost_packets_are_asked_for_again_and_no_bit_differs(plant: WarmPl
 
 
 async def test_without_resend_a_frame_with_holes_is_never_used(plant: WarmPlant, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 2.0)  # what each of three frames is waited for
+    monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 4.0)  # what each of three frames is waited for
+    monkeypatch.setattr(camera_connection, "FRAME_RETENTION_PERIODS", 0.4)  # a busy machine hears of it in time
     async with virtual(plant) as (clock, fake):
         fake.faults.no_resend = True
         async with opened(clock, packet_size=1500) as camera:
             fake.faults.loss = 0.05
             with pytest.raises(Unreachable, match="3 software triggers brought no complete frame"):
                 await camera.grab()
-            counted = camera.counters()  # missed: this machine was too busy to hear that it was given up
-            assert sum(each for name, each in counted.items() if name.startswith(("incomplete_", "missed"))) == 3
+            assert sum(count for name, count in camera.counters().items() if name.startswith("incomplete_")) == 3
             fake.faults.loss = 0.0
             await camera.open()
             frame = await camera.grab()
