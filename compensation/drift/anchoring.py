@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from compensation.drift.condensed import condense_instants
-from compensation.drift.displacements import Displacements
+from compensation.drift.displacements import Displacements, displacements_from
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import check_same
 from compensation.drift.terms import MOTIONS, Kind, Origin, features
@@ -46,7 +46,9 @@ def anchored(model: DriftModel, observations: Observations, frames: Mask | None 
     states = frame_states(observations, thermal.memory)
     origin = Origin(thermal.facts.reference_degC, thermal.reference_ambient_degC)
     found = features(states, thermal.terms, origin) - thermal.reference_features
-    rows = _rows(thermal, observations, wanted & np.isfinite(found).all(axis=1))
+    # Against where the model's first night had them at the reference.
+    known = wanted & np.isfinite(found).all(axis=1)
+    rows = displacements_from(observations, known, thermal.facts.reference_centres_px)
     if len(rows.frame) == 0:
         raise SessionError("the session has no usable reference frames of a known thermal state to anchor a model in")
     away_px = float(np.linalg.norm(rows.displacement_px.mean(axis=0)))
@@ -73,28 +75,12 @@ def _updated(model: ThermalModel, observations: Observations, rows: Displacement
     coefficients, covariance = model.coefficients.copy(), model.coefficient_covariance.copy()
     constant = [term.kind is Kind.CONSTANT for term in model.terms].index(True)
     covariance[:, constant, constant] += _UNKNOWN_PX**2
-    feature, told = seen.features.mean(axis=0), seen.amounts_px.mean(axis=0)
+    feature, seen_px = seen.features.mean(axis=0), seen.amounts_px.mean(axis=0)
     noise_px2 = seen.variance_px2.mean(axis=0) / len(seen.amounts_px)
     noise_px2 += np.append(model.discrepancy_px**2, np.zeros(MOTIONS - 2))
     for motion, own in enumerate(covariance):
         toward = own @ feature
         gain = toward / (feature @ toward + noise_px2[motion])
-        coefficients[motion] += gain * (told[motion] - feature @ coefficients[motion])
+        coefficients[motion] += gain * (seen_px[motion] - feature @ coefficients[motion])
         own -= np.outer(gain, toward)
     return replace(model, coefficients=coefficients, coefficient_covariance=covariance, other=None)
-
-
-def _rows(model: ThermalModel, observations: Observations, frames: Mask) -> Displacements:
-    """The centres of these frames against where the model's first night had them at the reference."""
-    away = model.facts.reference_centres_px - observations.centres_px
-    frame, marker = np.nonzero(frames[:, None] & np.isfinite(away).all(axis=2))
-    variance: Float = np.diagonal(observations.covariance_px2, axis1=2, axis2=3)
-    return Displacements(
-        measured_px=observations.centres_px[frame, marker],
-        displacement_px=away[frame, marker],
-        variance_px2=variance[frame, marker],
-        camera_degC=observations.camera_degC[frame],
-        chamber_degC=observations.chamber_degC[frame],
-        frame=frame,
-        marker=marker,
-    )

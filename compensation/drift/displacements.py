@@ -87,14 +87,21 @@ def displacements(observations: Observations, frames: Mask, against: Mask | None
         if not np.isfinite(centres[index]).any():
             name = observations.sessions[index].session_id
             raise SessionError(f"session {name} has no usable reference frames to measure the drift against")
-    reference = centres[observations.session]
-    displacement = reference - observations.centres_px
+    return displacements_from(observations, frames, centres[observations.session], variance[observations.session])
+
+
+def displacements_from(
+    observations: Observations, frames: Mask, reference_px: Float, reference_px2: Float | float = 0.0
+) -> Displacements:
+    """The measured centres of `frames` (F,) against references, (F, N, 2) or (N, 2) for all, and their variances;
+    markers without either are left out."""
+    displacement = reference_px - observations.centres_px
     frame, marker = np.nonzero(frames[:, None] & np.isfinite(displacement).all(axis=2))
-    total = _variance_px2(observations) + variance[observations.session]
+    variance = _variance_px2(observations) + reference_px2
     return Displacements(
         measured_px=observations.centres_px[frame, marker],
         displacement_px=displacement[frame, marker],
-        variance_px2=total[frame, marker],
+        variance_px2=variance[frame, marker],
         camera_degC=observations.camera_degC[frame],
         chamber_degC=observations.chamber_degC[frame],
         frame=frame,
