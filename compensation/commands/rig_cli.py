@@ -78,11 +78,7 @@ def calibrate_rig_command(
         useful = np.any([views.seen.sum(axis=1) >= LEAST_MARKERS for views in seen], axis=0)
         cameras = [views.part(useful) for views in seen]
         found = calibrate_rig(cameras, board_of(board) if isinstance(board, Target) else board_of_corners(board))
-        data = _data(found, folders)
-        make_folder(export)
-        write_whole(export / RIG, json.dumps(data, indent=1) + "\n")
-        for number, folder in enumerate(folders):
-            write_exports(export / folder.name, found.scene.lenses[number], folder.name, found.rms_px(number))
+        data = _written(found, folders, export)
         lines = [
             f"{np.count_nonzero(useful)} moments, {len(folders)} cameras",
             *_lines(found, folders),
@@ -144,6 +140,16 @@ def _seen(
     if size is None:
         raise CalibrationError(f"{folder}: the target is in none of the pictures")
     return Views(centres, covariances, size)
+
+
+def _written(found: RigCalibration, folders: list[Path], export: Path) -> list[dict[str, object]]:
+    """Write rig.json and each camera's files; what rig.json says."""
+    data = _data(found, folders)
+    make_folder(export)
+    write_whole(export / RIG, json.dumps(data, indent=1) + "\n")
+    for number, folder in enumerate(folders):
+        write_exports(export / folder.name, found.scene.lenses[number], folder.name, found.rms_px(number))
+    return data
 
 
 def _data(found: RigCalibration, folders: list[Path]) -> list[dict[str, object]]:

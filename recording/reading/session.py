@@ -60,10 +60,10 @@ from recording.reading.frames_table import FramesTable, frames_table
 from recording.reading.hole_finder import find_holes
 from recording.reading.journal_lines import journal_facts
 from recording.reading.run_word import Run, run_word
+from recording.reading.segment_files import number_of, segments_in, segments_of
 
 T = TypeVar("T")
 _TOPICS_OF_HOLES = (messages.CAMERA_META, messages.EVENT, messages.STEP)
-_NUMBER_DIGITS = 18
 
 
 class Session:
@@ -75,8 +75,8 @@ class Session:
 
     def __init__(self, path: Path, telemetry: list[Path], frames: list[Path]) -> None:
         self.path = path
-        self.incomplete = _files_of(path, UNFINISHED)
-        self.damaged = _files_of(path, DAMAGED)
+        self.incomplete = segments_of(path, UNFINISHED)
+        self.damaged = segments_of(path, DAMAGED)
         self._telemetry = telemetry
         self._frames = frames
         head = read_head(telemetry[0])
@@ -98,9 +98,9 @@ class Session:
     def open(cls, path: Path | str) -> Session:
         """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
         path = Path(path)
-        telemetry, frames = (_segments(path / name, FINISHED) for name in (TELEMETRY, FRAMES))
+        telemetry, frames = (segments_in(path / name, FINISHED) for name in (TELEMETRY, FRAMES))
         if not telemetry:
-            count = len(_files_of(path, UNFINISHED))
+            count = len(segments_of(path, UNFINISHED))
             unfinished = f", only {count} unfinished ones" if count else ""
             raise SessionError(f"{path}: not a session: there is no finished segment in {path / TELEMETRY}{unfinished}")
         return cls(path, telemetry, frames)
@@ -342,7 +342,7 @@ class Session:
         span = message_span(segment)
         return Link(
             segment.parent.name,
-            _number(segment),
+            number_of(segment),
             span.count,
             span.first_ns,
             span.last_ns,
@@ -373,7 +373,7 @@ class Session:
             raise _Unreadable(str(error)) from error
         if head.session != self.metadata:
             raise SessionError(f"{segment}: belongs to another session than {self._telemetry[0]}; move it away")
-        if head.place and misplaced(segment.parent.name, _number(segment), head.place, head.session):
+        if head.place and misplaced(segment.parent.name, number_of(segment), head.place, head.session):
             where = f"{head.place.get('series')}/{head.place.get('number')}{FINISHED}"
             raise SessionError(f"{segment}: was recorded as {where}; give it that name again, or move it away")
         self._salvaged[segment] = bool(head.salvaged)
@@ -381,21 +381,3 @@ class Session:
 
 class _Unreadable(FileDamaged):
     """The head of a segment cannot be read."""
-
-
-def _number(segment: Path) -> int:
-    digits = segment.name.partition(".")[0]
-    return int(digits) if digits.isdecimal() and len(digits) <= _NUMBER_DIGITS else -1
-
-
-def _files_of(path: Path, suffix: str) -> tuple[Path, ...]:
-    return (*_segments(path / TELEMETRY, suffix), *_segments(path / FRAMES, suffix))
-
-
-def _segments(folder: Path, suffix: str) -> list[Path]:
-    """The files in `folder` that end so, in order of their numbers; none when there is no such folder."""
-    try:
-        paths = [path for path in folder.iterdir() if path.name.endswith(suffix)]
-    except OSError:
-        return []
-    return sorted(paths, key=lambda path: (len(path.name), path.name))

@@ -6,7 +6,7 @@ import asyncio
 import itertools
 import shutil
 import tempfile
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -95,16 +95,10 @@ def run(
     """
     with _run_errors():
         if url:
-            here = {"--virtual-time": virtual_time, "--seed": seed, "--out": out, "--report": report}
-            if given := next((name for name, value in here.items() if not (value is None or value is False)), ""):
-                raise ConfigError(f"{given} is for a run of this machine; leave it out, or --url")
-            server = server_at(url, token_file)
-            _follow(server, submit_recipe(server, recipe, attended=attended), detach=detach, report=False)
-            return
-        if seed is not None and not virtual_time:
-            raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
-        if seed is not None and seed < 0:
-            raise ConfigError(f"--seed is 0 or more, not {seed}")
+            _check_elsewhere({"--virtual-time": virtual_time, "--seed": seed, "--out": out, "--report": report})
+            there = server_at(url, token_file)
+            return _follow(there, submit_recipe(there, recipe, attended=attended), detach=detach, report=False)
+        _check_seed(seed, virtual_time=virtual_time)
         order = replace(load_order(recipe, config), attended=attended)
         if report:
             check_reportable(order.recipe.plan())
@@ -112,8 +106,7 @@ def run(
             path = packaged("", config)
             warn_unchecked(path, order.config, load_checked(path))
         if not virtual_time and (server := daemon_of(order.config)) is not None:
-            _follow(server, submit(server, order, out), detach=detach, report=report)
-            return
+            return _follow(server, submit(server, order, out), detach=detach, report=report)
         if detach:
             raise ConfigError("--detach: no `stand serve` has this stand, and a run by itself ends with its command")
         directory = out or order.config.recording.directory
@@ -125,6 +118,19 @@ def run(
             work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
             session = asyncio.run(work)
         _finished(session, order.config, report=report)
+
+
+def _check_elsewhere(given: Mapping[str, object]) -> None:
+    """ConfigError when an option is given that a run at a stand elsewhere has no use for."""
+    if name := next((name for name, value in given.items() if not (value is None or value is False)), ""):
+        raise ConfigError(f"{name} is for a run of this machine; leave it out, or --url")
+
+
+def _check_seed(seed: int | None, *, virtual_time: bool) -> None:
+    if seed is not None and not virtual_time:
+        raise ConfigError("--seed belongs to --virtual-time; a running laboratory has its own seed")
+    if seed is not None and seed < 0:
+        raise ConfigError(f"--seed is 0 or more, not {seed}")
 
 
 @app.command("resume")

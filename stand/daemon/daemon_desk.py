@@ -14,6 +14,7 @@ from stand.gate import INTERLOCK
 from stand.running.run_desk import RunDesk
 from stand.running.said import Said, keep
 from stand.running.simulated_faults import break_or_mend, simulated_faults
+from stand.serving.command_event import command_event
 from stand.serving.desk import (
     Conflict,
     DeviceState,
@@ -29,7 +30,6 @@ from stand.serving.desk import (
     When,
     Who,
     WrittenStep,
-    command_event,
 )
 from stand.serving.seen import seen_state
 

@@ -24,6 +24,7 @@ from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
 from stand.running.said import Said, keep
 from stand.running.simulated_faults import break_or_mend, simulated_faults
 from stand.running.status import STATES
+from stand.serving.command_event import command_event
 from stand.serving.desk import (
     Conflict,
     DeviceState,
@@ -43,7 +44,6 @@ from stand.serving.desk import (
     When,
     Who,
     WrittenStep,
-    command_event,
 )
 from stand.serving.seen import seen_state
 

@@ -14,11 +14,8 @@ from typing import Literal, Protocol
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from foundation.errors import StandError
-from foundation.items import Event
 from foundation.readings import Cause, Quality
 from recording.reading.notes import LONGEST_NOTE
-
-COMMAND = "command"  # the kind of the event that each command is
 
 # Verbs of a command's event, in the words of the interface.
 Verb = Literal[
@@ -308,7 +305,7 @@ class Desk(Protocol):
     """What can be asked of a stand. All of it is called on the control loop and returns quickly: no method waits for a
     wire, and what waits for a disk is `async` and stands in nobody's way.
 
-    Each command publishes an event of kind COMMAND (`command_event`) and then does what it says, or raises Conflict
+    Each command publishes an event of kind COMMAND (command_event.py) and then does what it says, or raises Conflict
     when the state forbids it, Missing, or ConfigError when the request itself is wrong. `stop` never raises.
     """
 
@@ -385,25 +382,3 @@ class Desk(Protocol):
         """Break something of a simulated laboratory, or mend it, in a run as well; Conflict when the stand is a real
         one."""
         ...
-
-
-def command_event(
-    time_ns: int, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], result: str = "done"
-) -> Event:
-    """What the recording keeps of a command: who, how, what, and what came of it."""
-    by = who.name or "somebody"
-    data = {"who": who.name, "how": who.how, "verb": verb, "arguments": dict(arguments), "result": result}
-    ending = "" if result == "done" else f": {result}"
-    return Event(time_ns, "info", COMMAND, f"{by} ({who.how}): {_in_words(verb, arguments)}{ending}", data)
-
-
-def _in_words(verb: Verb, arguments: Mapping[str, JsonValue]) -> str:
-    """`pause`, `skip step_id=0-soak`, `flap open`, `linear move position=12.0`."""
-    given = arguments.get("arguments")
-    if verb == "device" and isinstance(given, Mapping):
-        return " ".join([str(arguments.get("device")), str(arguments.get("verb")), *_pairs(given)])
-    return " ".join([verb, *_pairs({name: value for name, value in arguments.items() if name != "key"})])
-
-
-def _pairs(arguments: Mapping[str, JsonValue]) -> list[str]:
-    return [f"{name}={value}" for name, value in arguments.items() if value not in ("", [], None)]

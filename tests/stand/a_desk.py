@@ -17,6 +17,7 @@ from foundation.readings import Reading, bad_reading
 from stand.gate import INTERLOCK, OPERATOR, Gate
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve
+from stand.serving.command_event import command_event
 from stand.serving.desk import (
     Conflict,
     DeviceState,
@@ -35,7 +36,6 @@ from stand.serving.desk import (
     When,
     Who,
     WrittenStep,
-    command_event,
 )
 
 STAND = "a stand"

@@ -23,7 +23,8 @@ from foundation.hub import Hub
 from foundation.items import Event, Item, Original, StepMark
 from foundation.readings import Frame
 from foundation.tasks import failure_text
-from stand.serving.desk import COMMAND, Desk, Done, PlanStep, StandState, Who
+from stand.serving.command_event import COMMAND
+from stand.serving.desk import Desk, Done, PlanStep, StandState, Who
 
 _REFRESH_S = 0.5
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
