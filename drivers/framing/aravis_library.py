@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from foundation.errors import StandError
@@ -134,49 +134,45 @@ def load(sonames: tuple[str, ...], debian_package: str) -> ctypes.CDLL:
     raise StandError(f"{sonames[0]} cannot be loaded; on Debian or Ubuntu: apt-get install {debian_package}")
 
 
-class Library:
-    """The loaded functions; `call` raises what a function reported."""
+Functions = Mapping[str, Callable[..., Any]]
+"""By name, as ctypes has them; what a function reports as GError is raised as AravisError.
 
-    def __init__(self) -> None:
-        self._functions: dict[str, Callable[..., Any]] = {}
-        self._reporting: set[str] = set()
-        self._declare(load(ARAVIS_SONAMES, "libaravis-0.8-0"), ARAVIS_FUNCTIONS)
-        self._declare(load(("libgobject-2.0.so.0",), "libglib2.0-0"), GOBJECT_FUNCTIONS)
-        self._declare(load(("libglib-2.0.so.0",), "libglib2.0-0"), GLIB_FUNCTIONS)
+A function may return a value and report an error: the error decides.
+"""
 
-    def _declare(self, library: ctypes.CDLL, signatures: dict[str, str]) -> None:
-        for name, signature in signatures.items():
-            result, _, arguments = signature.partition(" ")
-            function = getattr(library, name)
-            function.restype = C_TYPES[result]
-            function.argtypes = [C_TYPES[letter] for letter in arguments]
-            self._functions[name] = function
-            if arguments.endswith("E"):
-                self._reporting.add(name)
 
-    def call(self, name: str, *arguments: object) -> Any:
-        """The function's result (its type is in the tables above); AravisError when it reported one.
+def _declared(library: ctypes.CDLL, signatures: dict[str, str]) -> Iterator[tuple[str, Callable[..., Any]]]:
+    for name, signature in signatures.items():
+        result, _, arguments = signature.partition(" ")
+        function = getattr(library, name)
+        function.restype = C_TYPES[result]
+        function.argtypes = [C_TYPES[letter] for letter in arguments]
+        yield name, function
 
-        A function may return a value and report an error: the error decides.
-        """
-        if name not in self._reporting:
-            return self._functions[name](*arguments)
+
+def _raising(function: Callable[..., Any], glib: Functions) -> Callable[..., Any]:
+    """`function` with its GError, which is its last argument, raised and freed."""
+
+    def call(*arguments: object) -> Any:
         reported = ctypes.POINTER(_GError)()
-        result = self._functions[name](*arguments, ctypes.byref(reported))
-        if reported:
-            raise self._error(reported)
-        return result
-
-    def _error(self, reported: Any) -> AravisError:
-        """The GError as an exception; frees it."""
-        domain = self.call("g_quark_to_string", reported.contents.domain) or b""
+        result = function(*arguments, ctypes.byref(reported))
+        if not reported:
+            return result
+        domain = glib["g_quark_to_string"](reported.contents.domain) or b""
         message = reported.contents.message or b"no message"
         error = AravisError(domain.decode(), reported.contents.code, message.decode(errors="replace"))
-        self.call("g_error_free", reported)
-        return error
+        glib["g_error_free"](reported)
+        raise error
+
+    return call
 
 
 @functools.cache
-def library() -> Library:
-    """The libraries, loaded once; StandError names the package of a missing one."""
-    return Library()
+def library() -> Functions:
+    """Aravis, GObject and GLib, loaded once; StandError names the package of a missing one."""
+    glib = dict(_declared(load(("libglib-2.0.so.0",), "libglib2.0-0"), GLIB_FUNCTIONS))
+    gobject = _declared(load(("libgobject-2.0.so.0",), "libglib2.0-0"), GOBJECT_FUNCTIONS)
+    aravis = _declared(load(ARAVIS_SONAMES, "libaravis-0.8-0"), ARAVIS_FUNCTIONS)
+    reporting = {name for name, signature in ARAVIS_FUNCTIONS.items() if signature.endswith("E")}
+    calls = {name: _raising(function, glib) if name in reporting else function for name, function in aravis}
+    return {**calls, **dict(gobject), **glib}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.framing.aravis_library import Library, library
+from drivers.framing.aravis_library import Functions, library
 from drivers.wires.camera_settings import BITS_PER_PIXEL, PixelFormat, frame_bytes
 
 PACKET_SOCKET_DISABLED = 1  # ArvGvStreamOption: else root would get AF_PACKET and everyone else a UDP socket
@@ -70,25 +70,25 @@ class GigeDevice:
 
     def __init__(self, address: str) -> None:
         self._library = library()
-        self._camera = self._library.call("arv_camera_new", address.encode())
-        self._device = self._library.call("arv_camera_get_device", self._camera)  # borrowed: never unref
-        self.is_gige = bool(self._library.call("arv_camera_is_gv_device", self._camera))
+        self._camera = self._library["arv_camera_new"](address.encode())
+        self._device = self._library["arv_camera_get_device"](self._camera)  # borrowed: never unref
+        self.is_gige = bool(self._library["arv_camera_is_gv_device"](self._camera))
         if self.is_gige:
-            self._library.call("arv_camera_gv_set_stream_options", self._camera, PACKET_SOCKET_DISABLED)
+            self._library["arv_camera_gv_set_stream_options"](self._camera, PACKET_SOCKET_DISABLED)
         self._callback: Any = None
         self._handler = 0
 
     def _call(self, function: str, *arguments: object) -> Any:
         if not self._camera:
             raise ValueError("the device is closed")
-        return self._library.call(function, self._camera, *arguments)
+        return self._library[function](self._camera, *arguments)
 
     def close(self) -> None:
         """Let go of the camera; up to 7.5 s when it is dead. May be called twice. Close its stream first."""
         if self._camera:
             if self._handler:
-                self._library.call("g_signal_handler_disconnect", self._device, self._handler)
-            self._library.call("g_object_unref", self._camera)  # joins the heartbeat thread: no callback after this
+                self._library["g_signal_handler_disconnect"](self._device, self._handler)
+            self._library["g_object_unref"](self._camera)  # joins the heartbeat thread: no callback after this
             self._camera = None
 
     def on_control_lost(self, notify: Callable[[], object]) -> None:
@@ -99,26 +99,24 @@ class GigeDevice:
 
         self._callback = CONTROL_LOST_CALLBACK(lost)  # kept, or the signal would call freed memory
         pointer = ctypes.cast(self._callback, ctypes.c_void_p)
-        self._handler = self._library.call(
-            "g_signal_connect_data", self._device, b"control-lost", pointer, None, None, 0
-        )
+        self._handler = self._library["g_signal_connect_data"](self._device, b"control-lost", pointer, None, None, 0)
 
     def is_controller(self) -> bool:
         """Whether we may write."""
-        return not self.is_gige or bool(self._library.call("arv_gv_device_is_controller", self._device))
+        return not self.is_gige or bool(self._library["arv_gv_device_is_controller"](self._device))
 
     def kind(self, feature: str) -> str:
         """The GenICam kind of a feature ("Float", "Command", "IntReg", ...); "" when the camera has none."""
-        node = self._library.call("arv_device_get_feature", self._device, feature.encode())
-        kind = (self._library.call("arv_dom_node_get_node_name", node) or b"").decode() if node else ""
+        node = self._library["arv_device_get_feature"](self._device, feature.encode())
+        kind = (self._library["arv_dom_node_get_node_name"](node) or b"").decode() if node else ""
         return "" if kind == "Category" else kind
 
     def available(self, feature: str) -> bool:
         """Whether the camera has the feature and offers it now."""
         if not self.kind(feature):
             return False
-        node = self._library.call("arv_device_get_feature", self._device, feature.encode())
-        return bool(self._library.call("arv_gc_feature_node_is_implemented", node)) and bool(
+        node = self._library["arv_device_get_feature"](self._device, feature.encode())
+        return bool(self._library["arv_gc_feature_node_is_implemented"](node)) and bool(
             self._call("arv_camera_is_feature_available", feature.encode())
         )
 
@@ -148,10 +146,10 @@ class GigeDevice:
 
     def unit(self, feature: str) -> str:
         """The unit that the camera states for an Integer or Float feature; "" when it states none."""
-        node = self._library.call("arv_device_get_feature", self._device, feature.encode())
+        node = self._library["arv_device_get_feature"](self._device, feature.encode())
         is_float = self.kind(feature) in FLOAT_KINDS
         get = "arv_gc_float_get_unit" if is_float else "arv_gc_integer_get_unit"
-        return (self._library.call(get, node) or b"").decode(errors="replace").strip()
+        return (self._library[get](node) or b"").decode(errors="replace").strip()
 
     def get_string(self, feature: str) -> str:
         """A String or Enumeration feature."""
@@ -169,7 +167,7 @@ class GigeDevice:
             found = ctypes.cast(names, ctypes.POINTER(ctypes.c_char_p))
             return tuple((found[index] or b"").decode(errors="replace") for index in range(count.value))
         finally:
-            self._library.call("g_free", names)  # the array; the names are the feature's own
+            self._library["g_free"](names)  # the array; the names are the feature's own
 
     def set_boolean(self, feature: str, value: bool) -> None:
         """Write a Boolean feature."""
@@ -207,17 +205,17 @@ class GigeDevice:
     def read_register(self, address: int) -> int:
         """A 32-bit register."""
         value = ctypes.c_uint()
-        self._library.call("arv_device_read_register", self._device, address, ctypes.byref(value))
+        self._library["arv_device_read_register"](self._device, address, ctypes.byref(value))
         return value.value
 
     def write_register(self, address: int, value: int) -> None:
         """Write a 32-bit register."""
-        self._library.call("arv_device_write_register", self._device, address, value)
+        self._library["arv_device_write_register"](self._device, address, value)
 
     def read_text(self, address: int, size: int) -> str:
         """A NUL-padded string of the bootstrap registers; `size` is a multiple of 4."""
         memory = ctypes.create_string_buffer(size)
-        self._library.call("arv_device_read_memory", self._device, address, size, memory)
+        self._library["arv_device_read_memory"](self._device, address, size, memory)
         return memory.raw.split(b"\0")[0].decode(errors="replace")
 
 
@@ -225,20 +223,20 @@ class GigeStream:
     """One receiver. Never stop and start acquisition on the same one: frame numbers restart at 1 and it would throw
     everything away until they pass the old last one."""
 
-    def __init__(self, library: Library, stream: int) -> None:
+    def __init__(self, library: Functions, stream: int) -> None:
         self._library = library
         self._stream: int | None = stream
 
     def close(self) -> None:
         """End the receiving thread and free the buffers; may be called twice."""
         if self._stream:
-            self._library.call("g_object_unref", self._stream)
+            self._library["g_object_unref"](self._stream)
             self._stream = None
 
     def _call(self, function: str, *arguments: object) -> Any:
         if not self._stream:
             raise ValueError("the stream is closed")
-        return self._library.call(function, self._stream, *arguments)
+        return self._library[function](self._stream, *arguments)
 
     def set_property(self, name: str, value: int | float, g_type: int) -> None:
         """Set a GObject property; an enumeration takes G_TYPE_INT.
@@ -247,13 +245,13 @@ class GigeStream:
         """
         setter = {G_TYPE_INT: "g_value_set_int", G_TYPE_UINT: "g_value_set_uint", G_TYPE_DOUBLE: "g_value_set_double"}
         box = _GValue()
-        self._library.call("g_value_init", ctypes.byref(box), g_type)
-        self._library.call(setter[g_type], ctypes.byref(box), value)
+        self._library["g_value_init"](ctypes.byref(box), g_type)
+        self._library[setter[g_type]](ctypes.byref(box), value)
         self._call("g_object_set_property", name.encode(), ctypes.byref(box))
 
     def add_buffer(self, size: int) -> None:
         """Give it one more buffer of `size` bytes."""
-        self._call("arv_stream_push_buffer", self._library.call("arv_buffer_new_allocate", size))
+        self._call("arv_stream_push_buffer", self._library["arv_buffer_new_allocate"](size))
 
     def pop(self, timeout_s: float) -> int | None:
         """The oldest finished buffer, complete or not, or None after `timeout_s`; must be pushed back."""
@@ -267,22 +265,22 @@ class GigeStream:
 
     def info(self, buffer: int) -> BufferInfo:
         """What the buffer says of itself; sizes are 0 unless it is complete."""
-        get = self._library.call
-        status = int(get("arv_buffer_get_status", buffer))
+        get = self._library
+        status = int(get["arv_buffer_get_status"](buffer))
         complete = status == BUFFER_SUCCESS
         return BufferInfo(
             status=status,
-            frame_id=int(get("arv_buffer_get_frame_id", buffer)),
-            timestamp_ns=int(get("arv_buffer_get_timestamp", buffer)),
-            width=int(get("arv_buffer_get_image_width", buffer)) if complete else 0,
-            height=int(get("arv_buffer_get_image_height", buffer)) if complete else 0,
+            frame_id=int(get["arv_buffer_get_frame_id"](buffer)),
+            timestamp_ns=int(get["arv_buffer_get_timestamp"](buffer)),
+            width=int(get["arv_buffer_get_image_width"](buffer)) if complete else 0,
+            height=int(get["arv_buffer_get_image_height"](buffer)) if complete else 0,
         )
 
     def pixels(self, buffer: int, pixel_format: PixelFormat, shape: tuple[int, int]) -> Pixels | None:
         """The image of `shape` (height, width) in an array of its own, as of `unpacked`; None when the buffer has too
         few bytes (chunk data may follow the pixels)."""
         size, length = frame_bytes(pixel_format, shape[0] * shape[1]), ctypes.c_size_t()
-        address = self._library.call("arv_buffer_get_data", buffer, ctypes.byref(length))
+        address = self._library["arv_buffer_get_data"](buffer, ctypes.byref(length))
         if not address or length.value < size:
             return None
         pointer = ctypes.cast(address, ctypes.POINTER(ctypes.c_uint8))

@@ -42,7 +42,7 @@ _ENDS = (
     _WIRE,
     _ASKED,
     "modbus_unit:decode",
-    "aravis_library:call",
+    "aravis:pixels",
     "hub:publish",
     "telemetry:receive",
     "frames:receive",
@@ -95,7 +95,7 @@ WAYS: dict[str, tuple[Part, ...]] = {
         *_ONTO_DISK,
     ),
     "frame": (
-        Part("aravis_library:call", ("calls", "camera_connection", "pixels"), back=True),
+        Part("aravis:pixels", ("calls", "camera_connection"), back=True),
         Part(_ASKED, ("imaging", "camera_gige"), back=True),
         Part("frames:receive", ("imaging", "hub")),
         Part("images:encode_image", ("calls",)),

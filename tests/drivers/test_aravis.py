@@ -2,13 +2,13 @@ import os
 
 import pytest
 
-from drivers.framing.aravis_library import DEVICE_ERRORS, AravisError, Library, library, load
+from drivers.framing.aravis_library import DEVICE_ERRORS, AravisError, Functions, library, load
 from drivers.wires.aravis import GigeDevice
 from foundation.errors import StandError
 
 
 @pytest.fixture
-def aravis() -> Library:
+def aravis() -> Functions:
     try:
         return library()
     except StandError as error:
@@ -26,11 +26,11 @@ def test_the_first_library_that_is_there_is_taken():
     assert load(("libnowhere.so.1", "libc.so.6"), "libc6")
 
 
-def test_every_declared_function_exists(aravis: Library):
-    assert aravis.call("g_quark_to_string", 0) is None
+def test_every_declared_function_exists(aravis: Functions):
+    assert aravis["g_quark_to_string"](0) is None
 
 
-def test_what_aravis_reports_becomes_an_exception_with_domain_and_code(aravis: Library):
+def test_what_aravis_reports_becomes_an_exception_with_domain_and_code(aravis: Functions):
     with pytest.raises(AravisError, match=r"'no such camera' not found") as caught:
         GigeDevice("no such camera")
     assert (caught.value.domain, caught.value.code) == (DEVICE_ERRORS, 6)

@@ -90,10 +90,10 @@ _READ, _WRITE = _ACCESS(_read), _ACCESS(_write)  # kept for the life of the clas
 @functools.cache
 def _device_type() -> tuple[int, object]:
     """The GType of the device in memory, and what has to live as long as it does."""
-    call = library().call
-    parent, query, gobject = call("arv_device_get_type"), _TypeQuery(), _TypeQuery()
-    call("g_type_query", parent, ctypes.byref(query))
-    call("g_type_query", _G_TYPE_OBJECT, ctypes.byref(gobject))
+    functions = library()
+    parent, query, gobject = functions["arv_device_get_type"](), _TypeQuery(), _TypeQuery()
+    functions["g_type_query"](parent, ctypes.byref(query))
+    functions["g_type_query"](_G_TYPE_OBJECT, ctypes.byref(gobject))
 
     def initialize(device_class: int, _data: int) -> None:
         first = device_class + gobject.class_size
@@ -102,8 +102,7 @@ def _device_type() -> tuple[int, object]:
             ctypes.c_void_p.from_address(first + slot * _POINTER_bytes).value = pointer
 
     kept = _CLASS_INIT(initialize)
-    made = call(
-        "g_type_register_static_simple",
+    made = functions["g_type_register_static_simple"](
         parent,
         b"ThermostandMemoryDevice",
         query.class_size,
@@ -124,56 +123,56 @@ class Evaluated:
     def __init__(self, file: GenicamFile) -> None:
         self.file = file
         self.memory = Memory()
-        self._call = library().call
-        self._device = self._call("g_object_new", _device_type()[0], None)
+        self._library = library()
+        self._device = self._library["g_object_new"](_device_type()[0], None)
         _MEMORIES[self._device] = self.memory
         self._xml = file.xml  # Aravis may keep the pointer
-        self._genicam = self._call("arv_gc_new", self._device, self._xml, len(self._xml))
+        self._genicam = self._library["arv_gc_new"](self._device, self._xml, len(self._xml))
         self._known: dict[str, Any] = {}
 
     def close(self) -> None:
         """Free Aravis' side."""
         if self._genicam:
-            self._call("g_object_unref", self._genicam)
-            self._call("g_object_unref", self._device)
+            self._library["g_object_unref"](self._genicam)
+            self._library["g_object_unref"](self._device)
             del _MEMORIES[self._device]
             self._genicam = None
 
     def _node(self, name: str) -> Any:
         if name not in self._known:
-            self._known[name] = self._call("arv_gc_get_node", self._genicam, name.encode())
+            self._known[name] = self._library["arv_gc_get_node"](self._genicam, name.encode())
         return self._known[name]
 
     def get(self, name: str) -> float:
         """A node with a number; an enumeration or a boolean as its value."""
         kind, node = self.file.kind(name), self._node(name)
         if kind in _FLOATS:
-            return float(self._call("arv_gc_float_get_value", node))
+            return float(self._library["arv_gc_float_get_value"](node))
         if kind == "Enumeration":
-            return float(self._call("arv_gc_enumeration_get_int_value", node))
+            return float(self._library["arv_gc_enumeration_get_int_value"](node))
         if kind == "Boolean":
-            return float(self._call("arv_gc_boolean_get_value", node))
-        return float(self._call("arv_gc_integer_get_value", node))
+            return float(self._library["arv_gc_boolean_get_value"](node))
+        return float(self._library["arv_gc_integer_get_value"](node))
 
     def set(self, name: str, value: float) -> None:
         """Write a node with a number, through its converters."""
         kind, node = self.file.kind(name), self._node(name)
         if kind in _FLOATS:
-            self._call("arv_gc_float_set_value", node, value)
+            self._library["arv_gc_float_set_value"](node, value)
         elif kind == "Boolean":
-            self._call("arv_gc_boolean_set_value", node, bool(value))
+            self._library["arv_gc_boolean_set_value"](node, bool(value))
         else:
-            self._call("arv_gc_integer_set_value", node, round(value))
+            self._library["arv_gc_integer_set_value"](node, round(value))
 
     def entry(self, name: str) -> str:
         """The entry that an enumeration has now; "" when it has none of them."""
         with suppress(AravisError):
-            return (self._call("arv_gc_enumeration_get_string_value", self._node(name)) or b"").decode()
+            return (self._library["arv_gc_enumeration_get_string_value"](self._node(name)) or b"").decode()
         return ""
 
     def choose(self, name: str, entry: str) -> None:
         """Give an enumeration one of its entries."""
-        self._call("arv_gc_enumeration_set_string_value", self._node(name), entry.encode())
+        self._library["arv_gc_enumeration_set_string_value"](self._node(name), entry.encode())
 
     def command_value(self, name: str) -> int:
         """What a Command writes."""
@@ -184,5 +183,5 @@ class Evaluated:
     def place(self, register: str) -> tuple[int, int]:
         """Address and length of a register, bytes."""
         node = self._node(register)
-        address = self._call("arv_gc_register_get_address", node)
-        return address & _ADDRESS_MASK, self._call("arv_gc_register_get_length", node)
+        address = self._library["arv_gc_register_get_address"](node)
+        return address & _ADDRESS_MASK, self._library["arv_gc_register_get_length"](node)
