@@ -136,8 +136,10 @@ class Guard:
     def _abort(self, fault: Fault) -> None:
         self._ended = not self.keeps_on
         self.held = fault if self.keeps_on else self.held
-        self.stop(fault)
-        self._make_safe(fault)
+        try:
+            self.stop(fault)  # first: nothing moves any more that making safe would have to overtake
+        finally:
+            self._make_safe(fault)
 
     def _follow_hold(self, faults: list[Fault]) -> None:
         """Begin a hold, replace one that would end by itself by one that does not, or end it."""

@@ -96,7 +96,7 @@ class Guest:
 
     def trip(self, fault: Fault) -> None:
         """The guard ends the run."""
-        self.stop(fault)
+        self.stop.trip(fault)
         self.log.tripped(fault)
 
     def hold(self, fault: Fault) -> None:

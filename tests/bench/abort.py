@@ -128,7 +128,7 @@ async def _by_guard(stand: Stand, assembly: Assembly) -> float:
         async with Stop() as stop:
             stop.watch(stand)
             watches = (Watch(over_temperature("regulator.pv", -273.15)),)
-            guard = Guard(stand.safety, watches, assembly.hub, assembly.clock, 1.0, stop)
+            guard = Guard(stand.safety, watches, assembly.hub, assembly.clock, 1.0, stop.trip)
             begun_s = time.perf_counter()
             watching.append(asyncio.create_task(guard.run()))
             await asyncio.Event().wait()

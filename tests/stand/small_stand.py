@@ -190,6 +190,11 @@ class Life:
         self.publish_pv(chamber_degC)
         self.do(self._begin(folder))
 
+    def trip(self, fault):
+        """As the guard does."""
+        self.stop.trip(fault)
+        self.stand.safety.demand()
+
     async def _begin(self, folder):
         first, told = (), ()
         if self._resumes:

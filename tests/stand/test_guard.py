@@ -173,6 +173,20 @@ async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, sc
     assert told.read_text() == text
 
 
+async def test_a_run_that_cannot_be_ended_does_not_keep_the_stand_from_being_made_safe():
+    bench = Bench("abort")
+
+    def fails(fault: Fault) -> None:
+        raise KeyError(fault.rule)
+
+    bench.guard.stop = fails
+    bench.objecting = {0}
+    with pytest.raises(KeyError):
+        bench.guard.look()
+    await bench.safety.tried()
+    assert bench.log == ["revoke", "safe"]
+
+
 async def test_a_guard_that_was_kept_from_looking_says_so():
     """Real time goes on while somebody computes in the event loop."""
     bench = Bench("hold", clock=WallClock())

@@ -232,7 +232,7 @@ class RunMachine(RuleBasedStateMachine):
         """By the operator or by the guard, perhaps twice."""
         life, calls = self.life, 1 + again
         for _ in range(calls):
-            life.call(life.stop if fault is None else lambda: life.stop(fault))
+            life.call(life.stop if fault is None else lambda: life.trip(fault))
             life.passes(0.4)
         life.passes(5.0)
         assert life.run.done()

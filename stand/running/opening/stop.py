@@ -22,8 +22,8 @@ class Interrupted(StandError):
 
 
 class Stop:
-    """The one way a run ends early, for the guard and for the operator (SIGINT, SIGTERM, SIGQUIT, and SIGHUP, when the
-    terminal is closed and nohup does not keep it away): `stop(fault)`, in any phase.
+    """The one way a run ends early, in any phase: `stop(fault)` for the operator (SIGINT, SIGTERM, SIGQUIT, and SIGHUP,
+    when the terminal is closed and nohup does not keep it away), `stop.trip(fault)` for the guard.
 
     The stand is latched and made safe, the run cancelled where it waits, once, and not while it is being taken down;
     what it then raises becomes Interrupted or StandTripped with the first reason. While an actuator does not confirm
@@ -57,6 +57,15 @@ class Stop:
 
     def __call__(self, fault: Fault = STOPPED) -> None:
         """Latch at once, begin to make safe, and return; the run is cancelled when every actuator has been tried."""
+        if self._begins(fault) and self._stand is not None:
+            self._stand.safety.demand()
+
+    def trip(self, fault: Fault) -> None:
+        """The same, for the guard, which demands by itself that the stand is made safe, as soon as this returns."""
+        self._begins(fault)
+
+    def _begins(self, fault: Fault) -> bool:
+        """Latch; whether this stop is the first."""
         self.fault = self.fault or fault
         if self._stand is not None:
             self._stand.interlock.latch(fault)
@@ -65,13 +74,13 @@ class Stop:
                 self._stand.safety.give_up()
             if self.phase is Phase.ENDED:
                 self.patience.begin()
-            return
+            return False
         self._turn(Turn.STOP)
         if self._stand is None:
             self._run.cancel()
         else:
-            self._stand.safety.demand()
             self._aborting = asyncio.create_task(self._abort(self._stand))
+        return True
 
     def taking_down(self) -> None:
         """From here on the run makes safe and cleans up by itself and must not be cancelled."""
