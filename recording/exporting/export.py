@@ -21,8 +21,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
-from operator import attrgetter
+from contextlib import closing
 from pathlib import Path
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -30,31 +29,15 @@ from google.protobuf.message import DecodeError
 
 from foundation.errors import SessionError
 from foundation.files import new_folder
-from foundation.items import Batch
-from foundation.readings import Reading
 from recording.exporting.frames_file import frames_rows
 from recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
-from recording.exporting.tables import TABLES, Cell, Column, CsvTable, Table, TableFormat, check_format
-from recording.format import messages
+from recording.exporting.tables import TABLES, Cell, Column, CsvTable, TableFormat, check_format
+from recording.exporting.telemetry_tables import TIME_COLUMNS, write_telemetry
 from recording.format.damage import FileDamaged, naming
 from recording.format.images import SIGNATURE, decode_image, encode_png
-from recording.format.records import Message, telemetry_messages
-from recording.format.utc_offsets import UtcOffsets
 from recording.reading.notes import read_notes
 from recording.reading.session import RecordedImage, Session
 
-TIME_COLUMNS = (Column("time_ns", "ns"), Column("time_utc", "utc"))
-META_COLUMNS = (
-    *TIME_COLUMNS,
-    Column("channel", "word"),
-    Column("step_id", "word"),
-    Column("block_id", "count"),
-    Column("camera_ticks_ns", "count"),
-    Column("exposure_s", "value"),
-    Column("gain_dB", "value"),
-    Column("camera_temperature_degC", "value"),
-    Column("dropped", "count"),
-)
 STEP_COLUMNS = (
     *TIME_COLUMNS,
     *(Column(name, "text") for name in ("step_id", "index", "kind", "state", "parameters_json")),
@@ -78,6 +61,7 @@ Times    time_ns is the stand's clock, in ns since 1970: it never steps, so take
          the computer had it at that moment.
 Values   An empty cell is what the device does not measure; nan is what it could not measure, and remarks says why.
          Units are in the names of the columns. A number is the shortest text that reads back as the same number.
+         Thermometers of a laboratory's own names have columns as the others do (telemetry/sensors_temperature).
 Frames   Columns of frames.csv: file (the image here, else the recorded segment that has it); camera; step_id, the step
          of the plan that took it; role, what for; superseded, yes when the capture was begun again later;
          set_point_degC of the chamber; camera_temperature_degC, the camera's own; for each thermometer the last
@@ -111,7 +95,7 @@ def export(
     with new_folder(out) as folder:
         _write_facts(session, folder)
         if telemetry is not None:
-            _write_telemetry(session, folder / "telemetry", telemetry, work)
+            write_telemetry(session, folder / "telemetry", telemetry, work.done)
         if frames:
             _write_frames(session, folder / "frames", work)
         if session.frame_count:
@@ -181,94 +165,6 @@ def _write_csv(path: Path, columns: Sequence[Column], rows: Iterable[Sequence[Ce
     with closing(CsvTable(path, columns)) as table:
         for row in rows:
             table.add(row)
-
-
-def _write_telemetry(session: Session, folder: Path, table_format: TableFormat, work: _Work) -> None:
-    """One table per topic, in the order of the recording."""
-    folder.mkdir()
-    tables: dict[str, Table] = {}
-    with ExitStack() as stack:
-        for path in session.telemetry_segments:
-            for message in telemetry_messages(path, lambda channel: channel.topic in _COLUMNS):
-                if message.topic not in tables:
-                    name = message.topic.strip("/").replace("/", "_")
-                    table = TABLES[table_format](folder / f"{name}.{table_format}", _COLUMNS[message.topic])
-                    stack.callback(table.close)
-                    tables[message.topic] = table
-                for row in _rows(message, session.utc):
-                    tables[message.topic].add(row)
-            work.done(path.stat().st_size, f"telemetry {path.name}")
-
-
-def _batch_columns(kind: messages.Kind) -> tuple[Column, ...]:
-    """time_ns is the instant of the measurement; a value's unit is in its name."""
-    quantities = [
-        column
-        for quantity in kind.quantities
-        for column in (Column(quantity.field, "value"), Column(f"{quantity.field}_quality", "word"))
-    ]
-    return (*TIME_COLUMNS, Column("device", "word"), *quantities, Column("remarks", "text"))
-
-
-_COLUMNS = {
-    **{topic: _batch_columns(kind) for topic, kind in messages.KIND_OF_TOPIC.items()},
-    messages.CAMERA_META: META_COLUMNS,
-}
-
-
-def _rows(message: Message, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
-    if message.topic == messages.CAMERA_META:
-        meta = messages.decode_frame_meta(message.data)
-        yield (
-            message.time_ns,
-            utc.utc_ns(message.time_ns),
-            meta.channel,
-            meta.step_id,
-            meta.block_id,
-            meta.camera_ticks,
-            meta.exposure_s,
-            meta.gain_dB,
-            meta.camera_degC,
-            meta.dropped,
-        )
-    else:
-        batch = messages.decode_batch(message.topic, message.data, message.time_ns)
-        yield from _batch_rows(messages.KIND_OF_TOPIC[message.topic], batch, utc)
-
-
-def _batch_rows(kind: messages.Kind, batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
-    """A row for each instant at which something was measured, most often one."""
-    keys = [(f"{batch.device}.{quantity.name}", quantity.unit) for quantity in kind.quantities]
-    for time_ns, readings in _by_instant(batch):
-        cells: list[Cell] = []
-        for key in keys:
-            reading = readings.get(key)
-            cells += (None, None) if reading is None else (reading.value, reading.quality.value)
-        remarks = (_remark(reading, key in keys) for key, reading in readings.items())
-        yield (time_ns, utc.utc_ns(time_ns), batch.device, *cells, "; ".join(filter(None, remarks)))
-
-
-def _by_instant(batch: Batch) -> Iterator[tuple[int, dict[tuple[str, str], Reading]]]:
-    """(time_ns, (channel, unit) -> reading), ascending; a channel read twice at one instant gives two of them."""
-    readings: dict[tuple[str, str], Reading] = {}
-    time_ns = 0
-    for reading in sorted(batch.readings, key=attrgetter("time_ns")):
-        key = (reading.channel, reading.unit)
-        if readings and (reading.time_ns != time_ns or key in readings):
-            yield time_ns, readings
-            readings = {}
-        time_ns = reading.time_ns
-        readings[key] = reading
-    if readings:
-        yield time_ns, readings
-
-
-def _remark(reading: Reading, has_column: bool) -> str:
-    """The reason of a reading, and the reading itself when the table has no column for it; "" when there is neither."""
-    if not has_column:
-        value = f"{reading.channel} {reading.value!r} {reading.unit} {reading.quality.value}"
-        return f"{value} ({reading.reason})" if reading.reason else value
-    return f"{reading.channel}: {reading.reason}" if reading.reason else ""
 
 
 def _write_frames(session: Session, folder: Path, work: _Work) -> None:

@@ -48,7 +48,7 @@ class CsvTable:
     def __init__(self, path: Path, columns: Sequence[Column]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file)
-        self._writer.writerow([column.name for column in columns])
+        self._writer.writerow([plain_text(column.name) for column in columns])
         self._instants = [index for index, column in enumerate(columns) if column.type == "utc"]
 
     def add(self, row: Sequence[Cell]) -> None:

@@ -107,20 +107,39 @@ async def test_reasons_and_qualities_are_told(tmp_path, table_format):
     assert stale["remarks"] == "thermometers.artifact: not confirmed"
 
 
-async def test_what_no_column_is_for_is_in_the_remarks(tmp_path):
+@pytest.mark.parametrize("table_format", ["csv", "parquet"])
+async def test_quantities_of_other_names_have_columns_and_a_second_unit_is_in_the_remarks(tmp_path, table_format):
     def items(time_ns, index):
         readings = (
             Reading("thermometers.humidity", 45.25, "%", time_ns),
-            bad_reading("thermometers.dew", "degC", time_ns, "no answer"),
+            bad_reading("thermometers.=dew", "degC", time_ns, "no answer"),
+            Reading("thermometers.pt100_7", 30.5, "degC", time_ns),
+            Reading("thermometers.pt100_7_raw", 7.0, "1", time_ns),
+            Reading("thermometers.pt100_7", 303.65, "K", time_ns),
+            Reading("thermometers.air_degC", 1.0, "1", time_ns),
             Reading("thermometers.air", 20.5, "degC", time_ns),
             Reading("thermometers.air", 20.75, "degC", time_ns),
         )
         yield Batch("thermometers", time_ns, readings)
 
-    session, out = await exported(tmp_path, count=1, items=items)
-    rows = csv_rows(out / "telemetry" / "sensors_temperature.csv")
-    assert rows[0]["remarks"] == "thermometers.humidity 45.25 % good; thermometers.dew nan degC bad (no answer)"
-    assert_readings_equal(session, "thermometers.air", rows, "air_degC")
+    session, out = await exported(tmp_path, count=1, items=items, telemetry=table_format)
+    rows = (csv_rows if table_format == "csv" else parquet_rows)(
+        out / "telemetry" / f"sensors_temperature.{table_format}"
+    )
+    for name, column in (
+        ("air", "air_degC"),
+        ("pt100_7_raw", "pt100_7_raw"),
+        ("humidity", "humidity_percent"),
+    ):
+        assert_readings_equal(session, f"thermometers.{name}", rows, column)
+    assert (float(rows[0]["pt100_7_degC"]), rows[0]["pt100_7_degC_quality"]) == (30.5, "good")
+    dew = "'=dew_degC" if table_format == "csv" else "=dew_degC"  # no spreadsheet takes a name for a formula
+    assert (math.isnan(float(rows[0][dew])), rows[0][f"{dew}_quality"]) == (True, "bad")
+    assert rows[0]["remarks"].split("; ") == [
+        "thermometers.=dew: no answer",
+        "thermometers.pt100_7 303.65 K good",
+        "thermometers.air_degC 1.0 1 good",
+    ]
 
 
 @pytest.mark.parametrize("encoding", ["png", "raw"])
