@@ -49,6 +49,14 @@ class _Before:
 
 def checked(steps: Iterable[Written]) -> Iterator[Written]:
     """The steps as they are; PlanError at the first that cannot be where it is, or is one too many."""
+    for written, fault in faults(steps):
+        if fault:
+            raise PlanError(written.place, fault)
+        yield written
+
+
+def faults(steps: Iterable[Written]) -> Iterator[tuple[Written, str]]:
+    """Each step, and why it cannot be where it is or that it is one too many; "" when it can."""
     before, captures = _Before(), 0
     for count, written in enumerate(steps):
         step = written.step
@@ -56,10 +64,8 @@ def checked(steps: Iterable[Written]) -> Iterator[Written]:
         fault = _out_of_place(step, before)
         if count >= MOST_STEPS or captures > MOST_CAPTURES:
             fault = f"the plan has more than {MOST_STEPS} steps or {MOST_CAPTURES} captures here; repeat less often"
-        if fault:
-            raise PlanError(written.place, fault)
         before = before.after(step)
-        yield written
+        yield written, fault
 
 
 def _out_of_place(step: Step, before: _Before) -> str:

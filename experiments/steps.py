@@ -278,6 +278,11 @@ def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
     return step
 
 
+def schema_of_steps() -> dict[str, object]:
+    """The JSON Schema of any step's parameters, with a definition for each kind, by its name."""
+    return TypeAdapter(Step).json_schema()
+
+
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
     """A step at its place in the plan. `step_id` stays the same as long as place and parameters do."""

@@ -31,6 +31,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
+from stand.serving.plan_check import PlanCheck
 from stand.serving.seen import seen_state
 
 Result = TypeVar("Result")
@@ -67,6 +68,13 @@ class DaemonDesk:
         """The plan in force; empty when nothing is run."""
         run = self._run
         return () if run is None else run.plan()
+
+    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """What an edit would say; nothing is ordered, so nothing is recorded."""
+        run = self._run
+        if run is None:
+            raise Conflict(_NOTHING_RUNS)
+        return run.check_edit(from_index, steps)
 
     def devices(self) -> tuple[DeviceState, ...]:
         """The commands that devices take by hand."""

@@ -103,7 +103,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
     found, approach = Situation(), _Approach(LABORATORY_degC, LABORATORY_degC)
     priced: list[PricedStep] = []
     for planned in plan:
-        _check(planned, config)
+        check_step(planned, config)
         step = planned.step
         expected = expect(step, found, config, learned.overheads_s, learned.chamber)
         duration_s = expected.duration_s
@@ -227,7 +227,8 @@ def _check_set_point(chamber_degC: float, where: str, config: StandConfig) -> No
             raise ConfigError(f"{where}: {chamber_degC} degC is outside {key} {low}..{high}")
 
 
-def _check(planned: PlannedStep, config: StandConfig) -> None:
+def check_step(planned: PlannedStep, config: StandConfig) -> None:
+    """ConfigError, naming the step, when it is nothing for this stand or outside its limits."""
     step = planned.step
     where = f"step {planned.index + 1} ({kind_of(step)})"
     if isinstance(step, StartChamber | SetTemperature):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from drivers.settings import OnBus
 from drivers.wires.bus import Bus
-from experiments.sequence import checked
+from experiments.sequence import faults
 from experiments.steps import PlannedStep
-from experiments.written import PlanError, Written
+from experiments.written import Written
 from foundation.clock import WallClock
 from foundation.documents import parse_document, read_document
 from foundation.errors import ConfigError
@@ -19,7 +19,7 @@ from stand.assembly import bus_units, inputs_of
 from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.recipe import Recipe
 from stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
-from stand.estimating.estimate import price
+from stand.estimating.estimate import check_step, price
 
 _REGISTERS = "registers-{}.yaml"  # its name in a session
 
@@ -94,12 +94,22 @@ def register_texts(config: StandConfig) -> dict[str, str]:
 def check_plan(plan: Iterable[PlannedStep], config: StandConfig) -> None:
     """ConfigError when a step cannot be where it is, or is nothing for this stand."""
     planned = tuple(plan)
-    try:
-        for _ in checked(Written((each.index,), each.step) for each in planned):
-            pass
-    except PlanError as error:
-        raise ConfigError(f"step {int(error.place[0]) + 1}: {error}") from error
+    for _, text in plan_faults(planned, config):
+        raise ConfigError(text)
     price(planned, config)
+
+
+def plan_faults(plan: Sequence[PlannedStep], config: StandConfig) -> Iterator[tuple[int, str]]:
+    """(index, sentence) of each step that cannot be where it is, or is nothing for this stand."""
+    written = (Written((each.index,), each.step) for each in plan)
+    for each, (_, fault) in zip(plan, faults(written), strict=True):
+        if fault:
+            yield each.index, f"step {each.index + 1}: {fault}"
+            continue
+        try:
+            check_step(each, config)
+        except ConfigError as error:
+            yield each.index, str(error)
 
 
 def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:

@@ -21,6 +21,7 @@ from stand.running.executing.executor import Executor
 from stand.running.memory.journal import Logbook
 from stand.running.memory.state import RunState
 from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
+from stand.running.plan_check import check_edit
 from stand.running.said import Said, keep
 from stand.running.simulated_faults import break_or_mend, simulated_faults
 from stand.running.status import STATES
@@ -45,6 +46,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
+from stand.serving.plan_check import PlanCheck
 from stand.serving.seen import seen_state
 
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"
@@ -120,6 +122,11 @@ class RunDesk:
                 step = step.model_copy(update={"expected_ns": due_ns})
             steps.append(step)
         return tuple(steps)
+
+    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """What an edit would say."""
+        self._check_running()
+        return check_edit(self.log.state, from_index, steps, self.assembly.config)
 
     def devices(self) -> tuple[DeviceState, ...]:
         """None takes an order from anybody but the run."""

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from foundation.errors import StandError
 from foundation.readings import Cause, Quality
 from recording.reading.notes import LONGEST_NOTE
+from stand.serving.plan_check import PlanCheck
 
 # Verbs of a command's event, in the words of the interface.
 Verb = Literal[
@@ -314,8 +315,12 @@ class Desk(Protocol):
         ...
 
     def plan(self) -> tuple[PlanStep, ...]:
-        """The plan in force; empty when nothing is run. The one method that any thread may call: a long plan takes a
-        while to tell, so it reads values only that are replaced and never changed."""
+        """The plan in force; empty when nothing is run. With `check_edit` what any thread may call: a long plan takes a
+        while, so it reads values only that are replaced and never changed."""
+        ...
+
+    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """What `edit` would say; changes nothing. Any thread may call it, as `plan`. Conflict when nothing is run."""
         ...
 
     def devices(self) -> tuple[DeviceState, ...]:

@@ -9,12 +9,16 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
+from experiments.steps import Soak, number_steps
 from foundation.clock import WallClock
 from foundation.errors import ConfigError
 from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
+from stand.config.stand_config import load_config, packaged
 from stand.gate import INTERLOCK, OPERATOR, Gate
+from stand.running.memory.state import RunState
+from stand.running.plan_check import check_edit
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve
 from stand.serving.command_event import command_event
@@ -37,6 +41,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
+from stand.serving.plan_check import PlanCheck
 
 STAND = "a stand"
 KNOWN_FAULTS = (
@@ -59,6 +64,7 @@ class ADesk:
         self.orders: list[tuple[Who, Verb, dict[str, JsonValue]]] = []
         self.queue: list[QueuedRun] = []
         self.is_simulated = True
+        self.edited: tuple[WrittenStep, ...] = ()
         self.standing: dict[str, JsonValue] = {}
         self.requests: dict[str, tuple[RunRequest, QueuedRun]] = {}
         self.hub.publish(self.batch(21.5))
@@ -99,6 +105,11 @@ class ADesk:
         step = {"kind": "Soak", "parameters": {"duration_s": 60.0}, "text": "Soak", "duration_s": 60.0}
         return (PlanStep.model_validate({"step_id": "0-soak", "index": 0, "standing": "waiting", **step}),)
 
+    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """Of a run of one step, on the simulated stand."""
+        plan = tuple(number_steps([Soak(60.0)]))
+        return check_edit(RunState(plan), from_index, steps, load_config(packaged("", "simulated")))
+
     def devices(self) -> tuple[DeviceState, ...]:
         return (DeviceState(name="flap", kind="flap"),)
 
@@ -130,6 +141,7 @@ class ADesk:
         return self._done(who, "extend", {"step_id": step_id, "by_s": by_s})
 
     async def edit(self, who: Who, from_index: int, steps: Sequence[WrittenStep]) -> Done:
+        self.edited = tuple(steps)
         return self._done(who, "edit", {"from_index": from_index, "steps": len(steps)})
 
     async def submit(self, who: Who, order: RunRequest, key: str = "") -> QueuedRun:

@@ -6,17 +6,23 @@ from __future__ import annotations
 import asyncio
 import math
 import socket
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
+from pydantic import JsonValue
 
+from experiments.steps import PlannedStep, step_of
 from foundation.clock import NS_PER_S, WallClock
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading
+from stand.config.stand_config import load_config, packaged
 from stand.gate import INTERLOCK, OPERATOR
+from stand.running.memory.entries import Step as StepMarked
+from stand.running.memory.fold import fold
+from stand.running.plan_check import check_edit
 from stand.serving.api.doors import Interface
 from stand.serving.desk import (
     Argument,
@@ -31,8 +37,10 @@ from stand.serving.desk import (
     StandState,
     StepStanding,
     Who,
+    WrittenStep,
 )
 from stand.serving.page_room import PageRoom
+from stand.serving.plan_check import PlanCheck
 from stand.serving.viewing import Viewing
 from tests.stand.a_desk import ADesk, served
 
@@ -59,6 +67,7 @@ class NightDesk(ADesk):
         self.stops = 0
         self.viewing: Viewing | None = None
         self.began_ns = self.clock.now_ns() - round(10.6 * 3600 * NS_PER_S)
+        self.config = load_config(packaged("", "simulated"))
         self._air, self._granite, self._camera = 24.0, 24.0, 38.0
         self.queue = [
             QueuedRun(id=3, recipe="validation", state="waiting", added_ns=self.began_ns, expected_s=36_300.0),
@@ -121,7 +130,10 @@ class NightDesk(ADesk):
 
     def _step(self, index: int) -> PlanStep:
         kinds = (("StartChamber", "set {:g} °C", 2.0), ("Soak", "soak 55 min at {:g} °C", 3300.0))
-        kind, text, duration_s = (*kinds, ("Capture", "5 frames to fit, at {:g} °C", 298.0))[index % 3]
+        kind, text, duration_s = (*kinds, ("Capture", "5 frames at {:g} °C", 298.0))[index % 3]
+        degC: dict[str, JsonValue] = {"chamber_degC": SET_POINTS[index // 3]}
+        soak: dict[str, JsonValue] = {"duration_s": duration_s}
+        frames: dict[str, JsonValue] = {"frames": 5, "interval_s": 60.0, "exposure_s": 0.1, "role": "other", **degC}
         begin_s = index // 3 * SOAK_S + (0.0, 2.0, 3302.0)[index % 3]
         end_s, now_s = begin_s + duration_s * (1 + 0.01 * math.sin(index)), self.now_s()
         standing: StepStanding = "done" if end_s < now_s else "under_way" if begin_s <= now_s else "waiting"
@@ -130,7 +142,7 @@ class NightDesk(ADesk):
             step_id=f"{index:03d}-{kind.lower()}",
             index=index,
             kind=kind,
-            parameters={},
+            parameters=(degC, soak, frames)[index % 3],
             text=text.format(SET_POINTS[index // 3]),
             standing=standing,
             duration_s=duration_s,
@@ -141,6 +153,14 @@ class NightDesk(ADesk):
             ended_ns=self._at(end_s) if ended else None,
             expected_ns=None if ended else self._at(end_s),
         )
+
+    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """As a run does, whose plan is this night's."""
+        shown = self.plan()
+        plan = [PlannedStep(each.index, each.step_id, step_of(each.kind, dict(each.parameters))) for each in shown]
+        marks = [StepMarked(0, each.step_id, "started") for each in shown if each.standing != "waiting"]
+        marks += [StepMarked(0, each.step_id, "done") for each in shown if each.standing == "done"]
+        return check_edit(fold(plan, marks), from_index, steps, self.config)
 
     def devices(self) -> tuple[DeviceState, ...]:
         refused = "" if self.is_idle else "a run owns the stand"

@@ -226,18 +226,35 @@ async def test_the_plan_is_a_time_line_whose_steps_are_left_out_and_extended(nig
         await until(lambda: night.stops)
 
 
-async def test_the_steps_to_come_are_edited(night):
+async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night):
     async with a_page(night.chromium, night.port, "plan") as page:
         await page.get_by_role("button", name="Edit the steps to come").click()
-        text = await page.get_by_label("Steps to come").input_value()
-        assert len(text.splitlines()) == 4
-        await page.get_by_label("Steps to come").fill("\n".join(text.splitlines()[2:]) + "\nnot json")
-        await page.get_by_role("button", name="Replace them").click()
-        await page.get_by_text("line 3").wait_for()
-        await page.get_by_label("Steps to come").fill("\n".join(text.splitlines()[2:]))
-        await page.get_by_role("button", name="Replace them").click()
-        await until(lambda: night.orders)
-        assert night.orders[-1][1:] == ("edit", {"from_index": 32, "steps": 2})
+        editor = page.get_by_role("group", name="Steps to come")
+        await editor.get_by_text("4 steps, 1 h 03 min").wait_for()  # what the stand says of it as it is
+        rows = editor.get_by_role("listitem")
+        await editor.get_by_role("button", name="Remove: step 33").click()
+        await rows.nth(0).get_by_label("chamber °C").fill("75")
+        await editor.get_by_role("button", name="Double: step 34").click()
+        await editor.get_by_role("button", name="Replace them").click()
+        await rows.nth(0).get_by_text("a set-point of 75 degC").wait_for()
+        assert not night.edited
+        assert await rows.nth(2).locator(".error").is_hidden()
+        await rows.nth(0).get_by_label("chamber °C").fill("30")
+        assert await rows.nth(3).get_by_label("chamber °C").input_value() == "30"  # the label of the frames there
+        await rows.nth(1).get_by_label("duration, s").fill("600")
+        await rows.nth(1).get_by_text("soak for 10 min").wait_for()
+        await editor.get_by_role("button", name="Later: step 34").click()
+        await editor.get_by_label("Kind of step to add").select_option("Prompt")
+        await editor.get_by_role("button", name="Add this step").click()
+        await editor.get_by_role("button", name="Replace them").click()
+        await rows.nth(4).get_by_text("text: ").wait_for()
+        await rows.nth(4).get_by_label("text").fill("Look at the lens")
+        await editor.get_by_role("button", name="Replace them").click()
+        await until(lambda: night.edited)
+        await editor.wait_for(state="detached")
+        assert night.orders[-1][2] == {"from_index": 32, "steps": 5}
+        assert night.edited[3].parameters["chamber_degC"] == 30
+        assert [step.kind for step in night.edited] == ["StartChamber", "Soak", "Soak", "Capture", "Prompt"]
 
 
 async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):

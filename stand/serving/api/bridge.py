@@ -13,7 +13,7 @@ import inspect
 import math
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar
@@ -24,7 +24,8 @@ from foundation.items import Event, Item, Original, StepMark
 from foundation.readings import Frame
 from foundation.tasks import failure_text
 from stand.serving.command_event import COMMAND
-from stand.serving.desk import Desk, Done, PlanStep, StandState, Who
+from stand.serving.desk import Desk, Done, PlanStep, StandState, Who, WrittenStep
+from stand.serving.plan_check import PlanCheck
 
 _REFRESH_S = 0.5
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
@@ -182,6 +183,10 @@ class Bridge:
             self._plan_at_s = time.monotonic()
             plan = self._plan = await asyncio.to_thread(self._desk.plan)
         return plan
+
+    async def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """What an edit of the plan would say; in a thread of its own, as `plan`."""
+        return await asyncio.to_thread(self._desk.check_edit, from_index, steps)
 
     def _has_refreshed(self, refreshing: asyncio.Future[None]) -> None:
         self._refreshing = None

@@ -21,6 +21,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
+from stand.serving.plan_check import PlanCheck
 
 _Id = Annotated[int, Path(ge=1, le=1 << 53)]
 _Name = Annotated[str, Path(max_length=255)]
@@ -141,6 +142,12 @@ def _of_the_run(router: APIRouter, bridge: Bridge) -> None:
     async def edit(request: Request, body: PlanRequest) -> Response:
         """Replace steps that were not begun."""
         return done(await bridge.command(lambda desk: desk.edit(who(request), body.from_index, body.steps)))
+
+    @router.post("/run/plan/check", response_model=PlanCheck)
+    async def check_edit(body: PlanRequest) -> Response:
+        """What replacing these steps would say, step by step; changes nothing."""
+        found = await bridge.check_edit(body.from_index, body.steps)
+        return Response(found.model_dump_json(), media_type="application/json")
 
 
 def _of_the_queue(router: APIRouter, bridge: Bridge) -> None:

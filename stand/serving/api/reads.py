@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request, Response, WebSocket
 from pydantic import BaseModel
 from starlette.websockets import WebSocketDisconnect
 
+from experiments.steps import schema_of_steps
 from stand.serving.api.access import COOKIE, LOGIN_PATH, Access
 from stand.serving.api.bridge import Bridge, NoAnswer
 from stand.serving.api.metrics import metrics
@@ -75,6 +76,11 @@ def reads(bridge: Bridge, stream: Stream, access: Access, url: str) -> APIRouter
         """The plan in force, with what is done and earned; empty when nothing is run."""
         steps = await bridge.plan()
         return _json("[" + ",".join(step.model_dump_json() for step in steps) + "]")
+
+    @router.get("/api/v1/plan/schema")
+    async def plan_schema() -> dict[str, Any]:
+        """The JSON Schema of a step's parameters, by its kind."""
+        return schema_of_steps()
 
     @router.get("/api/v1/events", response_model=Events)
     async def events(after: Seq = 0, limit: Annotated[int, Query(ge=1, le=EVENTS)] = 200) -> Response:

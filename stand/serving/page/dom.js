@@ -55,6 +55,12 @@ export function number(value, digits) {
 
 export const unit_of = (unit) => ({ degC: "°C", deg: "°", 1: "" })[unit] ?? unit;
 
+// Name and unit of each stage.
+export function axes_of(state) {
+  const { axes, readings } = state ?? { axes: {} };
+  return Object.fromEntries(Object.keys(axes).map((name) => [name, unit_of(readings[`${name}.position`]?.unit ?? "")]));
+}
+
 export function bytes(count) {
   const units = ["B", "kB", "MB", "GB", "TB"];
   let index = 0;

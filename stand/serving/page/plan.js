@@ -1,6 +1,7 @@
 // The plan as a time line and as a list: what is done, what is earned, what is to come and when.
 import { command, get, tell } from "./api.js";
-import { ask, clock, css, day_clock, duration, fill, h, number, say, seconds } from "./dom.js";
+import { ask, axes_of, clock, css, day_clock, duration, fill, h, number, say, seconds } from "./dom.js";
+import { PlanEdit, step_schema } from "./plan_edit.js";
 
 const SIGN = { done: "✓", under_way: "▶", waiting: "·", skipped: "⤼" };
 const WORD = { done: "done", under_way: "under way", waiting: "to come", skipped: "left out" };
@@ -23,8 +24,9 @@ export class Plan {
     this.line = h("canvas", { class: "line", role: "img", "aria-label": "Time line of the plan" });
     this.list = h("ol", { class: "steps" });
     this.asks = h("div", {});
+    this.edits = h("div", {});
     fill(place, h("div", { class: "stack" },
-      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Run"), this.buttons), this.summary, this.asks, this.answer, this.line,
+      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Run"), this.buttons), this.summary, this.asks, this.answer, this.edits, this.line,
         h("p", { class: "quiet" }, "tall: frames are taken; low: soaks and the rest; the line is now")),
       h("section", { class: "panel" }, h("h2", {}, "Steps"), this.list)));
     this.resizing = new ResizeObserver(() => this.draw());
@@ -43,28 +45,14 @@ export class Plan {
       () => this.order("stop", undefined, "end the run"));
   }
 
-  // One step a line, as JSON; lines are removed, changed, moved and added.
-  edit() {
+  async edit() {
+    if (this.editor) return this.editor.head.focus();
     const first = this.steps.findIndex((step) => step.standing === "waiting" && this.steps.slice(step.index).every((later) => later.standing === "waiting"));
     if (first < 0) return tell(this.answer, "no step is to come that was not begun", true);
-    const from_index = this.steps[first].index;
-    const rows = Math.min(14, Math.max(5, this.steps.length - first + 1));
-    const text = h("textarea", { rows, "aria-label": "Steps to come, one a line", spellcheck: "false", class: "wide" });
-    text.value = this.steps.slice(first).map(({ kind, parameters }) => JSON.stringify({ kind, parameters })).join("\n");
-    const done = () => fill(this.asks);
-    const replace = async () => {
-      const steps = [];
-      for (const [index, line] of text.value.split("\n").entries()) {
-        if (!line.trim()) continue;
-        try { steps.push(JSON.parse(line)); } catch (error) { return tell(this.answer, `line ${index + 1} is no JSON: ${error.message}`, true); }
-      }
-      if (await command(this.answer, "edit the plan", "PUT", "/run/plan", { from_index, steps })) { done(); this.refresh(); }
-    };
-    fill(this.asks, h("div", { class: "ask" }, h("p", {}, `Steps from number ${from_index + 1} on, one a line, in JSON: change, remove, move or add lines. The stand checks them all before it takes any.`), text,
-      h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: replace }, "Replace them"), h("button", { type: "button", onclick: done }, "Leave them"))));
-    text.focus();
-    text.setSelectionRange(0, 0);
-    text.scrollTop = 0;
+    let schema;
+    try { schema = await step_schema(); } catch (error) { return tell(this.answer, error.message, true); }
+    const over = () => { this.editor = null; this.edit_button.focus(); this.refresh(); };
+    this.editor = new PlanEdit(this.edits, schema, axes_of(this.app.state), this.steps[first].index, this.steps.slice(first), this.answer, over);
   }
 
   async refresh() {
@@ -75,6 +63,7 @@ export class Plan {
 
   show() {
     const { steps } = this;
+    this.editor?.update(steps);
     const done = steps.filter((step) => step.standing === "done" || step.standing === "skipped");
     const hide = this.all ? 0 : Math.max(0, done.length - SHOWN_DONE);
     const first = steps.findIndex((step) => step.standing === "waiting" || step.standing === "under_way");
@@ -158,7 +147,7 @@ export class Plan {
 
   soon() { this.refresh(); }
   event(event) { if (event.kind === "step" || event.kind === "plan_changed") { clearTimeout(this.later); this.later = setTimeout(() => this.refresh(), 200); } }
-  close() { this.closed = true; clearInterval(this.timer); clearTimeout(this.later); this.resizing.disconnect(); }
+  close() { this.closed = true; this.editor?.close(); clearInterval(this.timer); clearTimeout(this.later); this.resizing.disconnect(); }
 }
 
 const earned = (step) => {

@@ -1,6 +1,6 @@
 // The queue of runs, and the form that adds one.
 import { command, get, tell } from "./api.js";
-import { ask, day_clock, duration, fill, h, seconds, unit_of } from "./dom.js";
+import { ask, axes_of, day_clock, duration, fill, h, seconds } from "./dom.js";
 import { RecipeForm } from "./recipe_form.js";
 
 const ENDED = ["done", "failed", "stopped"];
@@ -40,18 +40,12 @@ export class Queue {
     try {
       const [recipes, schema] = await Promise.all([get("/recipes"), get("/recipes/schema")]);
       if (this.closed) return;
-      this.form = new RecipeForm(schema, this.axes());
+      this.form = new RecipeForm(schema, axes_of(this.app.state));
       this.details.append(this.form.element);
       fill(this.choice, recipes.map(({ name }) => h("option", { value: name }, name)));
       this.choice.value = recipes.some(({ name }) => name === "overnight") ? "overnight" : recipes[0]?.name;
       await this.choose();
     } catch (error) { tell(this.form_answer, error.message, true); }
-  }
-
-  // Name and unit.
-  axes() {
-    const { axes, readings } = this.app.state ?? { axes: {} };
-    return Object.fromEntries(Object.keys(axes).map((name) => [name, unit_of(readings[`${name}.position`]?.unit ?? "")]));
   }
 
   async choose() {

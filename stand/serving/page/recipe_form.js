@@ -132,7 +132,7 @@ const long = (value) => (typeof value === "string" ? { [value]: {} } : value);
 
 const is_texts = (schema) => schema.anyOf?.some((each) => each.type === "array" && each.items?.type === "string");
 
-function collect(fields) {
+export function collect(fields) {
   return Object.fromEntries(fields.map((each) => [each.name, each.value()]).filter(([, value]) => value !== undefined));
 }
 

@@ -1,0 +1,65 @@
+"""Steps that somebody wants to replace others by: what is wrong is said of each, and nothing is changed."""
+
+import asyncio
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from pydantic import JsonValue
+
+from experiments.steps import OpenFlap, Soak, StartChamber, StopChamber, number_steps
+from stand.config.stand_config import load_config, packaged
+from stand.running.memory.entries import Step
+from stand.running.memory.fold import fold
+from stand.running.plan_check import check_edit
+from stand.serving.client import server_of
+from stand.serving.desk import WrittenStep
+from tests.stand.a_desk import ADesk, served
+
+PLAN = tuple(number_steps([StartChamber(24.0), Soak(60.0), OpenFlap(), StopChamber()]))
+BEGUN = fold(PLAN, [Step(0, PLAN[0].step_id, "started"), Step(0, PLAN[0].step_id, "done")])
+CONFIG = load_config(packaged("", "simulated"))
+
+
+def written(kind: str, **parameters: JsonValue) -> WrittenStep:
+    return WrittenStep(kind=kind, parameters=parameters)
+
+
+SOAK = written("Soak", duration_s=600.0)
+FIT = written("Capture", frames=2, interval_s=60.0, exposure_s=0.1, role="fit", chamber_degC=24.0)
+
+
+@pytest.mark.parametrize(
+    ("from_index", "steps", "faults"),
+    [
+        (1, [SOAK, written("Soak", duration_s=-1), SOAK, written("Teleport")], {2: "is -1", 4: "no step is called"}),
+        (1, [written("SetTemperature", chamber_degC=71), SOAK, FIT], {1: "give -10 to 70", 3: "give open_flap"}),
+        (1, [SOAK, written("MoveTo", axis="linear", position=9e9)], {2: "outside the limits"}),
+        (1, [written("MoveTo", axis="up", position=1), SOAK], {1: "up"}),
+        (0, [SOAK], {None: "the steps from number 2 on can be replaced, not those from number 1 on"}),
+        (1, [written("Soak", duration_s=4e7)], {None: "more than a year is refused"}),
+    ],
+)
+def test_what_is_wrong_is_said_of_each_step(from_index, steps, faults):
+    found = check_edit(BEGUN, from_index, steps, CONFIG)
+    assert [fault.index for fault in found.faults] == list(faults)
+    assert all(text in fault.text for fault, text in zip(found.faults, faults.values(), strict=True))
+    assert found.duration_s is None
+    assert len(found.texts) == len(steps)
+
+
+def test_steps_with_which_nothing_is_wrong_have_a_duration_and_their_words():
+    found = check_edit(BEGUN, 1, [SOAK, written("OpenFlap"), FIT], CONFIG)
+    assert (found.faults, found.texts[0]) == ((), "soak for 10 min")
+    assert found.duration_s == pytest.approx(663.1)
+
+
+async def test_the_interface_checks_an_edit_and_gives_the_form_of_each_step(tmp_path: Path):
+    async with served(ADesk(), tmp_path) as desk:
+        server = server_of(tmp_path)
+        body = {"from_index": 0, "steps": [SOAK.model_dump(), {"kind": "Soak"}]}
+        found = cast("Any", await asyncio.to_thread(server.request, "POST", "/api/v1/run/plan/check", body))
+        assert found["faults"][0]["index"] == 1
+        schema = cast("Any", await asyncio.to_thread(server.request, "GET", "/api/v1/plan/schema", None))
+        assert schema["$defs"]["Soak"]["properties"].keys() == {"duration_s"}
+        assert (desk.orders, desk.edited) == ([], ())
