@@ -145,7 +145,7 @@ def _chamber_of(config: StandConfig, address_of: Callable[[str | None], str | No
     return {
         "protocol": known["protocol"],
         "address": address_of(chamber.address),
-        "unit": known["unit"] or 1,
+        "unit": known.get("unit") or known.get("chamber") or 1,
         "limits_degC": list(chamber.limits_at_panel_degC or config.limits.chamber_degC),
     }
 

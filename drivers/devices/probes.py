@@ -48,7 +48,7 @@ _LANGUAGES = {
     "hart": _Language(
         SerialSettings(2400, 1),
         b"T\r",
-        {"temperature": ("degC", re.compile(rf"^t:{_NUMBER}(\w)", re.MULTILINE))},
+        {"temperature": ("degC", re.compile(rf"^t:{_NUMBER}(\w)"))},
         "Hart",
         "1502A",
         is_named=True,
@@ -149,19 +149,18 @@ class Probe:
         self.identity = same_device(self.name, Identity(vendor, model, serial_number, version), self.identity)
 
     def _heard(self, data: bytes) -> dict[str, float] | None:
-        """The values once their line has ended."""
-        text = data.decode("latin-1")
-        found = {channel: pattern.search(text) for channel, (_, pattern) in self._language.values.items()}
-        line_end = max((match.end() for match in found.values() if match is not None), default=-1)
-        if any(match is None for match in found.values()) or "\n" not in text[line_end:]:
-            return None
-        values: dict[str, float] = {}
-        for channel, (unit, _) in self._language.values.items():
-            match = found[channel]
-            if match is None or match[2] != _UNITS[unit]:
-                raise ValueError(f"{channel} is not in {unit}; set the instrument so")
-            values[channel] = math.nan if _FAILED.fullmatch(match[1]) else float(match[1])
-        return values
+        """The values of the first line that has them all; None until such a line has ended."""
+        for line in data.decode("latin-1").split("\n")[:-1]:
+            found = {channel: pattern.search(line) for channel, (_, pattern) in self._language.values.items()}
+            if all(found.values()):
+                return {channel: self._value(channel, match) for channel, match in found.items() if match is not None}
+        return None
+
+    def _value(self, channel: str, match: re.Match[str]) -> float:
+        unit, _ = self._language.values[channel]
+        if match[2] != _UNITS[unit]:
+            raise ValueError(f"{channel} is not in {unit}; set the instrument so")
+        return math.nan if _FAILED.fullmatch(match[1]) else float(match[1])
 
 
 def _named(data: bytes) -> tuple[str, str, str, str] | None:

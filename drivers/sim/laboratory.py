@@ -25,11 +25,13 @@ from drivers.sim.physics.scene import Scene, SceneSpec, still
 from drivers.sim.units.adam_4015 import FakeAdam4015
 from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
 from drivers.sim.units.heat_module import FakeHeatModule
+from drivers.sim.units.julabo_circulator import FakeJulabo
 from drivers.sim.units.modbus import RtuEngine, TcpEngine, Unit
 from drivers.sim.units.probes import FakeProbe
 from drivers.sim.units.regulator import FakeRegulator
 from drivers.sim.units.relays import FakeRelays
 from drivers.sim.units.rtd_sensors import CHANNELS
+from drivers.sim.units.simserv_chamber import FakeSimserv
 from drivers.sim.units.thermal_imager import FakeThermalImager
 from drivers.sim.units.thermometers import FakeThermometers
 from drivers.sim.usb import UsbServer
@@ -274,6 +276,10 @@ class Laboratory:
                 chamber = FakeCts(self.plant, self._clock, spec.unit, is_serial=is_serial)
             case "ascii2":
                 chamber = FakeWeiss(self.plant, self._clock, spec.unit)
+            case "simserv":
+                chamber = FakeSimserv(self.plant, self._clock, spec.unit)
+            case "julabo":
+                chamber = FakeJulabo(self.plant, self._clock)
         chamber.is_alone = self.spec.relays_unit is None
         chamber.limits_degC = spec.limits_degC or chamber.limits_degC
         return chamber

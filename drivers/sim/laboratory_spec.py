@@ -86,7 +86,7 @@ class ChamberUnitSpec(Document):
     """A commercial climate chamber: its protocol, where it answers, and the set-points that its controller allows (by
     default as the stand asks for)."""
 
-    protocol: Literal["espec", "cts", "ascii2"]
+    protocol: Literal["espec", "cts", "ascii2", "simserv", "julabo"]
     address: str
     unit: int
     limits_degC: tuple[float, float] | None = None

@@ -93,6 +93,19 @@ class LineClient:
             raise GarbledReply(self._device, f"only {heard[:80]!r} came within {self._timeout_s:g} s")
         raise Unreachable(self._device, f"no reply within {self._timeout_s:g} s")
 
+    def tell(self, request: bytes) -> None:
+        """One request that is not answered, sent once. Unreachable when the wire is gone."""
+        self._wait()
+        link = self._link = self._link or self._connect()
+        try:
+            while link.read(0.0):
+                pass  # nobody asked for it
+            link.write(request)
+        except Unreachable:
+            self.close()
+            raise
+        self._free_s = time.monotonic() + self._gap_s
+
     def _quarantine(self) -> None:
         self._free_s = time.monotonic() + self._timeout_s + _MARGIN_S
         if not self._is_kept:

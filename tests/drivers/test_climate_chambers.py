@@ -1,4 +1,4 @@
-"""Climate chambers of three makes over their wires: what they are asked, and each fault that the fact sheets name."""
+"""Climate chambers of five makes over their wires: what they are asked, and each fault that the fact sheets name."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from pydantic import TypeAdapter
 from drivers.devices.chambers.chamber_ascii2 import number, parse
 from drivers.devices.chambers.chamber_cts import framed, unframed
 from drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
+from drivers.devices.chambers.chamber_simserv import reply_of
 from drivers.devices.chambers.climate_chamber import ClimateChamber
 from drivers.sim.faults import LinkFaults
 from drivers.sim.physics.plant import Plant, PlantSpec
 from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
+from drivers.sim.units.julabo_circulator import FakeJulabo
+from drivers.sim.units.simserv_chamber import FakeSimserv
 from drivers.sim.wire import PtyWire, TcpWire
 from foundation.clock import FollowedClock, WallClock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
@@ -24,8 +27,9 @@ from foundation.readings import Quality, Reading
 
 START_NS = 1_700_000_000_000_000_000
 ALLOWED_DEGC = (-10.0, 60.0)
-MAKES = ("espec", "cts", "ascii2")
+MAKES = ("espec", "cts", "ascii2", "simserv", "julabo")
 WIRES = ("tcp", "serial")
+ON_WIRES = [(make, wire) for make in MAKES for wire in WIRES if (make, wire) != ("simserv", "serial")]
 SETTINGS: TypeAdapter[ChamberUnitSettings] = TypeAdapter(ClimateChamberSettings)
 
 
@@ -44,10 +48,12 @@ class Bench:
             else TcpWire("127.0.0.1", 0, self.fake.engine, self.faults)
         )
         known: dict[str, object] = {"protocol": make, "address": self.line.address, "timeout_s": 0.1, "gap_s": 0.0}
-        if make != "espec":
+        if make not in ("espec", "simserv"):
             known["limits_at_panel_degC"] = list(ALLOWED_DEGC)
-        if make == "cts":
+        if make in ("cts", "julabo"):
             known["parity"] = "N"  # a pseudo-terminal knows none
+        if make == "simserv":
+            known["off_channels"] = [2]
         self.driver = ClimateChamber(
             "regulator", SETTINGS.validate_python({**known, **settings}), ALLOWED_DEGC, WallClock()
         )
@@ -57,6 +63,10 @@ class Bench:
             return FakeEspec(self.plant, self.clock)
         if make == "cts":
             return FakeCts(self.plant, self.clock, is_serial=wire == "serial")
+        if make == "simserv":
+            return FakeSimserv(self.plant, self.clock)
+        if make == "julabo":
+            return FakeJulabo(self.plant, self.clock)
         return FakeWeiss(self.plant, self.clock)
 
     def wait(self, duration_s: float) -> None:
@@ -78,8 +88,7 @@ async def bench_of(make: str, wire: str, folder: Path, **settings: object) -> As
         bench.line.close()
 
 
-@pytest.mark.parametrize("wire", WIRES)
-@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize(("make", "wire"), ON_WIRES)
 async def test_it_goes_to_its_set_point_and_stops(make: str, wire: str, tmp_path: Path):
     async with bench_of(make, wire, tmp_path) as bench:
         await bench.driver.open()
@@ -152,7 +161,15 @@ async def test_what_was_changed_at_the_panel_is_told_with_both_values_and_left(m
         assert not bench.fake.running
 
 
-@pytest.mark.parametrize(("make", "code", "said"), [("espec", "5", "alarm 5"), ("cts", "33", "error 33")])
+@pytest.mark.parametrize(
+    ("make", "code", "said"),
+    [
+        ("espec", "5", "alarm 5"),
+        ("cts", "33", "error 33"),
+        ("simserv", "5", "alarm 5"),
+        ("julabo", "01 LOW LEVEL ALARM", "-01 LOW LEVEL ALARM"),
+    ],
+)
 async def test_a_latched_alarm_is_told_and_nothing_is_started_until_it_is_reset(
     make: str, code: str, said: str, tmp_path: Path
 ):
@@ -167,7 +184,7 @@ async def test_a_latched_alarm_is_told_and_nothing_is_started_until_it_is_reset(
         await bench.driver.run()
 
 
-@pytest.mark.parametrize("make", ["cts", "ascii2"])
+@pytest.mark.parametrize("make", ["cts", "ascii2", "simserv", "julabo"])
 async def test_a_set_point_that_is_clamped_is_refused_by_what_it_reads(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
@@ -176,11 +193,15 @@ async def test_a_set_point_that_is_clamped_is_refused_by_what_it_reads(make: str
             await bench.driver.set_temperature(50.0)
 
 
-async def test_a_set_point_that_the_unit_refuses_is_told_in_its_words(tmp_path: Path):
-    async with bench_of("espec", "tcp", tmp_path) as bench:
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [("espec", "DATA OUT OF RANGE"), ("simserv", "does not take these parameters"), ("julabo", "VALUE TOO LARGE")],
+)
+async def test_a_set_point_that_the_unit_refuses_is_told_in_its_words(make: str, said: str, tmp_path: Path):
+    async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         bench.fake.limits_degC = (0.0, 35.0)
-        with pytest.raises(Refused, match="DATA OUT OF RANGE"):
+        with pytest.raises(Refused, match=said):
             await bench.driver.set_temperature(50.0)
 
 
@@ -216,6 +237,52 @@ async def test_a_set_point_that_a_ramp_passes_on_its_way_elsewhere_is_sent_all_t
         assert bench.fake.setpoint_degC == passed_degC
 
 
+async def test_a_circulator_that_is_operated_by_hand_is_not_used_and_the_panel_action_is_named(tmp_path: Path):
+    async with bench_of("julabo", "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        await bench.driver.set_temperature(30.0)
+        bench.fake.remote = False
+        for call in (bench.driver.set_temperature(40.0), bench.driver.run()):
+            with pytest.raises(Refused, match=r"operated by hand: choose remote control \(RS232, USB\) at its panel"):
+                await call
+        assert (bench.fake.setpoint_degC, bench.fake.running) == (30.0, False)
+        bench.fake.remote = True
+        await bench.driver.run()
+        bench.fake.remote = False
+        assert "operated by hand" in (await bench.read())["fault"].reason
+        with pytest.raises(DeviceError, match="operated by hand"):
+            await bench.driver.make_safe()
+
+
+async def test_a_circulator_says_what_it_did_not_take_and_that_is_no_alarm(tmp_path: Path):
+    async with bench_of("julabo", "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        bench.fake._message = "-08 INVALID COMMAND"  # of another program before us
+        assert (await bench.read())["fault"].value == 0
+
+
+async def test_a_chamber_in_a_program_of_its_own_is_not_started(tmp_path: Path):
+    async with bench_of("simserv", "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        bench.fake.in_program = True
+        assert (await bench.read())["fault"].reason == "a program of its own runs"
+        with pytest.raises(DeviceFault, match="a program of its own runs; end it at the panel"):
+            await bench.driver.run()
+
+
+async def test_a_temperature_that_looks_like_a_code_is_a_temperature(tmp_path: Path):
+    assert reply_of(b"1\xb6-5\r\n") == ("1", ["-5"])
+    assert reply_of(b"-5\r\n") == ("-5", [])
+    assert [reply_of(b"1\xb624.98\r\n"[:length]) for length in range(8)] == [None] * 8
+    for wrong in (b"24.98\r\n", b"-5\xb61\r\n", b"\r\n"):
+        with pytest.raises(ValueError, match="expected"):
+            reply_of(wrong)
+    async with bench_of("simserv", "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        bench.fake.stuck_degC = -5.0
+        assert (await bench.read())["pv"].value == -5.0
+
+
 async def test_a_mode_that_is_missing_from_a_reply_is_no_reply(tmp_path: Path):
     async with bench_of("espec", "tcp", tmp_path) as bench:
         await bench.driver.open()
@@ -243,8 +310,7 @@ async def test_a_reply_of_another_address_is_discarded(tmp_path: Path):
         assert (await bench.read())["pv"].value == pytest.approx(24.0, abs=2)
 
 
-@pytest.mark.parametrize("wire", WIRES)
-@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize(("make", "wire"), ON_WIRES)
 async def test_a_late_reply_is_never_taken_for_the_next_one(make: str, wire: str, tmp_path: Path):
     async with bench_of(make, wire, tmp_path) as bench:
         await bench.driver.open()
@@ -263,8 +329,7 @@ class _nothing:
     def __exit__(self, *error: object) -> None: ...
 
 
-@pytest.mark.parametrize("wire", WIRES)
-@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize(("make", "wire"), ON_WIRES)
 async def test_among_hundreds_of_reads_with_faults_no_temperature_is_wrong(make: str, wire: str, tmp_path: Path):
     """ASCII-2 and ESPEC have no checksum: no bit flips, which nothing could find; lost, cut and late replies are."""
     async with bench_of(make, wire, tmp_path, timeout_s=0.02) as bench:
@@ -342,7 +407,7 @@ async def test_an_open_door_flags_what_is_measured_and_is_a_fault_while_it_contr
         assert (await bench.read())["pv"].reason == ""
 
 
-@pytest.mark.parametrize("make", ["espec", "ascii2"])
+@pytest.mark.parametrize("make", ["espec", "ascii2", "simserv"])
 async def test_humidity_that_is_on_from_before_is_switched_off_at_each_start_and_watched(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         bench.fake.humidity_on = True
@@ -383,7 +448,7 @@ async def test_a_controller_that_allows_more_than_the_stand_is_refused(tmp_path:
             await bench.driver.open()
 
 
-@pytest.mark.parametrize("make", ["cts", "ascii2"])
+@pytest.mark.parametrize("make", ["cts", "ascii2", "julabo"])
 async def test_limits_that_cannot_be_read_have_to_be_stated(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path, limits_at_panel_degC=None) as bench:
         with pytest.raises(DeviceFault, match="say so by limits_at_panel_degC"):

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.drivers.canned_camera import gvcp_commands, gvsp_packets
-from tests.drivers.canned_chambers import ascii2, cts, espec
+from tests.drivers.canned_chambers import ascii2, cts, cts_state, espec, espec_monitor, julabo, simserv, texts
 from tests.drivers.canned_devices import jrk, modbus, ximc
 from tests.drivers.canned_imager import radiometric
 from tests.drivers.canned_line import Parser, mutated
@@ -20,6 +20,13 @@ PARSERS: dict[str, Parser] = {
     "ESPEC": espec(),
     "CTS serial": cts("serial"),
     "CTS TCP": cts("tcp"),
+    "ESPEC state": espec_monitor(),
+    "CTS state serial": cts_state("serial"),
+    "CTS state TCP": cts_state("tcp"),
+    "SIMSERV": simserv(),
+    "Julabo": julabo(),
+    "Hart": texts("hart"),
+    "Vaisala": texts("vaisala"),
     "Jrk variables": jrk(),
     "GVCP": gvcp_commands(),
     "GVSP": gvsp_packets(),

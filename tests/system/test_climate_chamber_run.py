@@ -22,6 +22,7 @@ from tests.system.test_run import fault, ignore
 from tests.system.test_run_ends import SHORTER
 
 MAKES = ("espec", "cts", "ascii2")
+NIGHTLY = [pytest.param(make, marks=pytest.mark.nightly) for make in ("simserv", "julabo")]
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +37,7 @@ def settings_of(make: str, **changes: object) -> dict[str, object]:
         "gap_s": 0.0,
         "poll_s": 5.0,
     }
-    if make != "espec":
+    if make not in ("espec", "simserv"):
         settings["limits_at_panel_degC"] = [-10, 60]
     return {**settings, **changes}
 
@@ -61,7 +62,7 @@ def chamber_order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[.
     return build
 
 
-@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize("make", [*MAKES, *NIGHTLY])
 async def test_a_stand_with_a_commercial_chamber_needs_no_relay_board(
     tmp_path: Path, chamber_order: Callable[..., Order], make: str
 ):

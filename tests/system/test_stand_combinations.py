@@ -68,7 +68,7 @@ def chamber(protocol: str) -> Choice:
     def change(data: Data) -> None:
         del data["regulator"]
         known: Data = {"protocol": protocol, "address": "tcp:127.0.0.1:15023", "gap_s": 0.0, "poll_s": 5.0}
-        data["climate_chamber"] = known | ({} if protocol == "espec" else {"limits_at_panel_degC": [-10, 60]})
+        data["climate_chamber"] = known | ({} if protocol in ("espec", "simserv") else {"limits_at_panel_degC": [-10, 60]})
 
     return Choice(protocol, change)
 
@@ -121,7 +121,7 @@ PLACES: Mapping[str, tuple[Choice, ...]] = {
         Choice("omron-e5cc", nothing),
         Choice("software", software),
         Choice("heat module", module),
-        *map(chamber, ("espec", "cts", "ascii2")),
+        *map(chamber, ("espec", "cts", "ascii2", "simserv", "julabo")),
         *map(regulator, ("eurotherm-3200", "watlow-ez-zone", "watlow-f4t")),
     ),
     "relays": (

@@ -111,17 +111,18 @@ class Language:
         return _numbers(line, count)
 
     def _monitored(self) -> tuple[float, str, str, int]:
-        def answer(heard: bytes) -> tuple[float, str, str, int] | None:
-            line = _line(heard)
-            if line is None:
-                return None
-            self._refuse(line, "MON?")
-            fields = [field.strip(" ") for field in line.split(",")]
-            if len(fields) < 4 or not _NUMBER.fullmatch(fields[0]) or not fields[-1].isdigit():
-                raise ValueError("expected temperature, humidity, mode, number of alarms")
-            return float(fields[0]), fields[1], fields[2], int(fields[-1])
+        return self.client.query(self._bytes("MON?"), self._monitor)
 
-        return self.client.query(self._bytes("MON?"), answer)
+    def _monitor(self, heard: bytes) -> tuple[float, str, str, int] | None:
+        """Temperature, humidity, mode, number of alarms; None until they have come whole."""
+        line = _line(heard)
+        if line is None:
+            return None
+        self._refuse(line, "MON?")
+        fields = [field.strip(" ") for field in line.split(",")]
+        if len(fields) < 4 or not _NUMBER.fullmatch(fields[0]) or not fields[-1].isdigit():
+            raise ValueError("expected temperature, humidity, mode, number of alarms")
+        return float(fields[0]), fields[1], fields[2], int(fields[-1])
 
     def _humidity_on(self) -> bool:
         """`25,85,100,0`: the set value is no number when it is off."""

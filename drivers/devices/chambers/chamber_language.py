@@ -22,6 +22,7 @@ class ChamberState:
     program: bool = False
     ramp_degC: float | None = None
     door_open: bool = False
+    by_hand: str = ""
 
 
 class ChamberLanguage(Protocol):

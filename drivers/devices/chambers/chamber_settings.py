@@ -72,4 +72,35 @@ class Ascii2Settings(ChamberUnitSettings):
         return self
 
 
-ClimateChamberSettings = Annotated[EspecSettings | CtsSettings | Ascii2Settings, Field(discriminator="protocol")]
+class SimservSettings(ChamberUnitSettings):
+    """Weiss and Voetsch with SIMPAC or LabEvent: SIMSERV over TCP (port 2049). chamber: its number there.
+    start_channel, off_channels: digital channels, as `14001` counts them; the off_channels (humidity, condensation) are
+    set to 0 at each start."""
+
+    protocol: Literal["simserv"]
+    address: Annotated[ByteAddress, Field(pattern="^tcp:")]
+    chamber: int = Field(default=1, ge=1, le=99)
+    start_channel: int = Field(default=1, ge=0, le=99)
+    off_channels: tuple[Annotated[int, Field(ge=0, le=99)], ...] = ()
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        if self.start_channel in self.off_channels:
+            raise ValueError(f"start_channel {self.start_channel} is one of off_channels, too")
+        return self
+
+
+class JulaboSettings(ChamberUnitSettings):
+    """A Julabo circulator or temperature system whose bath holds the chamber: RS-232 (older ones 4800 7E1), USB or TCP.
+    Its set-point is the bath's, not the air's."""
+
+    protocol: Literal["julabo"]
+    baud: int = Field(default=4800, ge=1200, le=115200)
+    parity: Literal["N", "E", "O"] = "E"
+    databits: Literal[7, 8] = 7
+    gap_s: float = Field(default=0.25, ge=0, le=5)  # asked for by the manuals
+
+
+ClimateChamberSettings = Annotated[
+    EspecSettings | CtsSettings | Ascii2Settings | SimservSettings | JulaboSettings, Field(discriminator="protocol")
+]

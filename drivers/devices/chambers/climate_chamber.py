@@ -162,6 +162,7 @@ class ClimateChamber:
 
     def _set(self, degC: float) -> None:
         state = self._ready()
+        self._refuse_by_hand(state)
         near_K = self._language.resolution_K / 2
         if abs(state.set_degC - degC) < near_K and (state.ramp_degC is None or self._sp_degC == degC):
             return  # one that moves may only pass there
@@ -183,8 +184,13 @@ class ClimateChamber:
         low_degC, high_degC = sorted((self._from_degC, degC))
         return low_degC <= state.ramp_degC <= high_degC
 
+    def _refuse_by_hand(self, state: ChamberState) -> None:
+        if state.by_hand:
+            raise Refused(self.name, f"not in control: {state.by_hand}; nothing was sent")
+
     def _start(self) -> None:
         state = self._ready()
+        self._refuse_by_hand(state)
         if state.alarms:
             raise DeviceFault(self.name, f"{', '.join(state.alarms)}; look at the chamber, and reset it there")
         if state.program:
@@ -218,6 +224,7 @@ class ClimateChamber:
     def _readings(self, state: ChamberState) -> tuple[Reading, ...]:
         now_ns = self._clock.now_ns()
         faults, sp_degC = list(state.alarms), state.set_degC
+        faults += [state.by_hand] if state.by_hand and self._is_run else []
         if self._sp_degC is not None:
             if self._on_its_way(state, self._sp_degC):
                 sp_degC = self._sp_degC
