@@ -1,4 +1,5 @@
-"""Regulators of other makes on the bus, as far as their manuals say: Eurotherm 3200, Watlow EZ-ZONE PM and F4T.
+"""Regulators of other makes on the bus, as far as their manuals say: Eurotherm 3200, Watlow EZ-ZONE PM and F4T; and the
+controller of a Binder chamber, as far as two public drivers agree.
 
 Sources: Eurotherm HA028651 issue 7 (parameter addresses, status word); Watlow EZ-ZONE PM and F4T user's guides (Modbus
 map 1). Registers are plain words, a float is two of them, its low word first. The control is proportional over 5 K:
@@ -246,3 +247,30 @@ class FakeF4t(_Watlow):
     def _floats(self) -> dict[int, float]:
         low_degC, high_degC = self.limits_degC
         return {**super()._floats(), 2774: low_degC, 2776: high_degC, 2810: self.setpoint_degC}
+
+
+class FakeBinder(_Watlow):
+    """MK 53: 0x0800 in 0x1A22 is manual operation, in which it controls; 0 is idle. door_open: bit 0 of 0x1007."""
+
+    MODE, SETPOINT, PV = 0x1A22, 0x1581, 0x11A9
+    IDLE, BY_HAND = 0, 0x0800
+
+    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
+        super().__init__(plant, clock, unit)
+        self.mode = self.IDLE
+        self.door_open = False
+
+    def _output_percent(self) -> float:
+        return self._towards(self.setpoint_degC) if self.mode == self.BY_HAND else 0.0
+
+    def _floats(self) -> dict[int, float]:
+        return {self.PV: self._pv_degC(), self.SETPOINT: self.setpoint_degC, 0x156F: 22.0}
+
+    def _whole(self) -> dict[int, int]:
+        return {self.MODE: self.mode, 0x1007: int(self.door_open)}
+
+    def _write_words(self, address: int, words: Sequence[int]) -> None:
+        if address == self.MODE and list(words) in ([self.IDLE], [self.BY_HAND]):
+            self.mode = words[0]
+        else:
+            super()._write_words(address, words)
