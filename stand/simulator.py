@@ -12,12 +12,14 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from drivers.camera_preset import CameraPreset
 from drivers.settings import OnBus
 from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
+from foundation.documents import load_document
 from foundation.errors import ConfigError, Refused, Unreachable
 from stand.config.simulation import SimulatedCamera
-from stand.config.stand_config import StandConfig
+from stand.config.stand_config import StandConfig, packaged
 
 _STOP_LIMIT_S = 5.0
 _CONNECT_S = 5.0
@@ -113,9 +115,18 @@ def _model_of(module: OnBus) -> str:
     return "adam4015" if Path(module.registers).stem == "adam-4015" else "m7015"
 
 
-def _dress_of(camera: SimulatedCamera) -> dict[str, str | None]:
-    """Optics and the GenICam file, the latter from where we are."""
-    return {"optics": camera.optics, "genicam": None if camera.genicam is None else str(camera.genicam.resolve())}
+def _dress_of(camera: SimulatedCamera) -> dict[str, object]:
+    """Optics and the GenICam file, the latter from where we are. ConfigError where the optics' file cannot be read."""
+    genicam = None if camera.genicam is None else str(camera.genicam.resolve())
+    if not camera.is_preset:
+        return {"optics": camera.optics, "genicam": genicam}
+    preset = load_document(packaged("optics", str(camera.optics)), CameraPreset)
+    return {
+        "preset": preset.model_dump(),
+        "effects": list(camera.effects),
+        "drawn": camera.drawn,
+        "genicam": genicam,
+    }
 
 
 def _inputs_of(config: StandConfig) -> dict[str, object]:

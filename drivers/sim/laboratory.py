@@ -15,12 +15,13 @@ from drivers.sim.faults import LinkFaults
 from drivers.sim.gige.camera import FakeCamera
 from drivers.sim.gige.genicam_file import read_genicam
 from drivers.sim.gige.switch import Switch
-from drivers.sim.laboratory_spec import CameraSpec, ChamberUnitSpec, LaboratorySpec
+from drivers.sim.laboratory_spec import ChamberUnitSpec, LaboratorySpec
 from drivers.sim.link_faults import Link
 from drivers.sim.motion.flap import FakeFlap
 from drivers.sim.motion.ximc import FakeAxis
-from drivers.sim.physics.optics import true_centres_px
-from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.physics.optics import CameraKind, true_centres_px
+from drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
+from drivers.sim.physics.published_camera import PublishedCamera
 from drivers.sim.physics.scene import Scene, SceneSpec, still
 from drivers.sim.units.adam_4015 import FakeAdam4015
 from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
@@ -79,6 +80,7 @@ class Laboratory:
         self.probes: dict[str, FakeProbe] = {}
         self.thermometer_modules: list[FakeThermometers | FakeAdam4015] = []
         self.cameras: dict[str, FakeCamera] = {}
+        self.published: dict[str, PublishedCamera] = {}
         self.addresses: dict[str, str] = {}
         self._links: dict[str, Link] = {}
         self._regulator: FakeRegulator | None = None
@@ -186,9 +188,8 @@ class Laboratory:
         with self.plant.lock:
             now_ns = self._clock.now_ns()
             self.plant.advance(now_ns)
-            leading = self.spec.cameras.get("camera") or next(iter(self.spec.cameras.values()), None)
-            kind = self.spec.camera_kind if leading is None else leading.optics or self.spec.camera_kind
-            return true_centres_px(self.plant.optics(now_ns, kind)).tolist()
+            leading = "camera" if "camera" in self.spec.cameras else next(iter(self.spec.cameras), "")
+            return true_centres_px(self.plant.optics(now_ns, self._optics_of(leading))).tolist()
 
     def close(self) -> None:
         """Take everything down, last built first."""
@@ -236,13 +237,33 @@ class Laboratory:
             self._imager = FakeThermalImager(plant, spec.imager.folder, spec.imager.spots, spec.seed)
             self._closers.append(self._imager.close)
             self.addresses["imager"] = str(self._imager.folder)
-        for name, settings in spec.cameras.items():
+        self._publish()
+        for name in spec.cameras:
             is_first = not self.cameras
-            camera = self._camera(settings, Scene(SceneSpec(), spec.seed if is_first else spec.seed + _noise_of(name)))
+            camera = self._camera(name, Scene(SceneSpec(), spec.seed if is_first else spec.seed + _noise_of(name)))
             self._closers.append(camera.close)
             camera.start()
             self.cameras[name], self.addresses[name] = camera, camera.address
         self._share_a_switch()
+
+    def _publish(self) -> None:
+        """The cameras with physics of their own; one with a far thermometer of the air has the stand's hang there."""
+        for name, spec in self.spec.cameras.items():
+            if spec.preset is None:
+                continue
+            seed = f"{self.spec.seed} {name}"
+            camera = PublishedCamera(spec.preset, self.plant, STEP_s, spec.effects, spec.drawn, seed)
+            self.published[name] = camera
+            self.plant.on_step.append(camera.step)
+            if "far_air" in spec.effects:
+                for module in self.thermometer_modules:
+                    module.far_air_degC = lambda camera=camera: camera.far_air_degC
+
+    def _optics_of(self, name: str) -> CameraKind | PublishedCamera:
+        """What the camera of this name is."""
+        spec = self.spec.cameras.get(name)
+        kind = self.spec.camera_kind if spec is None else spec.optics or self.spec.camera_kind
+        return self.published.get(name, kind)
 
     def _rtd_modules(self) -> list[Unit]:
         spec, make = self.spec, FakeAdam4015 if self.spec.thermometers_model == "adam4015" else FakeThermometers
@@ -284,10 +305,11 @@ class Laboratory:
         chamber.limits_degC = spec.limits_degC or chamber.limits_degC
         return chamber
 
-    def _camera(self, settings: CameraSpec, scene: Scene) -> FakeCamera:
+    def _camera(self, name: str, scene: Scene) -> FakeCamera:
         """At its address, or at a free one: GVCP's port is fixed, but any of 127.0.0.0/8 will do."""
+        settings = self.spec.cameras[name]
         genicam = read_genicam(settings.genicam) if settings.genicam is not None else None
-        kind = settings.optics or self.spec.camera_kind
+        kind = self._optics_of(name)
         picture = still(scene.render) if settings.still else scene.render
 
         def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
@@ -308,6 +330,7 @@ class Laboratory:
                 pace_MBps=_PACE_MBps[self.spec.virtual] if len(self.spec.cameras) < 2 else _LINE_MBps,
                 boot_s=self.spec.camera_boot_s,
                 genicam=genicam,
+                thermometers=self.published.get(name),
             )
 
         return at(settings.address) if settings.address else _at_a_free_address(at)
@@ -317,6 +340,8 @@ class Laboratory:
         self.plant.heater_on_fraction = max(self.plant.heater_on_fraction, self.ssr_welded_share)
         if self.camera_sensor_degC is not None:
             self.plant.sensor_degC = self.camera_sensor_degC
+        for camera in self.published.values():
+            camera.held_chip_degC = self.camera_sensor_degC
 
     def _listen(self, name: str, address: str, make_engine: Callable[[], Engine]) -> None:
         faults = LinkFaults(seed=self.spec.seed)

@@ -8,6 +8,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from drivers.camera_preset import CameraPreset, Effect
 from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151, Profile
 from drivers.sim.physics.optics import CameraKind
 from drivers.sim.units.probes import ProbeKind
@@ -74,10 +75,14 @@ class EndpointSpec(Document):
 
 
 class CameraSpec(EndpointSpec):
-    """A camera; optics: none is as `camera_kind`. genicam: the file of another make, which it then shows. still: it
+    """A camera; optics: none is as `camera_kind`. preset: the camera's own physics instead, with these effects, and its
+    number where it is drawn. genicam: the file of another make, which it then shows. still: it
     renders a picture once and shows it from then on, for measurements of time on the machine that simulates."""
 
     optics: CameraKind | None = None
+    preset: CameraPreset | None = None
+    effects: tuple[Effect, ...] = ()
+    drawn: int | None = None
     genicam: Path | None = None
     still: bool = False
 

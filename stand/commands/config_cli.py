@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from pydantic import BaseModel
 
+from drivers.camera_preset import CameraPreset
 from drivers.wires.registers import RegisterMap
 from foundation.command_app import App
 from foundation.documents import read_document
@@ -33,6 +34,7 @@ DOCUMENTS: Mapping[str, type[BaseModel]] = {
     "recipe": Recipe,
     "registers": RegisterMap,
     "target": Target,
+    "optics": CameraPreset,
 }
 
 
@@ -72,8 +74,8 @@ def schema(
         Path | None, typer.Option("--out", "-o", help="A folder; else the installed configs/schema.")
     ] = None,
 ) -> None:
-    """Write the JSON Schemas of stands, recipes, register maps and targets. A file's first line names its schema to
-    an editor: `# yaml-language-server: $schema=schema/stand.json`.
+    """Write the JSON Schemas of stands, recipes, register maps, targets and simulated optics. A file's first line names
+    its schema to an editor: `# yaml-language-server: $schema=schema/stand.json`.
 
     Example: stand config schema --out schema
     """

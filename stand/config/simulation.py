@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, AwareDatetime, Field
+from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
+from drivers.camera_preset import Effect
 from drivers.settings import DeviceName
 from foundation.addresses import TcpAddress
 from foundation.documents import Document
@@ -25,16 +26,35 @@ def _of_this_century(start: datetime) -> datetime:
     return start
 
 
+BUILT_IN = ("modified", "unmodified")
+OPTICS = [*BUILT_IN, "nac", "navcam", "dic", "phone"]
 PrintablePath = Annotated[Path, AfterValidator(_printable)]
 FaultText = Annotated[str, Field(pattern=r"^[A-Za-z_]+\.[A-Za-z_]+(=.+)?(@[\d.]+(s|min|h)?)?(:[\d.]+(s|min|h)?)?$")]
 
 
 class SimulatedCamera(Document):
-    """One camera of a simulated laboratory; optics: modified or as bought. genicam: a camera's own GenICam file, whose
+    """One camera of a simulated laboratory; optics: modified, unmodified (as bought), or a file of configs/optics (nac,
+    navcam, dic, phone), by its name or path. Of such a one, effects: what it has beyond smooth and quick; drawn: its
+    number, another camera for each, else the middle of each range. genicam: a camera's own GenICam file, whose
     features it then shows (`arv-tool-0.8 -a ADDRESS genicam > FILE` writes that of a real one)."""
 
-    optics: Literal["modified", "unmodified"] | None = None
+    optics: Annotated[str, Field(min_length=1, max_length=200, examples=OPTICS)] | None = None
+    effects: tuple[Effect, ...] = ()
+    drawn: int | None = Field(default=None, ge=0)
     genicam: PrintablePath | None = None
+
+    @model_validator(mode="after")
+    def _effects_of_a_preset(self) -> Self:
+        if not self.is_preset and (self.effects or self.drawn is not None):
+            raise ValueError(
+                f"effects and drawn need optics of a file of configs/optics, such as nac; these are {self.optics}"
+            )
+        return self
+
+    @property
+    def is_preset(self) -> bool:
+        """Whether its optics are those of a file."""
+        return self.optics not in (None, *BUILT_IN)
 
 
 class SimulationConfig(Document):

@@ -13,6 +13,7 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
+from drivers.camera_preset import CameraPreset
 from drivers.devices.cameras.cameras_by_protocol import AnyCameraSettings
 from drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
 from drivers.devices.imager.thermal_imager import ThermalImagerSettings
@@ -56,7 +57,7 @@ RegulatorSettings = Annotated[
         custom_error_message="must have kind: software, or no kind and the registers of a unit on the bus",
     ),
 ]
-Folder = Literal["", "registers", "recipes", "targets"]
+Folder = Literal["", "registers", "recipes", "targets", "optics"]
 MAPPED = ("regulator", "heat_module", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
 _DEVICES = (
@@ -311,8 +312,8 @@ class StandConfig(Document):
 
 
 def load_config(path: Path) -> StandConfig:
-    """The configuration file, checked. Register maps that lie beside it, and GenICam files, are named by their whole
-    path."""
+    """The configuration file, checked. Register maps and optics that lie beside it, and GenICam files, are named by
+    their whole path."""
     config = load_document(path, StandConfig)
     simulation = config.simulation and config.simulation.model_copy(
         update={"cameras": {name: _dressed(path, each) for name, each in config.simulation.cameras.items()}}
@@ -328,9 +329,14 @@ def load_config(path: Path) -> StandConfig:
 
 
 def _dressed(path: Path, camera: SimulatedCamera) -> SimulatedCamera:
-    """Its GenICam file from where the stand's file at `path` is."""
+    """Its GenICam file, and the optics' where they have one, from where the stand's file at `path` is. ConfigError
+    where there are no such optics."""
     file = None if camera.genicam is None else (path.parent / camera.genicam).absolute()
-    return camera.model_copy(update={"genicam": file})
+    optics = camera.optics
+    if camera.is_preset:
+        optics = _beside(path, str(optics))
+        load_document(packaged("optics", optics, key=f"{path}: simulation.cameras.optics"), CameraPreset)
+    return camera.model_copy(update={"genicam": file, "optics": optics})
 
 
 def _beside(path: Path, name: str) -> str:

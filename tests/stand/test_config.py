@@ -293,6 +293,38 @@ def test_a_camera_of_the_simulation_is_one_of_the_stand(tmp_path: Path):
         load_config(file)
 
 
+@pytest.mark.parametrize(
+    ("camera", "sentence"),
+    [
+        ({"optics": "nacc"}, "nacc: no such file.*did you mean nac\\? there are dic, nac, navcam, phone"),
+        ({"optics": "unmodified", "effects": ["creep"]}, "effects and drawn need optics of a file.*are unmodified"),
+        ({"drawn": 3}, "effects and drawn need optics of a file.*are None"),
+        ({"optics": "nac", "effects": ["slip"]}, "simulation.cameras.camera.effects"),
+        ({"optics": "own.yaml"}, "own.yaml: scale_ppm_per_K.*the lower bound comes first"),
+    ],
+)
+def test_optics_that_cannot_be_are_refused_with_a_sentence(tmp_path: Path, camera: dict[str, object], sentence: str):
+    data = yaml.safe_load((CONFIGS / "simulated.yaml").read_text())
+    own = yaml.safe_load((CONFIGS / "optics" / "nac.yaml").read_text())
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump({**own, "scale_ppm_per_K": [22, 15]}))
+    data["simulation"]["cameras"] = {"camera": camera}
+    file = tmp_path / "stand.yaml"
+    file.write_text(yaml.safe_dump(data))
+    with pytest.raises(ConfigError, match=sentence):
+        load_config(file)
+
+
+def test_optics_beside_the_stands_file_come_first(tmp_path: Path):
+    data = yaml.safe_load((CONFIGS / "simulated.yaml").read_text())
+    data["simulation"]["cameras"] = {"camera": {"optics": "own.yaml", "effects": ["creep", "sag"], "drawn": 7}}
+    (tmp_path / "own.yaml").write_text((CONFIGS / "optics" / "nac.yaml").read_text())
+    file = tmp_path / "stand.yaml"
+    file.write_text(yaml.safe_dump(data))
+    simulation = load_config(file).simulation
+    assert simulation is not None
+    assert simulation.cameras["camera"].optics == str(tmp_path / "own.yaml")
+
+
 def test_a_missing_file_lists_what_there_is():
     with pytest.raises(ConfigError, match=r"thermal_cycle: no such file.*calibration, demo, .*warm-up"):
         packaged("recipes", "thermal_cycle")

@@ -20,7 +20,14 @@ from stand.commands.config_cli import DOCUMENTS
 CONFIGS = Path(__file__).parents[2] / "configs"
 FILES = sorted(CONFIGS.rglob("*.yaml"))
 ALL = {**DOCUMENTS, **OFFLINE}
-KINDS = {"configs": "stand", "recipes": "recipe", "registers": "registers", "targets": "target", "geometry": "geometry"}
+KINDS = {
+    "configs": "stand",
+    "recipes": "recipe",
+    "registers": "registers",
+    "targets": "target",
+    "geometry": "geometry",
+    "optics": "optics",
+}
 
 
 def validator(kind: str) -> Draft202012Validator:

@@ -55,6 +55,20 @@ class CameraPlant(Protocol):
         ...
 
 
+class Thermometers(Protocol):
+    """What a camera's temperatures are read from: the plant, or a camera's own physics."""
+
+    @property
+    def sensor_degC(self) -> float:
+        """Of the sensor chip."""
+        ...
+
+    @property
+    def body_degC(self) -> float:
+        """Of the housing."""
+        ...
+
+
 class FakeCamera:
     """The camera with serial number `serial` at UDP `address`:3956.
 
@@ -64,7 +78,7 @@ class FakeCamera:
     (virtual time stands still meanwhile) and a free-running one after `advance`. Timestamps are ns since power-on, at
     the start of the exposure. `boot_s` is simulated time from power-on to the first answer; a camera that has power
     when it is built is ready. `faults` and `counts` are open to all. With `genicam` it shows that file's features
-    instead of ours, and is a camera of that make to its client.
+    instead of ours, and is a camera of that make to its client. `thermometers`: of its own, else the plant's.
     """
 
     def __init__(
@@ -82,9 +96,11 @@ class FakeCamera:
         extended_ids: bool = False,
         faults: CameraFaults | None = None,
         genicam: GenicamFile | None = None,
+        thermometers: Thermometers | None = None,
     ) -> None:
         self.address = address
         self._plant = plant
+        self._thermometers = thermometers or plant
         self._clock = clock
         self._render = render
         self._real_time = real_time
@@ -238,7 +254,7 @@ class FakeCamera:
         if fault == "stuck":
             return
         sensor = self._registers.integer("DeviceTemperatureSelector") == 0
-        chip_degC = self._plant.sensor_degC if sensor else self._plant.body_degC
+        chip_degC = self._thermometers.sensor_degC if sensor else self._thermometers.body_degC
         chip_degC += self.faults.temperature_offset_K
         shown_degC = 0.0 if fault == "zero" else round(chip_degC / _RESOLUTION_K) * _RESOLUTION_K
         self._registers.put("DeviceTemperature", shown_degC)

@@ -163,6 +163,12 @@ def optics_at(kind: CameraKind, nodes: Nodes, placement: Placement) -> Optics:
     """The camera and the target's pose for these temperatures and this placement."""
     roll_rad = math.radians(placement.camera_roll_deg)
     camera = modified_camera(nodes) if kind == "modified" else unmodified_camera(nodes, roll_rad)
+    return optics_of(camera, nodes, placement)
+
+
+def optics_of(camera: Camera, nodes: Nodes, placement: Placement) -> Optics:
+    """This camera before the target, with the stand's temperatures (those of `nodes` that are not the camera's)."""
+    roll_rad = math.radians(placement.camera_roll_deg)
     inside = strain(nodes.granite_inside_degC, GRANITE_per_K, 900.0)
     outside = strain(nodes.granite_outside_degC, GRANITE_per_K, 900.0)
     half_mm = placement.distance_mm / 2.0  # the chamber's wall crosses the granite half way

@@ -16,10 +16,11 @@ import random
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from drivers.sim.physics.bouc_wen import BoucWen
 from drivers.sim.physics.chamber_spec import ChamberSpec, drawn
-from drivers.sim.physics.optics import CameraKind, Nodes, Optics, Placement, optics_at
+from drivers.sim.physics.optics import Camera, CameraKind, Nodes, Optics, Placement, optics_at, optics_of
 
 NS_PER_S = 1_000_000_000
 STEP_s = 0.5
@@ -64,6 +65,14 @@ class PlantSpec:
     camera_roll_deg: float = 0.0
     distance_mm: float = 826.0
     chamber_seed: int | None = None
+
+
+class OwnPhysics(Protocol):
+    """A camera whose temperatures are its own (published_camera.py)."""
+
+    def optics(self, camera_roll_rad: float) -> Camera:
+        """Its parts' places at the last grid time."""
+        ...
 
 
 def _closed(time_ns: int) -> float:
@@ -128,9 +137,9 @@ class Plant:
             self._step()
             self.now_ns += STEP_ns
 
-    def optics(self, time_ns: int, camera: CameraKind | None = None) -> Optics:
+    def optics(self, time_ns: int, camera: CameraKind | OwnPhysics | None = None) -> Optics:
         """The true camera and target pose: temperatures of the last grid time, stage positions of `time_ns`. Of another
-        kind of camera than the spec's, if asked: an unmodified one has joints only where the spec's is unmodified."""
+        camera than the spec's, if asked: an unmodified one has joints only where the spec's is unmodified."""
         nodes = Nodes(
             sensor_degC=self.sensor_degC,
             body_degC=self.body_degC,
@@ -146,7 +155,9 @@ class Plant:
             camera_roll_deg=self.spec.camera_roll_deg,
             distance_mm=self.spec.distance_mm,
         )
-        return optics_at(camera or self.spec.camera, nodes, placement)
+        if camera is None or isinstance(camera, str):
+            return optics_at(camera or self.spec.camera, nodes, placement)
+        return optics_of(camera.optics(math.radians(placement.camera_roll_deg)), nodes, placement)
 
     def state(self) -> dict[str, float]:
         """Every temperature, input and power by its attribute's name, at grid time; booleans as 0 or 1."""

@@ -50,6 +50,7 @@ class RtdModule:
             "granite_outside": lambda: plant.granite_outside_degC,
             "artifact": lambda: plant.artifact_degC,
             "laboratory": lambda: plant.laboratory_degC,
+            "air": self._air_of_models_degC,
         }
         if not set(channels.values()) <= set(range(first, first + CHANNELS)):
             raise ValueError(f"thermometer channels {dict(channels)}: expected {first}..{first + CHANNELS - 1}")
@@ -64,6 +65,7 @@ class RtdModule:
         self.drift_K_per_h: dict[int, float] = {}
         self.pulled_out: set[int] = set()
         self.air_exchanged = False
+        self.far_air_degC: Callable[[], float | None] = lambda: None  # where "air" hangs far from the camera
         self._first = first
         self._plant = plant
         self._clock = clock
@@ -97,6 +99,10 @@ class RtdModule:
 
     def _air_degC(self) -> float:
         return self._plant.chamber_degC if self.air_exchanged else self._plant.air_degC
+
+    def _air_of_models_degC(self) -> float:
+        far_degC = self.far_air_degC()
+        return self._air_degC() if far_degC is None or self.air_exchanged else far_degC
 
     def _noise(self, channel: int) -> float:
         """Drawn once in a step of the plant: the values and the fault bits of a poll ask for it alike."""
