@@ -8,7 +8,6 @@ the peer's frame is given by its own poses of the calibration positions, so each
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,8 @@ from compensation.calibration.model_scores import halves, rays_of
 from compensation.calibration.opencv import OpencvCalibration, calibrate_opencv
 from compensation.calibration.session_centres import Positions
 from compensation.calibration.stage_geometry import Table, TableSigma
-from tests.bench.figures import Figure, at_most, in_turns, milliseconds, progress, side_by_side, skipped
+from tests.bench import mrcal_peer
+from tests.bench.figures import Figure, at_most, in_turns, milliseconds, progress, side_by_side
 from tests.compensation.calibration_cases import CENTRE_mm, board, positions, translation_errors_um
 from tests.compensation.calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw
 
@@ -50,7 +50,7 @@ def figures(directory: Path) -> list[Figure]:
         *_translations("rays, lens ripple 0.05 px", rippled, rays=True),
         _halves(found[0]),
         _time(found[0]),
-        _mrcal(),
+        *mrcal_peer.figures(),
     ]
 
 
@@ -119,9 +119,3 @@ def _time(case: _Case) -> Figure:
         ROUNDS,
     )
     return side_by_side("calibration, camera, table and board together", "ms", PEER, own, other)
-
-
-def _mrcal() -> Figure:
-    """mrcal takes regular grids only and no table: this print, 20 um off, is not a problem it can be given."""
-    installed = importlib.util.find_spec("mrcal") is not None
-    return skipped("calibration, mrcal", "regular grids only" if installed else "not installed, and regular grids only")

@@ -18,7 +18,16 @@ from compensation.drift.evaluation import evaluate
 from compensation.drift.training import frame_states
 from drivers.sim.physics.optics import CameraKind
 from experiments.steps import Role
-from tests.bench import drift_beyond, drift_bumps, drift_drawn, drift_few, drift_moving, drift_space, drift_type
+from tests.bench import (
+    drift_beyond,
+    drift_bumps,
+    drift_drawn,
+    drift_few,
+    drift_moving,
+    drift_presets,
+    drift_space,
+    drift_type,
+)
 from tests.bench.figures import Figure, at_most, progress, side_by_side
 from tests.compensation.plant_night import Dwell, Seen, WarmUp, night, warm_up_and_cycles
 
@@ -39,7 +48,7 @@ def figures(directory: Path) -> list[Figure]:
         for what, unit, goal, pair in _values(seed):
             found.setdefault((what, unit, goal), []).append(pair)
     own = [_figure(what, unit, goal, pairs) for (what, unit, goal), pairs in found.items()]
-    parts = (drift_drawn, drift_moving, drift_beyond, drift_bumps, drift_few, drift_space, drift_type)
+    parts = (drift_drawn, drift_presets, drift_moving, drift_beyond, drift_bumps, drift_few, drift_space, drift_type)
     return [*own, *(figure for part in parts for figure in part.figures())]
 
 

@@ -7,14 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compensation.history.thermal_history import History, refined
 from compensation.observations import Observations, SessionFacts
+from drivers.camera_preset import CameraPreset, Effect
 from drivers.sim.physics.optics import CameraKind, true_centres_px
-from drivers.sim.physics.plant import Plant, PlantSpec
+from drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
+from drivers.sim.physics.published_camera import PublishedCamera
+from foundation.documents import load_document
 
 from .synthetic import SIZE, TARGET
 
@@ -26,6 +30,21 @@ NS_PER_S = 1_000_000_000
 START_NS = 1_767_290_400 * NS_PER_S
 POLL_S = 5
 CENTRE_NOISE_PX, AIR_NOISE_K, CAMERA_STEP_K = 0.0024, 0.003, 0.25
+
+
+@dataclass(frozen=True)
+class Published:
+    """A camera of configs/optics: its number, and what it has beyond smooth and quick."""
+
+    preset: str
+    drawn: int
+    effects: tuple[Effect, ...] = ()
+
+    def made(self, plant: Plant, seed: int) -> PublishedCamera:
+        """In this plant; seed: of what does not repeat."""
+        file = Path(__file__).parents[2] / "configs" / "optics" / f"{self.preset}.yaml"
+        preset = load_document(file, CameraPreset)
+        return PublishedCamera(preset, plant, STEP_s, self.effects, self.drawn, str(seed))
 
 
 @dataclass(frozen=True)
@@ -62,10 +81,14 @@ class Log:
 class Night:
     """One session; the chamber is held by a plain PI controller, a heater against a compressor that always runs."""
 
-    def __init__(self, kind: CameraKind, seed: int) -> None:
+    def __init__(self, kind: CameraKind | Published, seed: int) -> None:
         self.log = Log()
         self._rng = np.random.default_rng(seed)
-        self._plant = Plant(PlantSpec(camera=kind, seed=seed, camera_powered=True), START_NS)
+        own = isinstance(kind, Published)
+        self._plant = Plant(PlantSpec(camera="modified" if own else kind, seed=seed, camera_powered=True), START_NS)
+        self._published = kind.made(self._plant, seed) if own else None
+        if self._published is not None:
+            self._plant.on_step.append(self._published.step)
         self._plant.heater_enabled = self._plant.compressor_on = True
         self._integral = 0.3
         self._target_degC = 24.0
@@ -84,12 +107,17 @@ class Night:
         for _ in range(seconds // POLL_S):
             now_ns = self._plant.now_ns + POLL_S * NS_PER_S
             self._plant.advance(now_ns)
-            self.log.air.append((now_ns, self._plant.air_degC + AIR_NOISE_K * self._rng.standard_normal()))
+            self.log.air.append((now_ns, self._air_degC() + AIR_NOISE_K * self._rng.standard_normal()))
             if self._plant.camera_powered:
                 self.log.camera.append((now_ns, self._camera_degC()))
 
     def _camera_degC(self) -> float:
-        return CAMERA_STEP_K * round(self._plant.sensor_degC / CAMERA_STEP_K)
+        degC = self._plant.sensor_degC if self._published is None else self._published.sensor_degC
+        return CAMERA_STEP_K * round(degC / CAMERA_STEP_K)
+
+    def _air_degC(self) -> float:
+        far_degC = None if self._published is None else self._published.far_air_degC
+        return self._plant.air_degC if far_degC is None else far_degC
 
     def switch(self, on: bool) -> None:
         """The camera's supply."""
@@ -108,7 +136,7 @@ class Night:
                 self._plant.advance(due_ns)
             now_ns = self._plant.now_ns
             self.log.frames.append((now_ns, role, chamber_degC, self._camera_degC(), step))
-            self.log.truth.append(true_centres_px(self._plant.optics(now_ns)))
+            self.log.truth.append(true_centres_px(self._plant.optics(now_ns, self._published)))
         self._plant.flap_open_at = lambda _: 0.0
 
     def perform(self, part: WarmUp | Dwell) -> None:
@@ -159,7 +187,9 @@ class Night:
         )
 
 
-def night(kind: CameraKind, seed: int, parts: Sequence[WarmUp | Dwell], session_id: str = "night-1") -> Seen:
+def night(
+    kind: CameraKind | Published, seed: int, parts: Sequence[WarmUp | Dwell], session_id: str = "night-1"
+) -> Seen:
     """One session from a cold camera in a chamber at 24 degC."""
     session = Night(kind, seed)
     session.wait(600)
