@@ -8,6 +8,7 @@ import argparse
 import importlib.util
 import sys
 import time
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -18,27 +19,27 @@ from .scoring import Method, Score, scores, table
 
 
 def main() -> None:
-    """Score, and print one table for each group."""
+    """Score, and print one table for each group as soon as it is complete."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmark", description=__doc__)
     parser.add_argument("method", nargs="*", type=Path, help="files with NAME and fit(training)")
     parser.add_argument("--cameras", type=int, default=CAMERAS, help="of each group")
     parser.add_argument("--write", type=Path, metavar="FOLDER", help="the nights as .npz files, and no scores")
     given = parser.parse_args()
-    cases = (case(group, number, way) for way in TRAININGS for group in GROUPS for number in range(given.cameras))
     if given.write is not None:
-        for one in cases:
-            write(one, given.write)
+        for way, group, number in product(TRAININGS, GROUPS, range(given.cameras)):
+            write(case(group, number, way), given.write)
         return
     methods = {**METHODS, **dict(loaded(path) for path in given.method)}
     begin_s = time.monotonic()
-    found: list[Score] = []
-    for one in cases:
-        for name, method in methods.items():
-            found += scores(name, method, one)
-        sys.stderr.write(
-            f"  [{time.monotonic() - begin_s:4.0f} s] {one.learned_from}, {one.group}, camera {one.camera}\n"
-        )
-    sys.stdout.write(table(found, methods))
+    for way, group in product(TRAININGS, GROUPS):
+        found: list[Score] = []
+        for number in range(given.cameras):
+            one = case(group, number, way)
+            for name, method in methods.items():
+                found += scores(name, method, one)
+            sys.stderr.write(f"  [{time.monotonic() - begin_s:4.0f} s] {way}, {group}, camera {number}\n")
+        sys.stdout.write(f"{table(found, methods)}\n")
+        sys.stdout.flush()
 
 
 def loaded(path: Path) -> tuple[str, Method]:

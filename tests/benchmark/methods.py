@@ -1,10 +1,10 @@
-"""The methods that are compared: nothing, the paper's polynomial, the thermal form, and Gaussian processes on what that
-leaves."""
+"""The methods that are compared: nothing, the paper's polynomial, the form that is chosen (of all these cameras the
+thermal one), and Gaussian processes on what that leaves."""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import product
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,20 @@ def nothing(training: Observations) -> Corrector:
     return lambda night, frames, seen_px: Correction(seen_px)
 
 
-def of_this_project(form: Literal["paper", "thermal"] | None) -> Method:
-    """The paper's polynomial, the thermal form, or the one that the program chooses."""
+def paper(training: Observations) -> Corrector:
+    """The paper's polynomial."""
+    return corrector(fit(training, form="paper"))
 
-    def method(training: Observations) -> Corrector:
-        return corrector(fit(training, form=form))
 
-    return method
+@lru_cache(maxsize=1)
+def _model(training: Observations) -> DriftModel:
+    """Of the form that the program chooses; once for the methods of a camera that follow each other."""
+    return fit(training)
+
+
+def chosen(training: Observations) -> Corrector:
+    """The form that the program chooses."""
+    return corrector(_model(training))
 
 
 def corrector(model: DriftModel) -> Corrector:
@@ -56,7 +63,7 @@ def gp_on_residual(training: Observations) -> Corrector:
     """The chosen form, and a Gaussian process for the shift of the whole image that it leaves in the frames it was
     fitted to: over camera, air, their rate of change and the slowest lag, squared-exponential, with hyperparameters of
     largest marginal likelihood."""
-    model = fit(training)
+    model = _model(training)
     states = frame_states(training, model.memory)
     rows = displacements(training, training.of(Role.REFERENCE, Role.FIT, Role.WARM_UP))
     left = rows.displacement_px - model.shift(rows.measured_px, states.where(rows.frame))
@@ -114,8 +121,7 @@ class _Gp:
 
 METHODS: dict[str, Method] = {
     "nothing": nothing,
-    "the paper's polynomial": of_this_project("paper"),
-    "the thermal form": of_this_project("thermal"),
-    "the form that is chosen": of_this_project(None),
+    "the paper's polynomial": paper,
+    "the form that is chosen": chosen,
     "and a GP on its residual": gp_on_residual,
 }
