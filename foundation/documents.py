@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from foundation.document_faults import sentences, yaml_fault
-from foundation.errors import ConfigError
+from foundation.errors import ConfigError, SessionError
 
 if TYPE_CHECKING or not yaml.__with_libyaml__:
     from yaml import SafeLoader as QuickLoader
@@ -65,6 +65,7 @@ _Quick.add_constructor("tag:yaml.org,2002:int", _Quick.construct_yaml_int)
 
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 Model = TypeVar("Model", bound=BaseModel)
+Read = TypeVar("Read")
 
 
 def load_document(path: Path, model: type[Model]) -> Model:
@@ -90,6 +91,21 @@ def parse_document(text: str, model: type[Model], where: str) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         raise ConfigError(sentences(where, error, model, root)) from error
+
+
+def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
+    """What `read` makes of the text of a JSON file that this program has written; SessionError, which says that it is
+    not `what`, when that refuses it or the file cannot be read."""
+    try:
+        return read(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SessionError(f"{path}: cannot be read ({error})") from error
+    except ValidationError as error:
+        fault = error.errors()[0]
+        where = ".".join(str(part) for part in fault["loc"]) or "the file"
+        raise SessionError(f"{path}: not {what} of this program ({where}: {fault['msg']})") from error
+    except ValueError as error:
+        raise SessionError(f"{path}: not {what} of this program ({error})") from error
 
 
 def yaml_data(text: str, where: str) -> object:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from foundation.errors import SessionError
-from stand.serving.client import LIMIT_S, server_of
+from stand.serving.client import LIMIT_S, Answer, server_of
 from stand.serving.desk import RunStatus
+
+
+def ask(session: Path, verb: str, body: Mapping[str, object] | None = None, timeout_s: float = LIMIT_S) -> Answer:
+    """What the daemon that runs `session` answers to a command; SessionError when none runs, it does not answer, or it
+    refuses."""
+    return server_of(session).order(verb, body, timeout_s)
 
 
 def ask_status(session: Path, timeout_s: float = LIMIT_S) -> RunStatus:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from compensation.calibration.board import Board
 from compensation.calibration.calibrate import Calibration
@@ -19,8 +19,7 @@ from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES, Pinhole
 from compensation.calibration.rays import RayLens, exponents
 from compensation.calibration.stage_geometry import PARAMETERS
-from foundation.documents import Document
-from foundation.errors import SessionError
+from foundation.documents import Document, load_json
 from foundation.files import write_whole
 
 FORMAT = "thermostand camera"
@@ -161,14 +160,7 @@ class CameraFile(Document):
     @classmethod
     def load(cls, path: Path) -> CameraFile:
         """The camera in a file that `save` wrote, number for number; SessionError when it is anything else."""
-        try:
-            return cls.model_validate_json(path.read_text(encoding="utf-8"), strict=True)
-        except (OSError, UnicodeDecodeError) as error:
-            raise SessionError(f"{path}: cannot be read ({error})") from error
-        except ValidationError as error:
-            fault = error.errors()[0]
-            where = ".".join(str(part) for part in fault["loc"]) or "the file"
-            raise SessionError(f"{path}: not a camera file of this program ({where}: {fault['msg']})") from error
+        return load_json(path, lambda text: cls.model_validate_json(text, strict=True), "a camera file")
 
 
 def camera_file(

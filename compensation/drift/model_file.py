@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
 from compensation.drift.bump import Bump
 from compensation.drift.candidates import Candidate, Pair
@@ -26,8 +26,7 @@ from compensation.drift.polynomial import exponents
 from compensation.drift.terms import MOTIONS, Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
 from compensation.history.states import Float
-from foundation.documents import Document
-from foundation.errors import SessionError
+from foundation.documents import Document, load_json
 from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
@@ -110,17 +109,7 @@ def save_model(model: DriftModel, path: Path | str) -> None:
 
 def load_model(path: Path | str) -> DriftModel:
     """The model in a file that `save_model` wrote, number for number; SessionError when it is anything else."""
-    try:
-        file = _ANY.validate_json(Path(path).read_text(encoding="utf-8"), strict=True)
-        return _model(file)
-    except (OSError, UnicodeDecodeError) as error:
-        raise SessionError(f"{path}: cannot be read ({error})") from error
-    except ValidationError as error:
-        fault = error.errors()[0]
-        where = ".".join(str(part) for part in fault["loc"]) or "the file"
-        raise SessionError(f"{path}: not a drift model of this program ({where}: {fault['msg']})") from error
-    except ValueError as error:
-        raise SessionError(f"{path}: not a drift model of this program ({error})") from error
+    return load_json(path, lambda text: _model(_ANY.validate_json(text, strict=True)), "a drift model")
 
 
 def _model(file: PaperFile | ThermalFile) -> DriftModel:

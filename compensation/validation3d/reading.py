@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from compensation.drift.drift_model import Outside
 from compensation.observations import Float
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.validate import Validation
-from foundation.documents import Document
+from foundation.documents import Document, load_json
 from foundation.errors import SessionError
 
 _Number = float | None
@@ -72,15 +72,9 @@ class _File(Document):
 
 def load_validation(path: Path) -> Validation:
     """The validation in a file of `compensate validate`; SessionError when it is anything else."""
+    file = load_json(path, lambda text: _File.model_validate_json(text, strict=True), "a validation")
     try:
-        file = _File.model_validate_json(path.read_text(encoding="utf-8"), strict=True)
         return _validation(file)
-    except (OSError, UnicodeDecodeError) as error:
-        raise SessionError(f"{path}: cannot be read ({error})") from error
-    except ValidationError as error:
-        fault = error.errors()[0]
-        where = ".".join(str(part) for part in fault["loc"]) or "the file"
-        raise SessionError(f"{path}: not a validation of this program ({where}: {fault['msg']})") from error
     except (ValueError, KeyError) as error:
         raise SessionError(f"{path}: not a validation of this program (its arrays do not fit: {error})") from error
 

@@ -180,12 +180,6 @@ def server_of(session: Path) -> Server:
     return Server(str(session), found[0].socket)
 
 
-def ask(session: Path, verb: str, body: Mapping[str, object] | None = None, timeout_s: float = LIMIT_S) -> Answer:
-    """What the daemon that runs `session` answers to a command; SessionError when none runs, it does not answer, or it
-    refuses."""
-    return server_of(session).order(verb, body, timeout_s)
-
-
 def running_sessions(root: Path | None = None) -> list[Path]:
     """The sessions that a daemon of this user is running now: `root` itself when it is one, else those directly below
     it, by their present names as far as the disk gives them; all of this machine without `root`."""

@@ -21,8 +21,8 @@ from stand.running.memory.state import RunState
 from stand.running.opening.stop import Stop
 from stand.running.status import StatusBoard
 from stand.serving.api.access import user_name
-from stand.serving.client import ask
 from stand.serving.desk import RunStatus
+from tests.asking import ask
 from tests.host import Host
 from tests.stand.a_desk import ADesk, served
 

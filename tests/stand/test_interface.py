@@ -17,10 +17,10 @@ import pytest
 from foundation.errors import SessionError
 from stand.serving import presence as runtime
 from stand.serving.api.listening import MOST_CLIENTS
-from stand.serving.client import ask, running_sessions, server_of
+from stand.serving.client import running_sessions, server_of
 from stand.serving.desk import RunStatus
 from stand.serving.presence import Entry, Presence, address_in, living, opened_folder
-from tests.asking import ask_status
+from tests.asking import ask, ask_status
 from tests.stand.a_desk import STAND, ADesk, served
 
 STATUS = RunStatus(

@@ -13,8 +13,9 @@ import pytest
 
 from stand.serving.api.listening import MOST_CLIENTS
 from stand.serving.api.pace import Pace
-from stand.serving.client import ask, server_of
+from stand.serving.client import server_of
 from stand.serving.presence import address_in, living, opened_folder
+from tests.asking import ask
 from tests.stand.a_desk import ADesk, served
 
 STATE = b"GET /api/v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"

@@ -15,9 +15,10 @@ from stand.serving.api import stream as streams
 from stand.serving.api.bridge import Bridge, NoAnswer
 from stand.serving.api.doors import Interface
 from stand.serving.api.stream import MOST_VIEWERS, Stream
-from stand.serving.client import ask, server_of
+from stand.serving.client import server_of
 from stand.serving.desk import StandState
 from stand.serving.presence import living
+from tests.asking import ask
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import free_port
 

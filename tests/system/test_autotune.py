@@ -10,8 +10,7 @@ from foundation.hub import Hub
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.serving.client import ask
-from tests.asking import ask_status
+from tests.asking import ask, ask_status
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_guard_run import Watcher, check_safe
 from tests.system.test_run import at_step

@@ -14,8 +14,8 @@ from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.serving.client import ask
 from tests.addresses import free_port
+from tests.asking import ask
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated, trips_of
 from tests.system.test_run import fault, ignore

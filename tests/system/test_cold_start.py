@@ -22,7 +22,7 @@ from stand.running.memory.fold import fold
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_virtual
-from stand.serving.client import ask
+from tests.asking import ask
 from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher

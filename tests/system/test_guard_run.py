@@ -21,8 +21,7 @@ from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, run_virtual
-from stand.serving.client import ask
-from tests.asking import ask_status
+from tests.asking import ask, ask_status
 from tests.journals import read_lines
 from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.test_guard_wire import write_by_another_master

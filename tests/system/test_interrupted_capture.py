@@ -17,7 +17,7 @@ from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
-from stand.serving.client import ask
+from tests.asking import ask
 from tests.recording.disks import limit_files
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault

@@ -17,8 +17,7 @@ from stand.running.memory.entries import Held
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
-from stand.serving.client import ask
-from tests.asking import ask_status
+from tests.asking import ask, ask_status
 from tests.journals import read_lines
 from tests.system.conftest import require_aravis
 from tests.system.test_attended import PROMPTED

@@ -12,8 +12,8 @@ from stand.running.memory.journal import Logbook
 from stand.running.opening.stop import Stop
 from stand.running.order import Order
 from stand.running.run_desk import RunDesk
-from stand.serving.client import ask
 from stand.serving.desk import Who
+from tests.asking import ask
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of

@@ -19,7 +19,7 @@ from stand.running.executing.executor import Executor
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.serving.client import ask
+from tests.asking import ask
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")

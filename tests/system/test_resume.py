@@ -25,9 +25,8 @@ from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import Interruption, interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.serving.client import ask
 from stand.simulator import ControlSocket
-from tests.asking import ask_status
+from tests.asking import ask, ask_status
 from tests.journals import read_lines
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon

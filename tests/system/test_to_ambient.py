@@ -21,7 +21,7 @@ from stand.config.stand_config import packaged
 from stand.running.order import Order, load_order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
-from stand.serving.client import ask
+from tests.asking import ask
 from tests.system.test_run import fault
 
 RECIPE = "name: away\nsteps:\n  - start_chamber: {set_point}\n  - soak: {soak_s}\n  - stop_chamber\n"

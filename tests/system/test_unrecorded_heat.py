@@ -19,9 +19,8 @@ from recording.writing.disk import MODULE
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_real
-from stand.serving.client import ask
 from stand.simulator import ControlSocket
-from tests.asking import ask_status
+from tests.asking import ask, ask_status
 from tests.recording.disks import ext4
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_disk_process import frozen, gone
