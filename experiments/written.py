@@ -140,8 +140,8 @@ def _as_entry(value: object) -> object:
 def unknown(what: str, name: str, known: Iterable[str]) -> str:
     """The sentence about a name that is none of these."""
     near = difflib.get_close_matches(name, known, 1, 0.5)
-    advice = f"did you mean {near[0]}? " if near else ""
-    return f"there is no {what} {name[:100]!r}; {advice}There are {', '.join(known)}"
+    advice = f"did you mean {near[0]}? There are" if near else "there are"
+    return f"there is no {what} {name[:100]!r}; {advice} {', '.join(known)}"
 
 
 def _as_list(value: object) -> object:

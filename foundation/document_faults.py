@@ -6,7 +6,7 @@ import difflib
 import re
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, Union, cast, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -36,7 +36,11 @@ _WORDS: Mapping[str, str] = {
     "bool_type": "give true or false",
     "bool_parsing": "give true or false",
     "int_from_float": "give a whole number",
+    "invalid_key": "is no name of a key; decimals stand behind a point, as in 0.5 and not 0,5",
     "path_type": "give a path, in quotes where it looks like a number",
+    "date_from_datetime_parsing": "give a date as 2026-03-31",
+    "date_parsing": "give a date as 2026-03-31",
+    "date_type": "give a date as 2026-03-31",
     "timezone_aware": "needs its time zone; end it with Z, as in 2026-01-01T18:00:00Z",
 }
 _PATTERNS: Mapping[str, str] = {
@@ -59,6 +63,7 @@ _WITH_UNIT = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:e[-+]?\d+)?)\s*([a-zA-Z°%]*)\s
 
 
 TAG = "<"  # begins the tags of our unions, which are no keys
+_TAGS = (TAG, "literal[")  # and pydantic's of a choice of words
 
 
 class _Written:
@@ -88,7 +93,9 @@ class _Written:
             is_between = isinstance(node, yaml.MappingNode) if not is_last else fault["type"] == "model_type"
             if number and node is not None and key is None and is_between:
                 continue
-            if isinstance(part, str) and part.startswith(TAG) and key is None:  # of what an older form lacks
+            if (
+                isinstance(part, str) and part.startswith(_TAGS) and key is None
+            ):  # of what an older form lacks, or words
                 continue
             kept.append(part)
             node = inner
@@ -160,8 +167,36 @@ def words(fault: ErrorDetails, written: str | None = None) -> str:
     return text
 
 
+def words_for_numbers(where: str, data: object, model: type[BaseModel], root: yaml.Node | None) -> str:
+    """The sentence about `yes`, `no`, `on` or `off` where a number belongs, which would be 1 or 0; "" without such."""
+    yaml_text = _Written(root)
+    for place in _flags(data, ()):
+        types_ = {each for each in _types_at(model, place) if isinstance(each, type)}
+        if types_ and types_ <= {int, float, types.NoneType}:
+            _, node = yaml_text.found(place)
+            written = node.value if isinstance(node, yaml.ScalarNode) else ""
+            kind = "float_type" if float in types_ else "int_type"
+            return _sentence(where, ErrorDetails(type=kind, loc=place, msg="", input=written), yaml_text, "")
+    return ""
+
+
+def _flags(data: object, place: tuple[int | str, ...]) -> Iterator[tuple[int | str, ...]]:
+    """The places of all true and false."""
+    if isinstance(data, bool):
+        yield place
+    elif isinstance(data, dict):
+        for key, value in cast("dict[object, object]", data).items():
+            yield from _flags(value, (*place, str(key)))
+    elif isinstance(data, list):
+        for number, value in enumerate(cast("list[object]", data)):
+            yield from _flags(value, (*place, number))
+
+
 def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
-    """Without the faults that only follow from another one: a list is too short when its only entry is wrong."""
+    """Without the faults that only follow from another one: a list is too short when its only entry is wrong, and who
+    has mistyped one of a choice of words did not mean keys and values."""
+    misspelt = {fault["loc"] for fault in faults if fault["type"] == "literal_error"}
+    faults = [fault for fault in faults if fault["type"] != "model_type" or fault["loc"] not in misspelt]
     if not any(fault["type"] == "too_short" for fault in faults):
         return faults
     above = {fault["loc"][:length] for fault in faults for length in range(len(fault["loc"]))}
@@ -214,12 +249,15 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 
 def _models_at(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
     """The models that what stands at this place may be."""
+    return [each for each in _types_at(model, place) if isinstance(each, type) and issubclass(each, BaseModel)]
+
+
+def _types_at(model: type[BaseModel], place: Place) -> list[Any]:
+    """What may stand at this place; nothing where that is not known."""
     options: list[Any] = [model]
     for part in place:
         options = [inner for option in options for inner in _inside(option, part)]
-    return [
-        each for option in options for each in _plain(option) if isinstance(each, type) and issubclass(each, BaseModel)
-    ]
+    return [each for option in options for each in _plain(option)]
 
 
 def _inside(annotation: Any, part: int | str) -> Iterator[Any]:

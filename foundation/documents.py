@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from foundation.document_faults import sentences, yaml_fault
+from foundation.document_faults import sentences, words_for_numbers, yaml_fault
 from foundation.errors import ConfigError, SessionError
+from foundation.files import unreadable
 
 if TYPE_CHECKING or not yaml.__with_libyaml__:
     from yaml import SafeLoader as QuickLoader
@@ -78,7 +79,7 @@ def read_document(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from error
+        raise ConfigError(unreadable(path, error)) from error
 
 
 def parse_document(text: str, model: type[Model], where: str) -> Model:
@@ -87,6 +88,8 @@ def parse_document(text: str, model: type[Model], where: str) -> Model:
     if not isinstance(data, dict):
         found = "nothing" if data is None else "a list" if isinstance(data, list) else "a value alone"
         raise ConfigError(f"{where}: begins with keys and values, as in `name: my-stand`; there is {found}")
+    if wrong := words_for_numbers(where, data, model, root):
+        raise ConfigError(wrong)
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -99,7 +102,7 @@ def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
     try:
         return read(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise SessionError(f"{path}: cannot be read ({error})") from error
+        raise SessionError(unreadable(path, error)) from error
     except ValidationError as error:
         fault = error.errors()[0]
         where = ".".join(str(part) for part in fault["loc"]) or "the file"

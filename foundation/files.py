@@ -14,6 +14,16 @@ from typing import TextIO
 from foundation.errors import SessionError
 
 
+def unreadable(path: Path | str, error: OSError | UnicodeDecodeError) -> str:
+    """Why the text file there cannot be read, as `path: sentence`."""
+    if isinstance(error, UnicodeDecodeError):
+        line = error.object[: error.start].count(b"\n") + 1
+        return f"{path}: cannot be read (line {line} is not UTF-8; save the file as UTF-8)"
+    if isinstance(error, FileNotFoundError):
+        return f"{path}: no such file"
+    return f"{path}: cannot be read ({error.strerror or error})"
+
+
 def replace_file(path: Path, data: bytes) -> None:
     """`data` as the file `path`, complete and on the disk when this returns, also when others write one of that name at
     the same time; its folder is made. Raises OSError, and then a file that was there before is unchanged."""

@@ -201,6 +201,10 @@ def _thermometers(config: StandConfig, bus: Bus, clock: Clock) -> Thermometers |
     settings = config.thermometer_module
     first = register_map("thermometer_module", settings)
     count = sum(name.startswith("value_") for name in first.points)
+    if not count:
+        raise ConfigError(
+            f"thermometer_module: register map {first.model} lacks value_0; it is of no thermometer module"
+        )
     modules: list[Thermometers] = []
     for number, unit in enumerate(settings.units):
         here = {

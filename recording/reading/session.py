@@ -99,6 +99,8 @@ class Session:
         """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
         path = Path(path)
         telemetry, frames = (segments_in(path / name, FINISHED) for name in (TELEMETRY, FRAMES))
+        if not telemetry and not path.is_dir():
+            raise SessionError(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
         if not telemetry:
             count = len(segments_of(path, UNFINISHED))
             unfinished = f", only {count} unfinished ones" if count else ""

@@ -97,6 +97,17 @@ class Recipe(Document):
     experiments: tuple[Experiment, ...] = Field(default=(), max_length=100)
     steps: StepEntries = ()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _is_one(cls, data: object) -> object:
+        keys = cast("dict[object, object]", data) if isinstance(data, dict) else {}
+        if "bus" in keys and "experiments" not in keys and "steps" not in keys:
+            raise ValueError(
+                "is a stand's file, and a recipe is wanted here (one with `experiments:` or `steps:`); give a stand's "
+                "file behind --config"
+            )
+        return data
+
     @model_validator(mode="after")
     def _can_be_done(self) -> Self:
         if not self.experiments and not self.steps:

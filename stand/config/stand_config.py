@@ -148,7 +148,15 @@ class StandConfig(Document):
     @model_validator(mode="before")
     @classmethod
     def _of_today(cls, data: object) -> object:
-        return renewed(cast("dict[str, object]", data)) if isinstance(data, dict) else data
+        if not isinstance(data, dict):
+            return data
+        keys = cast("dict[str, object]", data)
+        if "bus" not in keys and ("experiments" in keys or "steps" in keys):
+            raise ValueError(
+                "is a recipe, and a stand's file is wanted here (one with `bus:`); give a recipe's name first, as in "
+                "`stand run RECIPE --config STAND`"
+            )
+        return renewed(keys)
 
     @model_validator(mode="after")
     def _cross_checks(self) -> Self:
@@ -364,6 +372,10 @@ def packaged(folder: Folder, name: str, beside: Path | None = None, key: str = "
                 return candidate
         except OSError as error:  # such as a name longer than the file system takes
             raise ConfigError(f"{named_by}{name}: cannot be looked up ({error.strerror})") from error
+    if any(path.is_dir() for path in (Path(name), *((beside.parent / name,) if beside else ()))):
+        raise ConfigError(
+            f"{named_by}{name}: is a folder; give a file in it, or one of those installed: {', '.join(known)}"
+        )
     near = difflib.get_close_matches(name, known, 1, 0.6)
     meant = f"did you mean {near[0]}? " if near else ""
     raise ConfigError(

@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 from pydantic import ValidationError
 
 from foundation.errors import ConfigError, SessionError
+from foundation.files import unreadable
 from stand.serving.desk import StandState
 from stand.serving.presence import Daemon, address_in, living, opened_folder
 
@@ -164,8 +165,8 @@ def server_at(url: str, token_file: Path | None = None) -> Server:
         raise ConfigError(f"--url {url}: expected http://HOST:PORT")
     try:
         token = token_file.read_text("utf-8").strip() if token_file is not None else ""
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"--token-file {token_file}: cannot be read ({error})") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--token-file {unreadable(token_file or '', error)}") from error
     if not token.isprintable() or not token.isascii():
         raise ConfigError(f"--token-file {token_file}: expected one line with a token")
     return Server(url, url=url, token=token)

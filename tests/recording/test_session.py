@@ -238,7 +238,7 @@ def test_what_is_no_sound_session_is_refused_with_a_sentence(copy, damage, sente
 
 
 def test_a_directory_that_does_not_exist_is_refused(tmp_path):
-    with pytest.raises(SessionError, match="not a session"):
+    with pytest.raises(SessionError, match="no such folder"):
         Session.open(tmp_path / "missing")
 
 

@@ -161,7 +161,7 @@ def test_a_link_stays_one(tmp_path: Path):
             "cameras.camera.exposure_s: must be greater than 0",
         ),
         ("name: x\ncamera: [", "not YAML"),
-        ("name: night\nexperiments: []\n", "unknown key"),
+        ("name: night\nexperiments: []\n", "is a recipe"),
     ],
     ids=["value", "yaml", "recipe"],
 )

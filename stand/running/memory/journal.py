@@ -83,6 +83,8 @@ class Journal:
         try:
             fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError as error:
+            if not directory.exists():
+                raise SessionError(f"{directory}: no such folder") from error
             raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
         try:
             if not path.is_file():  # a pipe of that name might never give a byte

@@ -1,0 +1,82 @@
+"""Mistakes that people make, each with what is said of it: what is wrong, where, what to type."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from compensation.drift.model_file import load_model
+from foundation.documents import load_document, parse_document
+from foundation.errors import ConfigError, SessionError, StandError
+from recording.reading.session import Session
+from stand.config.recipe import Recipe
+from stand.config.stand_config import StandConfig, packaged
+from stand.running.memory.journal import Journal
+from stand.running.order import load_order
+
+STAND = packaged("", "laboratory").read_text(encoding="utf-8")
+RECIPE = packaged("recipes", "trial").read_text(encoding="utf-8")
+
+
+def said(call: Callable[[], object], error: type[StandError] = ConfigError) -> str:
+    with pytest.raises(error) as refused:
+        call()
+    return str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("max_air_degC: 65.0", "max_air_degC: yes", "guard.max_air_degC: give a number in degC, without the unit"),
+        ("unit: 3", "unit: on", "thermometer_module.unit: give a whole number (got 'on', line 33)"),
+        ("offset_K: 0.0, polynomial: [], certificate: \"\"}     # and", "offset_K: 0,5}     # and",
+         "thermometers.granite_inside.5: is no name of a key; decimals stand behind a point, as in 0.5 and not 0,5"),
+        ("profile: 8MT160-300", "profile: 8MT160",
+         "axes.linear.profile: must be '8MT160-300' or '8MR151'; did you mean 8MT160-300? (got '8MT160', line 46)"),
+        ("air:             {channel: 3,", "air:             {channel: 3, calibrated: 11.03.2026,",
+         "thermometers.air.calibrated: give a date as 2026-03-31 (got '11.03.2026', line 41)"),
+    ],
+)  # fmt: skip
+def test_a_value_of_another_kind(old: str, new: str, sentence: str):
+    assert STAND.count(old) == 1, old
+    told = said(lambda: parse_document(STAND.replace(old, new), StandConfig, "mine.yaml"))
+    assert told.startswith(f"mine.yaml: {sentence}")
+    assert told.count("mine.yaml") == 1  # one mistake, one sentence
+
+
+def test_files_that_were_exchanged(tmp_path: Path):
+    assert said(lambda: parse_document(RECIPE, StandConfig, "mine.yaml")) == (
+        "mine.yaml: is a recipe, and a stand's file is wanted here (one with `bus:`); give a recipe's name first, "
+        "as in `stand run RECIPE --config STAND`"
+    )
+    assert said(lambda: parse_document(STAND, Recipe, "mine.yaml")) == (
+        "mine.yaml: is a stand's file, and a recipe is wanted here (one with `experiments:` or `steps:`); give a "
+        "stand's file behind --config"
+    )
+    told = said(lambda: packaged("", str(tmp_path)))
+    assert told.startswith(f"{tmp_path}: is a folder; give a file in it, or one of those installed: laboratory")
+
+
+def test_a_text_that_is_not_in_utf8(tmp_path: Path):
+    file = tmp_path / "mine.yaml"
+    file.write_bytes(STAND.replace('operator: ""', 'operator: "Müller"').encode("latin-1"))
+    told = said(lambda: load_document(file, StandConfig))
+    assert told == f"{file}: cannot be read (line 5 is not UTF-8; save the file as UTF-8)"
+
+
+@pytest.mark.parametrize("registers", ["waveshare-relay", "omron-e5cc"])
+def test_a_register_map_of_another_unit_for_thermometers(tmp_path: Path, registers: str):
+    file = tmp_path / "mine.yaml"
+    file.write_text(STAND.replace("registers: icpdas-m7015", f"registers: {registers}"))
+    told = said(lambda: load_order("trial", str(file)))
+    assert told.startswith(f"{file}: thermometer_module: register map ")
+    assert told.endswith("lacks value_0; it is of no thermometer module")
+
+
+def test_what_is_no_session_and_no_model(tmp_path: Path):
+    assert said(lambda: Session.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
+    file = tmp_path / "file"
+    file.write_text("x")
+    assert said(lambda: Session.open(file), SessionError) == f"{file}: is a file, not a folder"
+    assert said(lambda: Journal.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
+    assert said(lambda: load_model(tmp_path / "m.json"), SessionError) == f"{tmp_path / 'm.json'}: no such file"
