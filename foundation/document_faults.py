@@ -63,7 +63,7 @@ _WITH_UNIT = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:e[-+]?\d+)?)\s*([a-zA-Z°%]*)\s
 
 
 TAG = "<"  # begins the tags of our unions, which are no keys
-_TAGS = (TAG, "literal[")  # and pydantic's of a choice of words
+_TAGS = (TAG, "literal[")  # of what an older form lacks; and pydantic's of a choice of words
 
 
 class _Written:
@@ -93,9 +93,7 @@ class _Written:
             is_between = isinstance(node, yaml.MappingNode) if not is_last else fault["type"] == "model_type"
             if number and node is not None and key is None and is_between:
                 continue
-            if (
-                isinstance(part, str) and part.startswith(_TAGS) and key is None
-            ):  # of what an older form lacks, or words
+            if isinstance(part, str) and part.startswith(_TAGS) and key is None:
                 continue
             kept.append(part)
             node = inner
