@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import importlib
 import os
 import socket
 import threading
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -64,12 +66,20 @@ async def serve(
         presence.identify()
         with clock.hold():  # virtual time would be over before the first client is answered
             await asyncio.to_thread(thread.is_ready.wait, _READY_LIMIT_S)
+        spare_the_loaded()
         yield presence
     finally:
         bridge.close()
         with clock.hold():  # a client that does not read must not be where virtual time goes on
             await asyncio.to_thread(thread.end, (patience or Patience()).left_s(_CLOSE_LIMIT_S))
         presence.disappear()
+
+
+@cache
+def spare_the_loaded() -> None:
+    """Leave the 105,000 objects of the modules that are loaded by now out of every later search for garbage, once in a
+    process: a search of them all keeps the guard, and a stop, waiting for 57 ms."""
+    gc.freeze()
 
 
 def preload() -> None:

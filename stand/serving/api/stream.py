@@ -34,15 +34,20 @@ Kind = Literal["state", "event", "reading", "gone"]
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A numbered item of the stream."""
+    """A numbered item of the stream; data: JSON of an object. Written once for all viewers, and as a text: thousands
+    are kept, and each value in them would be looked at whenever Python searches this process for garbage."""
 
     seq: int
     type: Kind
-    data: Mapping[str, object]
+    data: str
 
     def json(self) -> str:
         """As it is sent."""
-        return json_of({"seq": self.seq, "type": self.type, "data": self.data})
+        return f'{{"seq":{self.seq},"type":"{self.type}","data":{self.data}}}'
+
+    def numbered(self) -> str:
+        """The data with the number in them."""
+        return f'{{"seq":{self.seq},{self.data[1:]}'
 
 
 def json_of(value: object) -> str:
@@ -59,14 +64,16 @@ def message_of(seq: int, utc_offset_ns: int, item: Item) -> Message:
     stamp = {"time_ns": item.time_ns, "utc_offset_ns": utc_offset_ns}
     match item:
         case Event(_, level, kind, text, data):
-            return Message(seq, "event", {**stamp, "level": level, "kind": kind, "text": text, "data": dict(data)})
+            fields = {**stamp, "level": level, "kind": kind, "text": text, "data": dict(data)}
+            return Message(seq, "event", json_of(fields))
         case StepMark(_, step_id, index, kind, state, parameters):
             data = {"step_id": step_id, "index": index, "step": kind, "state": state, "parameters": parameters}
             text = f"step {index + 1} ({kind}) {state}"
-            return Message(seq, "event", {**stamp, "level": "info", "kind": "step", "text": text, "data": data})
+            fields = {**stamp, "level": "info", "kind": "step", "text": text, "data": data}
+            return Message(seq, "event", json_of(fields))
         case Batch(device, _, readings):
             values = {reading.channel: reading_of(reading) for reading in readings}
-            return Message(seq, "reading", {**stamp, "device": device, "readings": values})
+            return Message(seq, "reading", json_of({**stamp, "device": device, "readings": values}))
         case Frame() | Original():
             raise ValueError("images are no items of the stream")
 
@@ -115,7 +122,7 @@ class Viewer:
         self._since_state += 1
         if self._lost is not None:
             (first, last), self._lost = self._lost, None
-            return Message(last, "gone", {"first": first, "last": last, "drops": self.drops}).json()
+            return Message(last, "gone", json_of({"first": first, "last": last, "drops": self.drops})).json()
         return self._waiting.popleft().json()
 
 
@@ -183,12 +190,14 @@ class Stream:
             first, last = self._first + 1, self._first
         elif last < first:
             return None
-        types = [
-            kind
-            for kind, gone in (("event", self._gone_events), ("reading", self._gone_readings))
-            if gone >= first or after > self._seq
-        ]
-        return Message(last, "gone", {"first": first, "last": last, "types": types, "drops": self.drops})
+        gone = {"first": first, "last": last, "types": self.missing_types(after), "drops": self.drops}
+        return Message(last, "gone", json_of(gone))
+
+    def missing_types(self, after: int) -> list[Kind]:
+        """Of which types some are gone for a viewer that has seen all up to `after`."""
+        is_other = after > self._seq  # of another stream
+        gone: tuple[tuple[Kind, int], ...] = (("event", self._gone_events), ("reading", self._gone_readings))
+        return [kind for kind, last in gone if last > after or is_other]
 
     def after(self, after: int) -> Iterator[Message]:
         """What is kept of both rings, in order; all of it for a number of another stream."""
