@@ -9,12 +9,8 @@ a process that does nothing but wait for instants as often: what the machine doe
 from __future__ import annotations
 
 import asyncio
-import json
 import shutil
-import signal
 import statistics
-import subprocess
-import sys
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,25 +27,12 @@ from stand.running.order import Order
 from stand.running.run import run_real
 from stand.simulator import Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
+from tests.bench.waiting import beside, p99, waiting
 from tests.system.simulated_orders import simulated_order
 
 FRAMES = 101  # so that the 99th percentile is not the longest
 INTERVAL_s = 0.5
 LIMIT_ms = 2.0
-WAIT = """
-import json, sys
-from foundation.clock import WallClock, block_until
-
-clock, late_ms = WallClock(), []
-due_ns, period_ns = clock.now_ns(), round(1e9 * float(sys.argv[1]))
-try:
-    while True:
-        due_ns += period_ns
-        block_until(clock, due_ns)
-        late_ms.append((clock.now_ns() - due_ns) / 1e6)
-except KeyboardInterrupt:
-    print(json.dumps(late_ms))
-"""
 RECIPE = f"""
 name: bench
 experiments:
@@ -97,25 +80,7 @@ def schedule(what: str, late_ms: Sequence[float], bare_ms: Sequence[float], more
         return skipped(what, f"{busy} of {FRAMES} frames came due while the camera was sending")
     seen = f"p99 of {len(late_ms)} frames; median {statistics.median(late_ms):.2f}, greatest {max(late_ms):.2f} ms"
     seen += f"; {busy} more came due while the camera was sending{more}"
-    seen += f"; a process that only waits: p99 {_p99(bare_ms):.2f}, greatest {max(bare_ms):.2f} ms"
-    return at_most(LIMIT_ms, Figure(what, "ms", _p99(late_ms), seen))
-
-
-def _p99(values: Sequence[float]) -> float:
-    return statistics.quantiles(values, n=100, method="inclusive")[98]
-
-
-@contextmanager
-def _waiting() -> Generator[list[float]]:
-    """How late a process beside that only waits goes on, ms; filled when the inside is left."""
-    late_ms: list[float] = []
-    command = [sys.executable, "-c", WAIT, str(INTERVAL_s)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield late_ms
-        finally:
-            process.send_signal(signal.SIGINT)
-            late_ms += json.loads(process.communicate()[0])
+    return at_most(LIMIT_ms, beside(Figure(what, "ms", p99(late_ms), seen), bare_ms))
 
 
 async def _nobody(_: Path) -> None:
@@ -139,7 +104,7 @@ def deviations_ms(
     def watch(hub: Hub) -> None:
         hub.subscribe(follow)
 
-    with _noted_dues() as dues_ns, _waiting() as bare_ms:
+    with _noted_dues() as dues_ns, waiting(INTERVAL_s) as bare_ms:
         asyncio.run(run_real(order, out, watch, begun or _nobody))
     shutil.rmtree(out)
     frames = zip(triggered_ns, dues_ns, [0, *arrived_ns], strict=False)
