@@ -6,7 +6,16 @@ from collections.abc import Iterator, Mapping
 
 from drivers.devices.thermometers import PLACES, Role, ThermometerSettings, by_channel
 
-GUARDED: tuple[Role, ...] = ("air", "granite_inside")  # without which nothing is heated
+GUARDED: tuple[Role, ...] = ("air",)  # without which nothing is heated
+
+
+def witnesses(thermometers: Mapping[str, ThermometerSettings], controlling: str = "") -> list[str]:
+    """The thermometers by which the guard finds that the regulator's probe and the air's are wrong alike: the granite
+    inside, which follows the air, and safety ones; not the one that `controlling` names."""
+    sensors = by_channel(thermometers)
+    return [
+        name for name, each in sensors.items() if (name == "granite_inside" or each.is_safety) and name != controlling
+    ]
 
 
 def unfit_roles(thermometers: Mapping[str, ThermometerSettings]) -> Iterator[str]:

@@ -53,6 +53,13 @@ SAFE_RANGES = (
     SafeRange("recording.stop_frames_below_GB", " GB", "telemetry would find the disk full", low=0.5),
     SafeRange("bus.timeout_s", " s", "the guard could wait longer for a silent unit than a permit lives", high=2),
 )
+_WITNESSES = SafeRange(
+    "witnesses",
+    "",
+    "no thermometer would show that the regulator's probe and the air's are wrong alike; give another one "
+    "`role: granite_inside`, or `role: safety` in the chamber's air",
+    low=1,
+)
 _CORRECTION = "a temperature that far from what the module indicates is a slip in the file, and hides heat"
 
 
@@ -82,6 +89,7 @@ def check(config: object, thermometers: Mapping[str, ThermometerSettings], accep
 def _values(config: object, thermometers: Mapping[str, ThermometerSettings]) -> Iterator[tuple[SafeRange, float]]:
     for safe in SAFE_RANGES:
         yield safe, float(attrgetter(safe.path)(config))
+    yield _WITNESSES, float(len(attrgetter(_WITNESSES.path)(config)))
     for name, entry in thermometers.items():
         path = f"thermometers.{name}.polynomial"
         yield SafeRange(path, " K", _CORRECTION, high=10), largest_correction_K(entry.offset_K, entry.polynomial)
@@ -115,7 +123,7 @@ def largest_correction_K(offset_K: float, polynomial: Sequence[float]) -> float:
 
 def accepted_text(accepted: Mapping[str, float]) -> str:
     """What a start says of values outside their ranges that were accepted, by their paths."""
-    ranges = {safe.path: str(safe) for safe in SAFE_RANGES}
+    ranges = {safe.path: str(safe) for safe in (*SAFE_RANGES, _WITNESSES)}
     usual = "a correction of at most 10 K"
     weakened = [f"{path} {value:g} (safe: {ranges.get(path, usual)})" for path, value in accepted.items()]
     return f"guard.accept weakens the protection: {', '.join(weakened)}"

@@ -37,7 +37,7 @@ from stand.config.dew import DewConfig, EndingConfig
 from stand.config.guard_section import GuardConfig
 from stand.config.interface_section import InterfaceConfig
 from stand.config.older_forms import CAMERA, renewed
-from stand.config.roles import unfit_roles
+from stand.config.roles import unfit_roles, witnesses
 from stand.config.safe_ranges import check, outside
 from stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
 
@@ -209,6 +209,11 @@ class StandConfig(Document):
             yield f"regulator.thermometer: there is no thermometer {regulator.thermometer}, by its role {known}"
         if regulator.sample_s < self.thermometer_module.poll_s:
             yield "regulator.sample_s is shorter than thermometer_module.poll_s: between two readings nothing is new"
+        if regulator.thermometer == "air" and not self.witnesses:
+            yield (
+                "regulator controls by the air's thermometer, and no other would show that this one is wrong; give "
+                "another one `role: granite_inside`, or `role: safety` in the chamber's air"
+            )
         law, compressor = regulator.law, self.compressor
         _, coldest_percent = split(law.lowest_percent, law.dead_band_percent)
         if law.lowest_percent < 0 and coldest_percent <= compressor.start_above_cool_percent:
@@ -282,6 +287,12 @@ class StandConfig(Document):
     def sensors(self) -> dict[str, ThermometerSettings]:
         """The thermometers by what they are read as: their roles, or their own names."""
         return by_channel(self.thermometers)
+
+    @property
+    def witnesses(self) -> list[str]:
+        """The thermometers that show when the regulator's probe and the air's are wrong alike."""
+        software = isinstance(self.regulator, SoftwareRegulatorSettings)
+        return witnesses(self.thermometers, self.regulator.thermometer if software else "")
 
     @property
     def set_points_degC(self) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from stand.config.guard_section import CoolingConfig, HeaterOffConfig, HeatingConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
+from stand.guarding.surroundings import Surroundings
 
 Memory = TypeVar("Memory")
 
@@ -100,7 +101,7 @@ class Off:
 
 
 def warming_while_off(
-    limits: HeaterOffConfig, air: str, regulator: str, permit: str, surroundings: tuple[str, ...]
+    limits: HeaterOffConfig, air: str, regulator: str, permit: str, surroundings: Surroundings
 ) -> Rule:
     """The air rises though the regulator's output is 0 or the permit is off: a welded relay or a shorted SSR.
 
@@ -109,14 +110,14 @@ def warming_while_off(
     """
     mv_heat, set_point, running = (f"{regulator}.{quantity}" for quantity in ("mv_heat", "sp", "running"))
 
-    def is_heat(readings: Readings, air_degC: float) -> bool:
+    def is_heat(readings: Readings, air_degC: float, around_degC: tuple[float, ...]) -> bool:
         if value_of(readings, running) == 1 and air_degC <= value_of(readings, set_point):
             return False
-        warmed_K = (air_degC - value_of(readings, channel) for channel in surroundings)
-        known = [excess_K for excess_K in warmed_K if not math.isnan(excess_K)]
+        known = [air_degC - degC for degC in around_degC if not math.isnan(degC)]
         return bool(known) and min(known) > limits.above_surroundings_K
 
     def step(last: Off | None, readings: Readings, now_ns: int) -> tuple[Off | None, Fault | None]:
+        around_degC = surroundings(readings, now_ns)  # at each look, for one that follows the air
         if not (value_of(readings, mv_heat) <= 0 or value_of(readings, permit) == 0):
             return None, None
         air_degC = value_of(readings, air)
@@ -126,7 +127,7 @@ def warming_while_off(
             return last, None
         lowest_degC = air_degC if last.lowest_degC is None else min(last.lowest_degC, air_degC)
         state = Off(last.since_ns, lowest_degC)
-        if air_degC - lowest_degC >= limits.rise_K and is_heat(readings, air_degC):
+        if air_degC - lowest_degC >= limits.rise_K and is_heat(readings, air_degC, around_degC):
             text = f"{air} has risen from {lowest_degC:.2f} to {air_degC:.2f} degC with the heater off"
             return state, Fault("warming_while_off", text)
         return state, None
@@ -143,7 +144,7 @@ class CompressorRun:
 
 
 def cooling_in_vain(
-    limits: CoolingConfig, air: str, regulator: str, compressor: str, surroundings: tuple[str, ...]
+    limits: CoolingConfig, air: str, regulator: str, compressor: str, surroundings: Surroundings
 ) -> Rule:
     """The compressor runs, the regulator's heating output is 0, and yet the air, which nothing around it warms, does
     not fall: a welded relay that heats as much as is cooled, or a compressor that does not cool. The two look alike.
@@ -152,13 +153,11 @@ def cooling_in_vain(
     """
     mv_heat = f"{regulator}.mv_heat"
 
-    def is_alone(readings: Readings, air_degC: float) -> bool:
-        return all(value_of(readings, channel) < air_degC - limits.margin_K for channel in surroundings)
-
     def step(last: CompressorRun | None, readings: Readings, now_ns: int) -> tuple[CompressorRun | None, Fault | None]:
-        air_degC = value_of(readings, air)
+        air_degC, around_degC = value_of(readings, air), surroundings(readings, now_ns)
+        is_alone = all(degC < air_degC - limits.margin_K for degC in around_degC)
         cools = value_of(readings, compressor) == 1 and value_of(readings, mv_heat) <= 0
-        if not (cools and is_alone(readings, air_degC)):
+        if not (cools and is_alone):
             return None, None
         if last is None or air_degC <= last.air_degC - limits.fall_K:
             return CompressorRun(now_ns, air_degC), None

@@ -48,6 +48,7 @@ from stand.guarding.plausibility import (
     stuck_while_other_moves,
     warming_while_off,
 )
+from stand.guarding.surroundings import Following, Surroundings, measured, together
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",
@@ -93,9 +94,14 @@ def safety_thermometers(config: StandConfig) -> tuple[str, ...]:
     return tuple(f"thermometers.{name}" for name, each in config.sensors.items() if each.is_safety)
 
 
+def granite(config: StandConfig) -> tuple[str, ...]:
+    """The granite inside, where a thermometer measures it."""
+    return (GRANITE,) if "granite_inside" in config.sensors else ()
+
+
 def vital(config: StandConfig) -> tuple[str, ...]:
     """Without a fresh reading of each of these there is no heat."""
-    return (PV, AIR, GRANITE, *safety_thermometers(config))
+    return (PV, AIR, *granite(config), *safety_thermometers(config))
 
 
 def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
@@ -120,7 +126,7 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
     return (
         Watch(over_temperature(PV, limits.max_air_degC)),
         *(Watch(over_temperature(channel, limits.max_air_degC)) for channel in (AIR, *safety_thermometers(config))),
-        Watch(over_temperature(GRANITE, limits.max_granite_degC)),
+        *(Watch(over_temperature(channel, limits.max_granite_degC)) for channel in granite(config)),
         *(
             Watch(over_temperature(f"{name}.temperature", limits.max_camera_degC, cuts_camera=True))
             for name in config.cameras
@@ -135,11 +141,11 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
 def _heat(config: StandConfig) -> tuple[Watch, ...]:
     """Heat that does not come, comes unasked, or is held back. The first may be a detached sensor, the second is out
     of control; a relay that does not close or answer, or a compressor that does not cool, can be put right."""
-    limits, around = config.guard, _surroundings(config)
+    limits = config.guard
     return (
         Watch(heater_not_warming(limits.heating, "regulator", PERMIT)),
-        Watch(warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, around)),
-        Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, around), action="hold"),
+        Watch(warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, _surroundings(config))),
+        Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, _surroundings(config)), action="hold"),
         Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
         Watch(trustworthy(PERMIT, limits.keys_s), limits.keys_s, "hold"),
     )
@@ -182,12 +188,16 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
     for its temperature is unknown; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
     found before anything is warm. The camera's own temperature is not required: one that is stale is a warning."""
     limits, chamber = config.guard, config.chamber
-    granite, frost = limits.granite_feels, limits.frozen
+    feels, frost = limits.granite_feels, limits.frozen
     module = tuple(f"thermometers.{name}" for name in config.sensors)
     return (
         Watch(too_much_heat(limits.heat_max_Wh_per_h, chamber.heater_W, "regulator", PERMIT)),
         *(Watch(heat_not_felt(limits.heat_felt, chamber, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
-        *(Watch(granite_feels(granite, chamber.granite_lag_s, GRANITE, probe)) for probe in (PV, AIR)),
+        *(
+            Watch(granite_feels(feels, chamber.granite_lag_s, body, probe))
+            for body in granite(config)
+            for probe in (PV, AIR)
+        ),
         *(
             Watch(camera_feels(limits.camera_feels, chamber.camera_lag_s, f"{name}.temperature", probe))
             for name in config.cameras
@@ -196,16 +206,19 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
         Watch(output_not_as_needed(limits.needed_output, "regulator", PERMIT, COMPRESSOR, FLAP)),
         *(
             Watch(frozen(channel, module, frost.step_K, frost.after_s, "regulator"), action="hold")
-            for channel in (AIR, GRANITE)
+            for channel in (AIR, *granite(config))
         ),
         *(Watch(camera_stale(config, name), action="warn") for name in config.cameras),
         Watch(first_heat(limits.first_heat, AIR, "regulator", PERMIT), action="hold"),
     )
 
 
-def _surroundings(config: StandConfig) -> tuple[str, ...]:
-    """What could warm the air, as far as it is measured."""
-    return (LABORATORY, GRANITE) if "laboratory" in config.sensors else (GRANITE,)
+def _surroundings(config: StandConfig) -> Surroundings:
+    """What could warm the air."""
+    found = measured(*((LABORATORY,) if "laboratory" in config.sensors else ()), *granite(config))
+    if granite(config):
+        return found
+    return together(found, Following(AIR, config.chamber.granite_lag_s, config.limits.chamber_degC[1]))
 
 
 def camera_stale(config: StandConfig, name: str) -> Rule:
@@ -242,10 +255,10 @@ def _flap_watches(config: StandConfig, announced: Announcements) -> tuple[Watch,
 
 
 def cold_parts(config: StandConfig) -> tuple[str, ...]:
-    """What water would settle on first: the target, the granite it stands on without a thermometer of its own, and the
+    """What water would settle on first, as far as it is measured: the target, or the granite it stands on, and the
     cameras."""
-    target = "thermometers.artifact" if "artifact" in config.sensors else GRANITE
-    return (target, *(f"{name}.temperature" for name in config.cameras))
+    target = ("thermometers.artifact",) if "artifact" in config.sensors else granite(config)
+    return (*target, *(f"{name}.temperature" for name in config.cameras))
 
 
 def _dew(config: StandConfig) -> tuple[Watch, ...]:

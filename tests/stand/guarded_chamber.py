@@ -6,7 +6,7 @@ and noise, the camera's steps of 0.25 K. The guard's rules look at them; when on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from drivers.sim.physics.plant import Plant, PlantSpec
@@ -31,13 +31,14 @@ COMPRESSOR = CompressorConfig()
 class Chamber:
     """One drawn chamber with its regulator. `poll` moves it on by POLL_S and publishes what the daemon would read.
 
-    chamber_seed: which chamber is drawn, None for the standard one.
+    chamber_seed: which chamber is drawn, None for the standard one. channels: its thermometers and where they end.
     """
 
     chamber_seed: int | None
     laboratory_degC: float = 24.0
     camera_powered: bool = True
     hub: Hub = field(default_factory=Hub)
+    channels: Mapping[str, int] = field(default_factory=lambda: CHANNELS)
 
     def __post_init__(self) -> None:
         self.clock = FollowedClock(START_NS)
@@ -46,7 +47,9 @@ class Chamber:
         )
         self.plant = Plant(spec, START_NS)
         self.regulator = FakeRegulator(self.plant, self.clock, 1)
-        self.thermometers = FakeThermometers(self.plant, self.clock, 3, CHANNELS, seed=self.chamber_seed or 0)
+        self.thermometers = FakeThermometers(
+            self.plant, self.clock, 3, dict(self.channels), seed=self.chamber_seed or 0
+        )
         self.permitted = self.running = False
         self.flap_open = 0.0
         self.plant.flap_open_at = lambda time_ns: self.flap_open
@@ -127,7 +130,7 @@ class Chamber:
     def _temperatures(self, now_ns: int) -> Iterator[Reading]:
         reply = self.thermometers.handle(bytes.fromhex("0400000006"))
         assert reply is not None
-        for name, number in CHANNELS.items():
+        for name, number in self.channels.items():
             word = int.from_bytes(reply[2 + 2 * number : 4 + 2 * number], "big", signed=True)
             channel = f"thermometers.{name}"
             if word in (0x7FFF, -0x8000):

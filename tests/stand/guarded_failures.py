@@ -86,6 +86,7 @@ FAILURES: dict[str, Action] = {
     "granite stuck, PV low": _all(_granite_stuck, _pv_low),
 }
 PHASES = ("heating", "holding", "cooling")
+EARLY_S = 900.0  # at a set-point of which the guard has not learned yet how much heat it needs
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,8 @@ def _phase(
     if phase == "heating":
         middle_degC = (24.0 + hot_degC) / 2
         return [*begin, (0.0, _set(hot_degC))], lambda air: air >= middle_degC, [(held_s, _nothing)]
-    hold: list[tuple[float, Action]] = [*begin, (5400.0, _set(hot_degC))]
-    if phase == "holding":
+    hold: list[tuple[float, Action]] = [*begin, (EARLY_S if phase == "early" else 5400.0, _set(hot_degC))]
+    if phase in ("holding", "early"):
         return hold, lambda air: True, [(held_s, _nothing)]
     after = [(3600.0, _nothing), (held_s, _set(hot_degC))]
     return [*hold, (0.0, _set(hot_degC - 14.0))], lambda air: air <= hot_degC - 7.0, after
@@ -123,7 +124,8 @@ class Night:
     """A chamber at the instant of a phase at which its sensors fail, the guard's whole table looking at it."""
 
     def __init__(self, phase: str, config: StandConfig, chamber_seed: int | None, hot_degC: float) -> None:
-        self._chamber = Chamber(chamber_seed)
+        channels = {name: each.channel for name, each in config.sensors.items()}
+        self._chamber = Chamber(chamber_seed, camera_powered=bool(config.cameras), channels=channels)
         self._table = watches(config, Announcements())
         self._phase, self._hot_degC = phase, hot_degC
         before, is_there, _ = _phase(phase, hot_degC, HELD_S)

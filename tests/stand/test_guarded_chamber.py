@@ -4,7 +4,9 @@ wrong, and good nights are left alone."""
 from collections.abc import Callable, Iterable
 
 import pytest
+import yaml
 
+from foundation.documents import parse_document
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
@@ -15,6 +17,23 @@ from tests.stand.guarded_recipes import RECIPES, Player
 CONFIG = load_config(packaged("", "simulated"))
 LIMIT_DEGC = CONFIG.guard.max_air_degC + 3.0
 CHAMBERS = range(10)
+
+
+def with_thermometers(**thermometers: dict[str, object]) -> StandConfig:
+    """The simulated stand with these alone, and no camera; one witness too few is accepted by name."""
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data |= {"thermometers": thermometers, "cameras": {}}
+    if "ceiling" not in thermometers:
+        data.setdefault("guard", {})["accept"] = ["witnesses"]
+    return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
+
+
+# Without the granite: with a safety thermometer in its place each failure is found. With the air's alone, and the
+# regulator's own probe, any one that fails is, and both that fall out or stand still; not both that are wrong alike.
+SAFETY = with_thermometers(air={"channel": 3}, ceiling={"channel": 0, "role": "safety"})
+ALONE = with_thermometers(air={"channel": 3})
+ALIKE = ("both stuck low", "both drift")
+OF_GRANITE = ("granite stuck, PV low",)
 BIG_STEPS_DEGC = (24.0, 60.0, -5.0, 60.0, 24.0, 27.0, 24.0)  # as no installed recipe makes
 
 
@@ -56,6 +75,40 @@ def test_the_air_stays_below_its_limit_when_probes_fail(
     failure: str, phase: str, chamber_seed: int | None, hot_degC: float
 ):
     check(Night(phase, CONFIG, chamber_seed, hot_degC).outcome(failure), failure)
+
+
+@pytest.mark.parametrize(
+    ("config", "failure", "phase", "chamber_seed", "hot_degC"),
+    [
+        (SAFETY, "both stuck low", "early", 9, 60.0),
+        (SAFETY, "both out of the chamber", "heating", 0, 52.0),
+        (ALONE, "PV stuck low", "early", 9, 60.0),
+        (ALONE, "PV drifts", "holding", 2, 52.0),
+        (ALONE, "both stuck low, air without noise", "early", 9, 52.0),  # at 60 degC it ends at 68.3
+        (ALONE, "both out of the chamber", "heating", 0, 52.0),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_so_it_does_without_a_thermometer_in_the_granite(
+    config: StandConfig, failure: str, phase: str, chamber_seed: int, hot_degC: float
+):
+    check(Night(phase, config, chamber_seed, hot_degC).outcome(failure), failure)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("phase", [*PHASES, "early"])
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_so_it_does_in_every_failure_without_a_thermometer_in_the_granite(phase: str):
+    for chamber_seed in (None, *CHAMBERS):
+        for config, hot_degC, but in ((SAFETY, 60.0, OF_GRANITE), (ALONE, 52.0, (*OF_GRANITE, *ALIKE))):
+            failures = [failure for failure in FAILURES if failure not in but]
+            for failure, outcome in Night(phase, config, chamber_seed, hot_degC).outcomes(failures).items():
+                check(outcome, failure)
+
+
+def test_a_good_day_without_a_thermometer_in_the_granite_is_left_alone():
+    chamber = Chamber(1, camera_powered=False, channels={"air": 3})
+    assert objections(chamber, big_steps(), ALONE) == []
 
 
 @pytest.mark.nightly

@@ -21,6 +21,7 @@ from stand.guarding.plausibility import (
     warming_while_off,
 )
 from stand.guarding.rules import Announcements, watches
+from stand.guarding.surroundings import Following, measured, together
 from tests.stand.chamber_night import START_NS, Night
 
 LIMITS = HeatingConfig(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)
@@ -336,7 +337,7 @@ def test_air_that_rises_with_the_heater_off_was_heated_unless_something_else_can
         AIR,
         "regulator",
         PERMIT,
-        (LABORATORY, GRANITE),
+        measured(LABORATORY, GRANITE),
     )
     publish_all(hub, WELDED | changed)
     found_s: list[int] = []
@@ -345,3 +346,31 @@ def test_air_that_rises_with_the_heater_off_was_heated_unless_something_else_can
         if rule(hub, seconds_ns(second)) is not None:
             found_s.append(second)
     assert found_s[:1] == ([290] if trips else [])
+
+
+def test_a_granite_without_a_thermometer_is_taken_for_what_the_air_makes_of_it():
+    hub, granite = Hub(), Following(AIR, lag_s=4000.0, warmest_degC=40.0)
+    around = together(measured(LABORATORY), granite)
+    publish_all(hub, {AIR: 20.0, LABORATORY: 24.0})
+    assert around(hub, 0) == (24.0, 40.0)
+    for second in range(10, 4001, 10):
+        found = around(hub, seconds_ns(second))
+    assert found == (24.0, pytest.approx(20 + 20 * math.exp(-1)))
+    publish(hub, AIR, math.nan)  # unknown air leaves it as it is
+    assert around(hub, seconds_ns(8000)) == found
+    publish(hub, AIR, 60.0)
+    for second in range(8000, 40_000, 100):
+        found = around(hub, seconds_ns(second))
+    assert found[1] == pytest.approx(60.0, abs=0.1)
+
+
+def test_on_a_stand_without_the_granite_a_welded_relay_is_found_once_the_air_is_above_all_that_could_warm_it():
+    hub = Hub()
+    rule = warming_while_off(HeaterOffConfig(), AIR, "regulator", PERMIT, Following(AIR, 4300.0, 40.0))
+    publish_all(hub, WELDED | {GRANITE: math.nan, LABORATORY: math.nan})
+    found_s: list[int] = []
+    for second in range(0, 30_000, 10):
+        publish(hub, AIR, 24.0 if second < 20_000 else 24.0 + (second - 20_000) / 100)
+        if rule(hub, seconds_ns(second)) is not None:
+            found_s.append(second)
+    assert 20_500 <= found_s[0] < 20_600  # 5 K above what the air was, 24.4 degC by then

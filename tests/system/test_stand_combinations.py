@@ -12,7 +12,9 @@ from typing import Any
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from compensation.cli import app as compensate
 from foundation.clock import VirtualClock
 from foundation.documents import parse_document
 from foundation.errors import ConfigError
@@ -68,7 +70,9 @@ def chamber(protocol: str) -> Choice:
     def change(data: Data) -> None:
         del data["regulator"]
         known: Data = {"protocol": protocol, "address": "tcp:127.0.0.1:15023", "gap_s": 0.0, "poll_s": 5.0}
-        data["climate_chamber"] = known | ({} if protocol in ("espec", "simserv") else {"limits_at_panel_degC": [-10, 60]})
+        data["climate_chamber"] = known | (
+            {} if protocol in ("espec", "simserv") else {"limits_at_panel_degC": [-10, 60]}
+        )
 
     return Choice(protocol, change)
 
@@ -94,6 +98,15 @@ def thermometers(*names: str) -> Callable[[Data], None]:
     return change
 
 
+def one_thermometer(data: Data) -> None:
+    """Of the air. Ours controls by another one, or it could not be found wrong."""
+    if data.get("regulator", {}).get("kind") == "software":
+        thermometers("air", "granite_inside")(data)
+        return
+    thermometers("air")(data)
+    data.setdefault("guard", {})["accept"] = ["witnesses"]
+
+
 def sixteen(data: Data) -> None:
     data["thermometer_module"] |= {"registers": "adam-4015", "further_units": [5, 6]}
     data["thermometers"] |= {f"pt_{number}": {"channel": number} for number in range(5, 16)}
@@ -116,6 +129,7 @@ def beside(data: Data) -> None:
 
 
 NO_LABORATORY = "no thermometer in the laboratory"
+NO_GRANITE = ("no thermometer in the granite inside", "no witness of the air")
 PLACES: Mapping[str, tuple[Choice, ...]] = {
     "heat": (
         Choice("omron-e5cc", nothing),
@@ -138,6 +152,7 @@ PLACES: Mapping[str, tuple[Choice, ...]] = {
     ),
     "thermometers": (
         Choice("5", nothing),
+        Choice("1", one_thermometer, (NO_LABORATORY, *NO_GRANITE)),
         Choice("2", thermometers("air", "granite_inside"), (NO_LABORATORY,)),
         Choice("16", sixteen),
     ),
@@ -229,6 +244,8 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
                 check_plan(recipe(does).plan(), config)
     said = [sentence.partition(":")[0] for sentence in absences(config)]
     expected = [absent for choice in combination for absent in choice.absent]
+    if "granite_inside" in data["thermometers"]:  # ours is not controlled by the only one
+        expected = [each for each in expected if each not in NO_GRANITE]
     if "relays" in data and "no relay board" in expected:  # a regulator keeps its board
         expected.remove("no relay board")
     assert sorted(said) == sorted(expected)
@@ -269,8 +286,60 @@ async def test_each_combination_runs_and_records_what_it_lacks(combination: Comb
     assert all(len(session.readings(f"thermometers.{name}")[1]) == len(air_degC) for name in order.config.sensors)
 
 
-def test_one_thermometer_alone_guards_no_heat():
+CYCLE: Data = {
+    "equilibrium_s": 120,
+    "set_points_degC": [30, 20, 26],
+    "dwell_s": 120,
+    "reference_frames": 1,
+    "frames_per_point": 1,
+}
+
+
+def chosen(**names: str) -> Combination:
+    """The first choice of each place but for those named."""
+    return tuple(
+        next(choice for choice in choices if choice.name == names.get(place, choices[0].name))
+        for place, choices in PLACES.items()
+    )
+
+
+FEWEST = chosen(relays="no compressor", flap="no flap", axes="no axes", thermometers="1")
+
+
+@pytest.mark.parametrize(
+    "combination",
+    [FEWEST, *(pytest.param(each, marks=pytest.mark.nightly) for each in RUN_BY_NIGHT if each[5].name != "no camera")],
+    ids=named,
+)
+async def test_each_combination_is_reported(combination: Combination, tmp_path: Path):
+    require_aravis()
+    data = written(combination, tmp_path)
+    if "imager" in data:
+        data["imager"]["folder"] = str(tmp_path / "pictures")
+    at = {"table_position": {"linear": 2, "rotary": 1}} if data["axes"] else {}
+    points = [30, 26, 28] if combination[1].name == "no compressor" else CYCLE["set_points_degC"]
+    written_recipe = yaml.safe_dump(
+        {"name": "cycle", "experiments": [{"thermal_cycle": {**CYCLE, **at, "set_points_degC": points}}]}
+    )
+    cycle = parse_document(written_recipe, Recipe, "recipe.yaml")
+    order = Order(configured(data), cycle, yaml.safe_dump(data), written_recipe, TARGET)
+    folder = await run_virtual(order, tmp_path / "out", 1, lambda _: None)
+    for camera in data["cameras"]:
+        page = tmp_path / f"{camera}.html"
+        ended = CliRunner().invoke(compensate, ["report", str(folder), "-o", str(page), "--camera", camera])
+        assert ended.exit_code == 0, ended.stderr
+        assert "Drift over temperature" in page.read_text(encoding="utf-8")
+
+
+def test_one_thermometer_alone_has_to_be_accepted_by_name_and_is_not_controlled_by():
     data = copy.deepcopy(SIMULATED)
     thermometers("air")(data)
-    with pytest.raises(ConfigError, match="thermometers lacks granite_inside, without which nothing is heated"):
+    with pytest.raises(
+        ConfigError, match=r"witnesses: 0 is outside the safe range \(at least 1\): no thermometer would"
+    ):
+        configured(data)
+    one_thermometer(data)
+    configured(data)
+    software(data)
+    with pytest.raises(ConfigError, match="regulator controls by the air's thermometer, and no other would show"):
         configured(data)
