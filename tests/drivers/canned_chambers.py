@@ -148,14 +148,20 @@ def texts(kind: Literal["hart", "vaisala"]) -> Parser:
         return None if found is None else plain(found)
 
     def between(line: str, word: str, unit: str) -> float | str | None:
-        """The first number between them, None for one that was not measured; why there is none."""
-        for part in line.split(word)[1:]:
-            number = part.partition(unit)[0].strip() if unit in part else ""
+        """The first number between them, None for one that was not measured; why there is none. The word is not the end
+        of another one, and `t:` begins the line."""
+        at = line.find(word)
+        while at >= 0:
+            text, found, _ = line[at + len(word) :].partition(unit)
+            number = text.strip()
             whole, point, rest = number.removeprefix("-").partition(".")
-            if number and not number.strip("*"):
+            before = line[max(0, at - 1) : at]
+            is_word = at == 0 if kind == "hart" else not (before.isalnum() or before == "_")
+            if found and is_word and number and not number.strip("*"):
                 return None
-            if whole.isdecimal() and (rest.isdecimal() if point else True):
+            if found and is_word and whole.isdecimal() and (rest.isdecimal() if point else True):
                 return float(number)
+            at = line.find(word, at + 1)
         return f"no {word}"
 
     words = (
