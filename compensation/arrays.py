@@ -41,12 +41,13 @@ def observations_of(
     experiments.steps.Role; else `reference` at the set-point nearest to reference_degC (else that of the first frame)
     and `fit` at the others. air: (time_ns, degC), both (A,), near the camera, for the thermal form. sigma_px: standard
     uncertainty of a coordinate, where there is no covariance_px2 (F, N, 2, 2). image_size: (width, height), else what
-    holds the centres. ValueError when shapes do not agree.
+    holds the centres. ValueError when shapes do not agree, or something cannot be what it is given as.
     """
     centres, camera = _seen(centres_px, camera_degC)
     frames, count = centres.shape[:2]
     instants, chamber, roles = _columns(camera, time_ns, chamber_degC, role, reference_degC)
     missing, size = np.isnan(centres).any(axis=2) | np.isnan(camera)[:, None], image_size or _size_of(centres)
+    covariance = _covariance(covariance_px2, sigma_px, missing)
     history = None if air is None else _history(air, instants, camera)
     return Observations(
         target=target or _unnamed(count),
@@ -62,23 +63,49 @@ def observations_of(
         camera_degC=camera,
         air_degC=_air_at(history, instants),
         centres_px=np.where(missing[..., None], np.nan, centres),
-        covariance_px2=np.where(missing[..., None, None], np.nan, _covariance(covariance_px2, sigma_px)),
+        covariance_px2=np.where(missing[..., None, None], np.nan, covariance),
         flags=np.zeros((frames, count), np.uint8),
         reasons=tuple(map(_reason, camera.tolist(), np.all(missing, axis=1).tolist())),
         histories=() if history is None else (history,),
     )
 
 
-def _covariance(covariance_px2: ArrayLike | None, sigma_px: float) -> Float:
-    """What is given, else that of coordinates with this uncertainty each."""
-    return np.eye(2) * sigma_px**2 if covariance_px2 is None else np.array(covariance_px2, np.float64)
+def _covariance(covariance_px2: ArrayLike | None, sigma_px: float, missing: NDArray[np.bool_]) -> Float:
+    """What is given, else that of coordinates with this uncertainty each, for all of (F, N, 2, 2); ValueError when it
+    is no covariance of a centre that is there."""
+    if covariance_px2 is None:
+        if not sigma_px > 0:
+            raise ValueError(f"sigma_px is {sigma_px}; expected one above 0")
+        return np.eye(2) * sigma_px**2
+    given, shape = _numbers("covariance_px2", covariance_px2), (*missing.shape, 2, 2)
+    if given.shape not in ((2, 2), shape):
+        raise ValueError(f"covariance_px2 has shape {given.shape}, not {shape} or, one for all, (2, 2)")
+    whole = np.broadcast_to(given, shape)
+    xx, xy, yx, yy = whole.reshape(-1, 4).T
+    sound = ((xx > 0) & (yy > 0) & (xx * yy > xy**2) & (xy == yx) & np.isfinite(xx + yy)).reshape(missing.shape)
+    if wrong := np.argwhere(~missing & ~sound).tolist():
+        frame, marker = wrong[0]
+        raise ValueError(
+            f"covariance_px2 of frame {frame}, marker {marker} is no covariance: {whole[frame, marker].tolist()}"
+        )
+    return whole
+
+
+def _numbers(what: str, given: ArrayLike) -> Float:
+    """As an array; ValueError that says which argument holds no numbers, or rows of different lengths."""
+    try:
+        return np.array(given, np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{what}: expected numbers, as many in each row ({error})") from error
 
 
 def _seen(centres_px: ArrayLike, camera_degC: ArrayLike) -> tuple[Float, Float]:
     """Centres (F, N, 2) and temperatures (F,); ValueError when they are not."""
-    centres, camera = np.array(centres_px, np.float64), np.array(camera_degC, np.float64)
+    centres, camera = _numbers("centres_px", centres_px), _numbers("camera_degC", camera_degC)
     if centres.ndim != 3 or centres.shape[2] != 2 or camera.shape != centres.shape[:1] or not len(camera):
         raise ValueError(f"centres are (F, N, 2) and temperatures (F,), not {centres.shape} and {camera.shape}")
+    if not np.isfinite(centres).all(axis=2).any():
+        raise ValueError(f"none of the {len(centres)} frames has a centre: centres_px are all NaN")
     return centres, camera
 
 
@@ -97,6 +124,11 @@ def _columns(
     for what, column in (("time_ns", instants), ("chamber_degC", chamber), ("role", roles)):
         if column.shape != (frames,):
             raise ValueError(f"{what} has shape {column.shape}, not ({frames},)")
+    if (falls := np.flatnonzero(np.diff(instants) <= 0)).size:
+        raise ValueError(f"time_ns does not grow at frame {falls[0] + 1}; give the frames in order of time")
+    known = [str(each) for each in Role]
+    if unknown := sorted(set(roles.tolist()) - set(known)):
+        raise ValueError(f"role has {unknown[0]!r}; there are {', '.join(known)}")
     return instants, chamber, roles
 
 
@@ -128,7 +160,13 @@ def _roles(chamber_degC: Float, reference_degC: float | None) -> NDArray[np.str_
 
 def _history(air: tuple[ArrayLike, ArrayLike], instants: NDArray[np.int64], camera_degC: Float) -> History:
     """What lags are computed from; the camera's supply is on, for it has temperatures."""
-    time_ns, degC = np.array(air[0], np.int64), np.array(air[1], np.float64)
+    if len(air) != 2:
+        raise ValueError(f"air: expected (time_ns, degC), not {len(air)} columns")
+    time_ns, degC = np.array(air[0], np.int64), _numbers("air", air[1])
+    if time_ns.ndim != 1 or time_ns.shape != degC.shape:
+        raise ValueError(
+            f"air: expected (time_ns, degC), two columns of the same length, not {time_ns.shape} and {degC.shape}"
+        )
     good, measured = np.isfinite(degC), np.isfinite(camera_degC)
     nothing = np.empty(0, np.int64), np.empty(0)
     return refined(History(time_ns[good], degC[good], *nothing, instants[measured], camera_degC[measured]))

@@ -101,6 +101,14 @@ def states_of(state: Situation, count: int, memory: Memory) -> States:
     return state if len(state.camera_degC) == count else state.where(np.zeros(count, np.int64))
 
 
+def points_of(xy_px: Float) -> Float:
+    """Points (N, 2), px, also from lists; ValueError when they are none."""
+    points = np.asarray(xy_px, np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"points are (N, 2), not {points.shape}")
+    return points
+
+
 def place_flags(xy_px: Float, hull_px: Float) -> Flags:
     """(N,): PLACE outside the hull, or without a place."""
     outside = ~(distances_px(xy_px, hull_px) >= -MARGIN_PX).all(axis=1)

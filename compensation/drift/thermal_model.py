@@ -20,6 +20,7 @@ from compensation.drift.drift_model import (
     Outside,
     Situation,
     place_flags,
+    points_of,
     range_flags,
     states_of,
 )
@@ -98,7 +99,8 @@ class ThermalModel:
 
     def correct(self, xy_px: Float, state: Situation) -> Float:
         """Where the points (N, 2), px, would be at the reference."""
-        return xy_px + self.shift(xy_px, state)
+        points = points_of(xy_px)
+        return points + self.shift(points, state)
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: of the coefficients, which

@@ -134,6 +134,17 @@ def test_air_over_time_makes_a_history_for_the_thermal_form():
         ({"centres_px": np.zeros((12, 24))}, r"not \(12, 24\)"),
         ({"time_ns": np.zeros(3)}, r"time_ns has shape \(3,\)"),
         ({"role": ["fit"]}, r"role has shape \(1,\)"),
+        ({"role": ["sleep"] * 12}, r"role has 'sleep'; there are reference, fit"),
+        ({"centres_px": [[[1, 2]], [[1, 2], [3, 4]]]}, r"centres_px: expected numbers, as many in each row"),
+        ({"camera_degC": ["warm"] * 12}, r"camera_degC: expected numbers"),
+        ({"centres_px": np.full((12, 24, 2), np.nan)}, r"none of the 12 frames has a centre"),
+        ({"time_ns": np.arange(12)[::-1]}, r"time_ns does not grow at frame 1"),
+        ({"covariance_px2": np.ones((12, 2, 2))}, r"covariance_px2 has shape \(12, 2, 2\), not \(12, 24, 2, 2\)"),
+        ({"covariance_px2": -np.eye(2)}, r"covariance_px2 of frame 0, marker 0 is no covariance"),
+        ({"covariance_px2": np.full((12, 24, 2, 2), np.nan)}, r"covariance_px2 of frame 0, marker 0 is no covariance"),
+        ({"sigma_px": 0.0}, r"sigma_px is 0.0; expected one above 0"),
+        ({"air": np.zeros(12)}, r"air: expected \(time_ns, degC\)"),
+        ({"air": (np.zeros(3), np.zeros(4))}, r"air: expected \(time_ns, degC\), two columns of the same length"),
     ],
 )
 def test_arrays_that_do_not_agree_are_refused(change: dict[str, object], sentence: str):
@@ -141,6 +152,21 @@ def test_arrays_that_do_not_agree_are_refused(change: dict[str, object], sentenc
     given = {"centres_px": centres_px, "camera_degC": camera_degC, "chamber_degC": chamber_degC} | change
     with pytest.raises(ValueError, match=sentence):
         thermostand.observations_of(**given)  # type: ignore[arg-type]
+
+
+def test_lists_do_as_arrays_and_points_of_another_shape_are_refused():
+    centres_px, camera_degC, chamber_degC = arrays()
+    given = thermostand.observations_of(
+        centres_px.tolist(),
+        camera_degC.tolist(),
+        chamber_degC=chamber_degC.tolist(),
+        covariance_px2=[[1e-6, 0], [0, 1e-6]],
+    )
+    model = thermostand.fit(given)
+    place = [[300.0, 200.0]]
+    np.testing.assert_array_equal(model.correct(place, 50.0), model.correct(np.array(place), 50.0))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"points are \(N, 2\), not \(2,\)"):
+        model.correct(np.array([300.0, 200.0]), 50.0)
 
 
 @pytest.mark.nightly
