@@ -52,17 +52,20 @@ def observations_of_table(path: Path, camera_serial: str = "") -> Observations:
     camera_degC = _temperatures(path, of_frames, "camera_degC")
     if _COVARIANCE[0] in rows[0]:
         covariance[at] = _covariances(path, rows)
-    return observations_of(
-        centres,
-        np.empty(0) if camera_degC is None else camera_degC,
-        time_ns,
-        chamber_degC=_temperatures(path, of_frames, "chamber_degC"),
-        role=_roles(path, of_frames.get("role")),
-        air=None if air is None or time_ns is None else (time_ns, air),
-        covariance_px2=covariance if _COVARIANCE[0] in rows[0] else None,
-        camera_serial=camera_serial,
-        name=path.stem,
-    )
+    try:
+        return observations_of(
+            centres,
+            np.empty(0) if camera_degC is None else camera_degC,
+            time_ns,
+            chamber_degC=_temperatures(path, of_frames, "chamber_degC"),
+            role=_roles(path, of_frames.get("role")),
+            air=None if air is None or time_ns is None else (time_ns, air),
+            covariance_px2=covariance if _COVARIANCE[0] in rows[0] else None,
+            camera_serial=camera_serial,
+            name=path.stem,
+        )
+    except ValueError as error:
+        raise SessionError(f"{path}: {error}") from error
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -33,6 +33,7 @@ from compensation.drift.paper_model import PaperModel
 from compensation.history.states import States
 from compensation.history.thermal_history import recorded_history, states_at
 from compensation.one_camera import name_of, own_frames, take
+from experiments.steps import Role
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import one_line_errors
@@ -108,7 +109,20 @@ def _opened(path: Path, model: DriftModel, camera: str | None, incomplete: bool)
     session = open_session(path, camera, incomplete)
     if camera is None:
         take(session, name_of(session, model.facts.camera_serial))
+    _offer_anchor(model, session)
     return session
+
+
+def _offer_anchor(model: DriftModel, session: Session) -> None:
+    """A message where the model is of other nights, and this one has reference frames that would take out what differs
+    between them."""
+    if model.form != "thermal" or session.metadata.get("session_id") in model.facts.session_ids:
+        return
+    if any(mark.parameters.get("role") == str(Role.REFERENCE) for mark in session.steps()):
+        say(
+            "the model was fitted to other sessions, and this one has reference frames of its own: `compensate anchor` "
+            "makes a model of them that leaves less here"
+        )
 
 
 def _of_image(

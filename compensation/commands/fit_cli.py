@@ -68,6 +68,9 @@ def fit(
     A table has a row for each centre: frame, marker, x_px, y_px, camera_degC, and where known time_ns, chamber_degC,
     role, air_degC, var_x_px2, cov_xy_px2, var_y_px2. It needs no session and no stand.
 
+    One night does not show all that another brings: a dead zone in a mount or a thermometer far from the camera may err
+    by 20 to 60 mpx there. Two nights over the same set-points, in another order, show it and claim it.
+
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
     with one_line_errors():

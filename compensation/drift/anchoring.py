@@ -83,4 +83,6 @@ def _updated(model: ThermalModel, observations: Observations, rows: Displacement
         gain = toward / (feature @ toward + noise_px2[motion])
         coefficients[motion] += gain * (seen_px[motion] - feature @ coefficients[motion])
         own -= np.outer(gain, toward)
-    return replace(model, coefficients=coefficients, coefficient_covariance=covariance, other=None)
+    ids = dict.fromkeys((*model.facts.session_ids, *(one.session_id for one in observations.sessions)))
+    facts = replace(model.facts, session_ids=tuple(ids))
+    return replace(model, facts=facts, coefficients=coefficients, coefficient_covariance=covariance, other=None)

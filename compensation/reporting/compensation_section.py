@@ -165,6 +165,13 @@ def uncertainty_section(numbers: Numbers) -> Iterator[Part]:
             ("part within the claimed 95 % interval", *(percent(100 * part) for part in score.coverage_95)),
         ],
     )
+    if len(model.session_ids) == 1:
+        yield Paragraph(
+            "Of one night. What differs between nights is estimated from how its set-points agree: a dead zone in a "
+            "mount, or a thermometer far from the camera, may leave 20 to 60 mpx on another night that one night does "
+            "not show. A second night over the same set-points, in another order and fitted with this one, shows it, "
+            "and the interval then contains it."
+        )
 
 
 def _mpx(values_px: tuple[float, float]) -> Iterator[str]:

@@ -339,8 +339,10 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
     recorded: Recorded, files: dict[str, Path], tmp_path: Path
 ):
     at_first_px = recorded.true_px[3] + 0.5
-    elsewhere = replace(thermal(), facts=replace(thermal().facts, reference_centres_px=at_first_px))
-    save_model(replace(elsewhere, other=paper()), tmp_path / "elsewhere.json")
+    facts = replace(thermal().facts, reference_centres_px=at_first_px, session_ids=("another",))
+    elsewhere = replace(thermal(), facts=facts)
+    other = replace(paper(), facts=replace(paper().facts, session_ids=("another",)))
+    save_model(replace(elsewhere, other=other), tmp_path / "elsewhere.json")
     assert "thermal: " in run("anchor", tmp_path / "elsewhere.json", recorded.path, "-o", tmp_path / "here.json")
     here, observed = load_model(tmp_path / "here.json"), observe(recorded.path)
     assert (here.form, here.other) == ("thermal", None)
@@ -348,6 +350,11 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
     at_reference = np.flatnonzero(observed.of(Role.REFERENCE)).tolist()
     corrected = [here.correct(recorded.true_px[k], states.where(np.array([k]))) for k in at_reference]
     assert np.abs(np.mean(corrected, axis=0) - at_first_px).max() < 0.02
+    place = tmp_path / "place.csv"
+    place.write_text(f"x_px,y_px,time_ns\n100,200,{observed.time_ns[4]}\n")
+    for name, is_offered in (("elsewhere", True), ("here", False)):
+        said = run("apply", tmp_path / f"{name}.json", place, "--session", recorded.path, "-o", tmp_path / "out.csv")
+        assert ("reference frames of its own: `compensate anchor`" in said) == is_offered
     refused = run("anchor", files["paper"], recorded.path, "-o", tmp_path / "none.json", status=1)
     assert "the model has no thermal form" in refused
     refused = run("fit-like", recorded.path, *2 * [files["thermal"]], "-o", tmp_path / "none.json", status=1)

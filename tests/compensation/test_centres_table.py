@@ -64,6 +64,7 @@ def test_a_table_gives_what_it_says(tmp_path: Path) -> None:
         (HEAD + "\n0,0,1\n", "line 2 has not as many cells"),
         (HEAD + "\n0,0,one,2,30\n", "line 2: x_px is 'one', not a number"),
         (HEAD + "\n0,0,inf,2,30\n", "line 2: x_px is 'inf', not a finite number"),
+        (HEAD + "\n0,0,,,30\n1,0,,,31\n", "none of the 2 frames has a centre"),
         (HEAD + "\n0,-1,1,2,30\n", "line 2: marker is '-1'"),
         (HEAD + "\n0,99999999,1,2,30\n", "line 2: marker is '99999999'"),
         (HEAD + "\n0,0,1,2,30\n0,0,1,2,30\n", "line 3: frame 0 has this marker already"),
