@@ -14,9 +14,10 @@ from dataclasses import replace
 from tests.bench.figures import Figure
 
 WAIT = """
-import json, sys
+import json, signal, sys
 from foundation.clock import WallClock, block_until
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 clock, late_ms = WallClock(), []
 due_ns, period_ns = clock.now_ns(), round(1e9 * float(sys.argv[1]))
 try:
