@@ -1,6 +1,7 @@
 """`stand session archive`: copies, says what must wait, shows the rule, and deletes only with --yes."""
 
 import asyncio
+import json
 import shutil
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def test_finished_sessions_are_copied_and_the_others_are_told(sessions: Path, tm
     result = ask("archive", sessions, "--to", nas)
     assert result.stdout.startswith(f"a: copied to {nas}/a and read back (")
     assert "killed: not yet: its run is interrupted and may be resumed" in result.stderr
-    assert ask("archive", sessions, "--to", nas).stdout == "nothing to copy: 1 of 2 have a copy\n"
+    assert ask("archive", sessions, "--to", nas).stdout == f"nothing to copy: 1 of 2 have a copy in {nas}\n"
     assert ask("list", sessions).stdout.splitlines()[0].split()[-1] == "archived"
     assert [line.split()[0] for line in ask("list", sessions, "--not-archived").stdout.splitlines()[1:]] == ["killed"]
     assert f"archived      {nas}/a" in ask("info", sessions / "a").stdout
@@ -57,3 +58,17 @@ def test_what_would_be_deleted_is_shown_and_deleted_with_yes(sessions: Path, tmp
 def test_a_place_is_needed_and_not_among_the_sessions(sessions: Path):
     assert "give --to DIR, or recording.archive_directory" in ask("archive", sessions, status=2).stderr
     assert "the copies belong on another disk" in ask("archive", sessions, "--to", sessions / "x", status=2).stderr
+
+
+def test_copies_elsewhere_do_not_count_and_one_that_is_gone_is_said_to_be(sessions: Path, tmp_path: Path):
+    nas, other = tmp_path / "nas", tmp_path / "other"
+    ask("archive", sessions, "--to", nas)
+    found = json.loads(ask("archive", sessions, "--to", other, "--json").stdout)
+    (name,) = found["copied"]
+    assert (other / name).is_dir()
+    shutil.rmtree(other / name)
+    told = ask("archive", sessions, "--to", other, status=1)
+    assert f"{(other / name).resolve()}: the copy is gone; is its disk connected?" in told.stderr
+    assert not (other / name).exists()  # the disk that its place is on is not filled
+    ask("archive", sessions, "--to", other, "--again")
+    assert (other / name).is_dir()

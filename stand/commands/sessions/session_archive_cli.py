@@ -44,6 +44,7 @@ def archive_sessions(
         Path | None, typer.Option(metavar="DIR", help="Where the copies go; else recording.archive_directory.")
     ] = None,
     config: Annotated[str, typer.Option(help="The stand's file, or an installed configuration.")] = "simulated",
+    again: Annotated[bool, typer.Option("--again", help="Copy those once more whose copy is gone.")] = False,
     delete_after: Annotated[
         float | None,
         typer.Option("--delete-after", metavar="DAYS", min=0, help="Then delete those that ended so long ago."),
@@ -65,7 +66,7 @@ def archive_sessions(
         with suppress(OSError):
             os.nice(_NICENESS)
         done = _Done()
-        _copy(_entries(place), out, done)
+        _copy(_entries(place), out, done, again=again)
         if delete_after is not None:
             _delete(_entries(place), Rule(delete_after), done, yes=yes)
         show(done.data(), ())
@@ -79,10 +80,11 @@ def _entries(place: Path) -> list[Entry]:
 
 @dataclass
 class _Done:
-    """What became of the sessions, by name. due: those that the rule would delete."""
+    """What became of the sessions, by name. gone: whose copy is there no more; due: those that the rule would delete."""
 
     copied: dict[str, Path] = field(default_factory=dict[str, Path])
     waiting: dict[str, str] = field(default_factory=dict[str, str])
+    gone: list[str] = field(default_factory=list[str])
     failed: list[str] = field(default_factory=list[str])
     due: list[str] = field(default_factory=list[str])
     deleted: list[str] = field(default_factory=list[str])
@@ -97,13 +99,26 @@ def _line(text: str) -> None:
         typer.echo(one_line(text))
 
 
-def _copy(entries: Sequence[Entry], out: Path, found: _Done) -> None:
-    """Those that must wait are listed."""
-    waiting = [(entry, reason) for entry in entries if not entry.archived and (reason := unfit(entry))]
-    for entry, reason in waiting:
-        found.waiting[entry.name] = reason
-        say(f"{entry.name}: not yet: {reason}")
-    due = [entry for entry in entries if not entry.archived and not unfit(entry)]
+def _to_copy(entries: Sequence[Entry], out: Path, found: _Done, *, again: bool) -> list[Entry]:
+    """Those without a copy in `out`. Those that must wait are listed, and those whose copy is gone: a disk that is not
+    mounted must not fill the one that its place is on."""
+    due: list[Entry] = []
+    for entry in entries:
+        copy = (out / entry.name).resolve()
+        if not entry.archived and (reason := unfit(entry)):
+            found.waiting[entry.name] = reason
+            say(f"{entry.name}: not yet: {reason}")
+        elif not entry.archived or Path(entry.archived) != copy or (again and not copy.exists()):
+            due.append(entry)
+        elif not copy.exists():
+            found.gone.append(entry.name)
+            found.failed.append(entry.name)
+            tell(SessionError(f"{copy}: the copy is gone; is its disk connected? `--again` makes another"))
+    return due
+
+
+def _copy(entries: Sequence[Entry], out: Path, found: _Done, *, again: bool) -> None:
+    due = _to_copy(entries, out, found, again=again)
     if out.exists() and any(entry.path.stat().st_dev == out.stat().st_dev for entry in due):
         say(f"warning: {out}: is on the disk that the sessions are on")
     done = 0
@@ -123,7 +138,8 @@ def _copy(entries: Sequence[Entry], out: Path, found: _Done) -> None:
                 tell(error)
                 found.failed.append(entry.name)
     if not due:
-        _line(f"nothing to copy: {sum(bool(entry.archived) for entry in entries)} of {len(entries)} have a copy")
+        have = sum(bool(entry.archived) for entry in entries) - len(found.gone)
+        _line(f"nothing to copy: {have} of {len(entries)} have a copy in {out}")
 
 
 def _delete(entries: Sequence[Entry], rule: Rule, found: _Done, *, yes: bool) -> None:
