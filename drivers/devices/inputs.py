@@ -13,7 +13,7 @@ from drivers.wires.modbus_unit import ModbusUnit
 from drivers.wires.registers import RegisterMap
 from foundation.clock import Clock
 from foundation.documents import Document
-from foundation.errors import ConfigError
+from foundation.errors import ConfigError, Unreachable
 from foundation.readings import Reading
 
 
@@ -51,6 +51,7 @@ class Inputs:
         self._unit = ModbusUnit(name, bus, register_map)
         self._points = {contact: f"input_{channel}" for contact, channel in channels.items()}
         self._clock = clock
+        self._probe_due = True
         for contact, point in self._points.items():
             if point not in register_map.points:
                 raise ConfigError(f"{name}.{contact}: register map {register_map.model} has no {point}")
@@ -62,7 +63,7 @@ class Inputs:
 
     async def open(self) -> None:
         """See that the unit answers, and which it is; raises DeviceError."""
-        await self._unit.probe()
+        self._probe_due = True
         await self.read()
 
     async def close(self) -> None:
@@ -70,7 +71,14 @@ class Inputs:
 
     async def read(self) -> tuple[Reading, ...]:
         """Every contact; raises DeviceError."""
-        bits = (await self._unit.snapshot(self._points.values())).bits
+        try:
+            if self._probe_due:
+                await self._unit.probe()
+                self._probe_due = False
+            bits = (await self._unit.snapshot(self._points.values())).bits
+        except Unreachable:
+            self._probe_due = True  # another unit may stand there when something answers again
+            raise
         now_ns = self._clock.now_ns()
         return tuple(
             Reading(f"{self.name}.{contact}", float(bits[point]), "1", now_ns)

@@ -436,6 +436,20 @@ async def test_a_unit_of_another_identity_is_not_used_also_after_a_loss(tmp_path
         assert bench.fake.setpoint_writes == 0
 
 
+async def test_another_chamber_that_answers_after_a_loss_gets_no_command(tmp_path: Path):
+    async with bench_of("simserv", "tcp", tmp_path) as bench:
+        await bench.driver.open()
+        bench.line.unplug()
+        with pytest.raises(Unreachable):
+            await bench.driver.read()
+        bench.fake.serial_number = "58226999990010"
+        bench.line.plug()
+        for call in (bench.driver.set_temperature(40.0), bench.driver.run(), bench.driver.read()):
+            with pytest.raises(DeviceFault, match=r"exchanged: .*58226999990010 answers where .*58226123450010"):
+                await call
+        assert (bench.fake.setpoint_writes, bench.fake.running) == (0, False)
+
+
 # What keeps it safe when the computer dies.
 
 

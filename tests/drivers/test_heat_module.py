@@ -13,7 +13,7 @@ from drivers.devices.regulators.heat_module import HeatModule, HeatModuleSetting
 from drivers.sim.faults import LinkFaults
 from drivers.sim.physics.plant import Plant, PlantSpec
 from drivers.sim.units import heat_module as fake_module
-from drivers.sim.units.heat_module import FakeHeatModule
+from drivers.sim.units.heat_module import TRIPPED, FakeHeatModule
 from drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
 from drivers.sim.wire import TcpWire
 from drivers.wires.bus import Bus, BusSettings
@@ -326,3 +326,36 @@ def test_a_module_without_a_watchdog_that_can_be_read_is_refused():
 def test_currents_that_would_heat_without_us_are_refused(settings: dict[str, float], text: str):
     with pytest.raises(ValidationError, match=text):
         HeatModuleSettings(registers="icpdas-m7024", unit=UNIT, **settings)  # type: ignore[arg-type] - floats
+
+
+async def test_a_module_exchanged_while_it_was_silent_gets_no_heat():
+    bench = Bench()
+    async with driven(bench) as module:
+        await module.open()
+        await module.arm()
+        await heating(bench, module, 50.0)
+        bench.fake.silent = True
+        with pytest.raises(Unreachable):
+            await module.give(50.0)
+        bench.fake.silent, bench.fake.name = False, 0x702800
+        bench.fake.values_mA = [4.0] * 4
+        bench.fake.coils[TRIPPED] = False
+        for _ in range(2):
+            with pytest.raises(DeviceFault, match=r"0x702800.* answers where .*0x702400.* answered before"):
+                await module.give(50.0)
+        assert bench.fake.values_mA == [4.0] * 4
+        await module.off()  # which is never withheld
+
+
+async def test_an_output_with_a_slew_rate_is_found_at_its_first_heat_and_gives_no_more():
+    """By the slowest one it would go on heating for two minutes after it was switched off, or has tripped."""
+    bench = Bench()
+    async with driven(bench) as module:
+        await module.open()
+        await module.arm()
+        bench.fake.slew_mA_per_s = 0.125
+        with pytest.raises(DeviceFault, match=r"left at 12\.00 mA; .* or is its slew rate not immediate"):
+            await heating(bench, module, 50.0)
+        assert module.uncontrolled
+        await bench.wait(10.0)
+        assert bench.heater_W() < 2000 * 0.02

@@ -6,7 +6,9 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+import yaml
 
+from drivers.devices.inputs import Inputs
 from drivers.devices.relays import Relays
 from drivers.devices.thermometers import Thermometers, ThermometerSettings
 from drivers.settings import Identity, same_device
@@ -17,8 +19,9 @@ from drivers.sim.units.relays import FakeRelays
 from drivers.sim.units.thermometers import FakeThermometers
 from drivers.sim.wire import TcpWire
 from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import load_register_map
+from drivers.wires.registers import RegisterMap, load_register_map
 from foundation.clock import FollowedClock, WallClock
+from foundation.documents import parse_document
 from foundation.errors import DeviceFault, Unreachable
 
 MAPS = Path(__file__).parents[2] / "configs" / "registers"
@@ -79,6 +82,24 @@ async def test_a_module_exchanged_while_it_was_silent_is_not_read(bench: Bench) 
     bench.module.silent, bench.module.name = False, bytes.fromhex("00 70 18 00")
     with pytest.raises(DeviceFault, match=r"0x701800.* answers where .*0x701500.* answered before"):
         await bench.thermometers.read()
+
+
+async def test_contacts_of_a_board_exchanged_while_it_was_silent_are_not_read(bench: Bench) -> None:
+    data = yaml.safe_load((MAPS / "waveshare-inputs.yaml").read_text())
+    relay_map = yaml.safe_load((MAPS / "waveshare-relay.yaml").read_text())
+    data["points"]["version"] = relay_map["points"]["version"]
+    data["identity"] = relay_map["identity"]
+    inputs_map = parse_document(yaml.safe_dump(data), RegisterMap, "inputs")
+    bench.board.closed_inputs = {0}
+    inputs = Inputs("inputs", bench.bus, inputs_map, {"door": 0}, WallClock())
+    await inputs.open()
+    bench.board.silent = True
+    with pytest.raises(Unreachable):
+        await inputs.read()
+    bench.board.silent, bench.board.version = False, 300
+    for _ in range(2):
+        with pytest.raises(DeviceFault, match="was exchanged"):
+            await inputs.read()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from drivers.sim.gige.camera import FakeCamera
 from drivers.wires import camera_connection
 from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
-from foundation.errors import Refused, StandError, Unreachable
+from foundation.errors import DeviceFault, Refused, StandError, Unreachable
 from foundation.readings import Quality
 from tests.addresses import camera_address
 
@@ -67,10 +67,10 @@ def noise(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT_px
 
 
 @contextmanager
-def simulated(clock: WallClock | FollowedClock, plant: WarmPlant) -> Generator[FakeCamera]:
+def simulated(clock: WallClock | FollowedClock, plant: WarmPlant, serial: str = SERIAL) -> Generator[FakeCamera]:
     real_time = isinstance(clock, WallClock)
     fake = FakeCamera(
-        plant, clock, noise, ADDRESS, SERIAL, size_px=(WIDTH_px, HEIGHT_px), real_time=real_time, boot_s=0.2
+        plant, clock, noise, ADDRESS, serial, size_px=(WIDTH_px, HEIGHT_px), real_time=real_time, boot_s=0.2
     )
     fake.start()
     try:
@@ -120,6 +120,23 @@ async def virtual(plant: WarmPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCa
         running = asyncio.create_task(clock.run())
         yield clock, fake
         running.cancel()
+
+
+@pytest.mark.parametrize("wanted", [SERIAL, None], ids=["of a configured number", "of any number"])
+async def test_another_camera_at_the_address_of_the_first_gets_no_setting(plant: WarmPlant, wanted: str | None):
+    """Control is taken, which Aravis does when it opens one; nothing else is written."""
+    with simulated(WallClock(), plant):
+        camera = Camera("camera", settings(serial_number=wanted), WallClock())
+        await camera.open()
+    with simulated(WallClock(), plant, "C9999") as stranger:
+        before = {name: stranger._registers.integer(name) for name in ("GevSCPSPacketSize", "GevSCPD", "PixelFormat")}
+        for _ in range(2):
+            with pytest.raises((DeviceFault, Refused), match=f"C9999 answers|C9999, version .* where .* {SERIAL}"):
+                await camera.open()
+        assert stranger._registers.real("ExposureTime") == 10_000.0
+        assert {name: stranger._registers.integer(name) for name in before} == before
+        assert not stranger.streaming
+    await camera.close()
 
 
 @pytest.mark.usefixtures("fake")

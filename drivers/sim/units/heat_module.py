@@ -58,6 +58,8 @@ class FakeHeatModule:
     the trip is cleared, which a power cycle does not do. refreshed_by: what starts its time again (nothing: it wants
     the DCON broadcast `~**`). refuses: an ignored write is answered with an exception. stuck_mA: the output gives this.
     lost_writes: writes to outputs are acknowledged, not done. safe_fixed: its safe values take no writes. silent.
+    slew_mA_per_s: how fast the output goes to its value, None at once (the slew rate of its configuration). name: what
+    it says that it is.
     """
 
     def __init__(self, plant: Heated, clock: Now, unit: int, channel: int) -> None:
@@ -67,6 +69,8 @@ class FakeHeatModule:
         self.safe_fixed = False
         self.lost_writes = False
         self.stuck_mA: float | None = None
+        self.slew_mA_per_s: float | None = None
+        self.name = MODULE_NAME
         self.refreshed_by: Refreshed = "requests"
         self.type_codes = [0x31] * OUTPUTS
         self.values_mA = [4.0] * OUTPUTS
@@ -79,6 +83,8 @@ class FakeHeatModule:
         self._clock = clock
         self._channel = channel
         self._heard_ns = 0
+        self._flows_at_mA = 4.0  # with a slew rate, at _flows_at_ns
+        self._flows_at_ns = clock.now_ns()
         self._functions = {
             0x01: reads_bits(self._read_coils),
             0x03: reads_words(self._read_holding),
@@ -126,7 +132,15 @@ class FakeHeatModule:
             self._watch(self._now_ns)
             yield
 
+    def _slew(self, time_ns: int) -> None:
+        """The output on its way to its value; from here on the way goes to another one."""
+        most_mA = (self.slew_mA_per_s or 1e9) * max(0, time_ns - self._flows_at_ns) / NS_PER_S
+        left_mA = self.values_mA[self._channel] - self._flows_at_mA
+        self._flows_at_mA += max(-most_mA, min(most_mA, left_mA))
+        self._flows_at_ns = max(time_ns, self._flows_at_ns)
+
     def _watch(self, time_ns: int) -> None:
+        self._slew(time_ns)
         is_late = time_ns - self._heard_ns >= self.timeout_tenths * TENTH_NS
         if self.coils[WATCHDOG_ENABLED] and self.timeout_tenths and is_late and not self.coils[TRIPPED]:
             self.coils[TRIPPED] = True
@@ -146,6 +160,8 @@ class FakeHeatModule:
         return min(1.0, max(0.0, (self._flows_mA(self._channel) - 4.0) / 16.0))
 
     def _flows_mA(self, output: int) -> float:
+        if self.slew_mA_per_s is not None and output == self._channel and self.stuck_mA is None:
+            return self._flows_at_mA
         return self.values_mA[output] if self.stuck_mA is None or output != self._channel else self.stuck_mA
 
     # Registers.
@@ -181,8 +197,8 @@ class FakeHeatModule:
         known = {
             FIRMWARE: FIRMWARE_VERSION & 0xFFFF,
             FIRMWARE + 1: FIRMWARE_VERSION >> 16,
-            NAME: MODULE_NAME & 0xFFFF,
-            NAME + 1: MODULE_NAME >> 16,
+            NAME: self.name & 0xFFFF,
+            NAME + 1: self.name >> 16,
             TIMEOUT: self.timeout_tenths,
             TRIPS: self.trips,
         }

@@ -18,6 +18,7 @@ class FakeSimserv(FakeClimateChamber):
         super().__init__(plant, clock)
         self._chamber = str(chamber)
         self.in_program = False
+        self.serial_number = "58226123450010"
 
     def engine(self) -> Conversation:
         """Commands that end with CR; replies end with CR LF."""
@@ -45,7 +46,7 @@ class FakeSimserv(FakeClimateChamber):
             ("14003", ("2",)): str(int(self.humidity_on)),
             ("99997", ("1",)): "VT3 7034",
             ("99997", ("2",)): "2014",
-            ("99997", ("3",)): "58226123450010",
+            ("99997", ("3",)): self.serial_number,
             **self._messages(),
         }
         value = reads.get((command, tuple(arguments)))
