@@ -77,6 +77,16 @@ class Target(Document):
     flatness_mm: Positive = 0.005
     certificate: str = ""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_dots(cls, given: object) -> object:
+        if isinstance(given, dict) and "kind" in given:
+            raise ValueError(
+                f"kind: {given['kind']} is a board of squares or tags, which `compensate calibrate-photographs` and "
+                "`calibrate-rig` take; here it must be a target of round markers"
+            )
+        return given
+
     @model_validator(mode="after")
     def _consistent(self) -> Target:
         if self.layout == "square" and self.columns < self.rows:

@@ -47,6 +47,7 @@ def test_measured_coordinates_replace_the_nominal_ones():
         (SMALL.replace("ter_mm: 4", "ter_mm: 8") + "layout: staggered\n", "overlap at a pitch of 10.0 mm"),
         (SMALL + "layout: hexagonal\n", "t.yaml: layout: "),
         (SMALL + "pitch_cm: 1\n", "t.yaml: pitch_cm: unknown key"),
+        ("kind: charuco\ncolumns: 8\n", "kind: charuco is a board of squares or tags, which .compensate calibrate"),
         (SMALL + "odd_marker: {number: 13, diameter_mm: 8}\n", "odd_marker.number is 13, but the target has 12"),
         (SMALL + "odd_marker: {number: 1, diameter_mm: 4.5}\n", "differs too little"),
         (SMALL + "odd_marker: {number: 1, diameter_mm: 17}\n", "overlaps its neighbours"),

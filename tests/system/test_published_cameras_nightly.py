@@ -1,5 +1,5 @@
-"""Nights of the simulated laboratory with each camera of configs/optics, through every wire: recorded to the end, and the
-image grows or shrinks as its file says."""
+"""Nights of the simulated laboratory with each camera of configs/optics, through every wire: recorded to the end, and
+the image grows or shrinks as its file says."""
 
 from __future__ import annotations
 
