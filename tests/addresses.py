@@ -4,6 +4,8 @@ import itertools
 import os
 import re
 import socket
+from pathlib import Path
+from typing import Any
 
 # Below the kernel's ephemeral ports, which it hands out to every client on this machine.
 _FIRST_PORT, _PORTS_PER_WORKER = 10_000, 1_500
@@ -31,3 +33,15 @@ def camera_address() -> str:
     """An address of 127.0.0.0/8 that this process has not given to a camera for a long time: the port of GVCP is fixed,
     and a laboratory whose daemon was killed keeps its own for a minute."""
     return f"127.{1 + os.getpid() // 250 % 60}.{1 + os.getpid() % 250}.{1 + next(_cameras) % 254}"
+
+
+def move_to_free(stand: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The data of a simulated stand, moved to addresses of its own; its pseudo-terminals lie in the folder."""
+    stand["bus"]["address"] = f"tcp:127.0.0.1:{free_port()}"
+    for name, axis in stand["axes"].items():
+        axis["address"] = f"serial:{folder / name}"
+    stand["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
+    for camera in stand["cameras"].values():
+        camera["address"] = camera_address()
+    stand["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
+    return stand

@@ -45,7 +45,7 @@ def linked(server: socket.socket) -> ByteLink:
 def bounded() -> Generator[None]:
     begun_s = time.monotonic()
     yield
-    assert time.monotonic() - begun_s < 2
+    assert time.monotonic() - begun_s < 10  # a wait without a bound takes for ever
 
 
 def read_all(link: ByteLink, size: int) -> bytes:

@@ -188,6 +188,7 @@ def test_pymodbus_gets_no_answer_from_a_unit_that_is_not_there(bus: tuple[LinkFa
     faults, client = bus
     with pytest.raises(ModbusIOException):
         client.read_holding_registers(0, count=1, device_id=9)
+    client.comm_params.timeout_connect = 3.0
     faults.byte_by_byte = True
     assert client.read_holding_registers(0x42, count=2, device_id=1).registers == [0x42, 0x43]
 

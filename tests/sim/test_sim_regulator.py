@@ -355,7 +355,7 @@ def test_faults_of_the_probe_and_of_the_set_point_show_on_the_wire(bench: Bench)
 def client(bench: Bench, tmp_path: Path) -> Iterator[ModbusSerialClient]:
     wire = PtyWire(tmp_path / "bus", RtuEngine([bench.regulator]), LinkFaults())
     # No parity here: a pseudo-terminal carries none, and some kernels refuse to be asked for it.
-    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=9600, timeout=0.3, retries=0)
+    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=9600, timeout=3, retries=0)
     assert client.connect()
     yield client
     client.close()

@@ -216,7 +216,7 @@ def test_an_unknown_contact_or_relay_number_is_a_mistake_of_the_caller() -> None
 
 def test_pymodbus_switches_and_reads_back_over_a_pseudo_terminal(bench: Bench, tmp_path: Path) -> None:
     wire = PtyWire(tmp_path / "bus", RtuEngine([bench.board]), LinkFaults())
-    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=9600, timeout=0.3, retries=0)
+    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=9600, timeout=3, retries=0)
     assert client.connect()
     assert not client.write_coil(CAMERA, True, device_id=1).isError()
     assert not client.write_coils(0, [True, False, True], device_id=1).isError()

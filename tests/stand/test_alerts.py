@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from foundation.clock import VirtualClock, WallClock
@@ -21,6 +22,7 @@ from stand.running.run import run_real
 from stand.serving import alerts as module
 from stand.serving.alerts import alerting
 from stand.serving.alerts_process import deliver, ping
+from tests.addresses import move_to_free
 
 from .alert_receiver import Receiver, until
 
@@ -176,7 +178,7 @@ def test_a_folder_a_pipe_and_nothing_are_no_secrets(tmp_path: Path):
 
 
 def config_with(tmp_path: Path, secrets: Path | None) -> Path:
-    text = packaged("", "simulated").read_text()
+    text = yaml.safe_dump(move_to_free(yaml.safe_load(packaged("", "simulated").read_text()), tmp_path))
     path = tmp_path / "stand.yaml"
     path.write_text(text + (f"alerts: {{secrets: {json.dumps(str(secrets))}}}\n" if secrets else ""))
     return path

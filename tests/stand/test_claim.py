@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import re
 import signal
 import stat
 import subprocess
@@ -18,11 +19,21 @@ from foundation.documents import parse_document
 from foundation.errors import InUse, SessionError
 from stand.config.stand_config import StandConfig, packaged
 from stand.running.opening.claim import addresses, claimed
+from tests.addresses import move_to_free
 from tests.sections import change
 
 
+def _simulated() -> str:
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    return yaml.safe_dump(move_to_free(data, Path(f"/tmp/thermostand-{os.getpid()}")))
+
+
+SIMULATED = _simulated()
+"""Another run of this machine may have the addresses of the packaged one."""
+
+
 def config(base: str = "simulated", **sections: dict[str, object]) -> StandConfig:
-    data = yaml.safe_load(packaged("", base).read_text())
+    data = yaml.safe_load(SIMULATED if base == "simulated" else packaged("", base).read_text())
     change(data, sections)
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
@@ -121,7 +132,8 @@ async def test_the_locks_say_who_has_them_to_their_user_only(tmp_path: Path, mon
     assert len(said) >= 5
     assert all((each["session"], each["pid"]) == (str(tmp_path / "night"), os.getpid()) for each in said)
     assert all(each["stand"] == "simulated-stand" for each in said)
-    assert any(each["place"].startswith("tcp 127.0.0.1:15020") for each in said)
+    bus = config().bus.address.removeprefix("tcp:")
+    assert any(each["place"].startswith(f"tcp {bus}") for each in said)
     assert list((tmp_path / "thermostand").iterdir()) == []
 
 
@@ -133,9 +145,8 @@ async def test_a_run_of_another_login_is_found_though_its_files_are_not(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "one"))
     async with claimed(config(), tmp_path):
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "other"))
-        with pytest.raises(
-            InUse, match=r"camera 127\.0\.0\.20 is in use by a run of another user or login; nothing was"
-        ):
+        camera = re.escape(config().cameras["camera"].address)
+        with pytest.raises(InUse, match=f"camera {camera} is in use by a run of another user or login; nothing was"):
             async with claimed(config(), tmp_path):
                 pass
 
@@ -169,7 +180,7 @@ except Exception as error:
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[[], "subprocess.Popen[str]"]]:
     file = tmp_path / "stand.yaml"
-    file.write_text(packaged("", "simulated").read_text())
+    file.write_text(SIMULATED)
     started: list[subprocess.Popen[str]] = []
 
     def begin() -> "subprocess.Popen[str]":

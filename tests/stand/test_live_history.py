@@ -201,13 +201,13 @@ async def test_after_a_restart_the_week_is_there_again_and_what_cannot_be_read_i
 
 
 def test_a_week_of_thirty_channels_is_answered_within_the_page_s_patience():
-    """50 ms are asked for; the test allows a busy machine ten times that. tests/bench/page.py measures."""
+    """50 ms are asked for; the test allows ten times that, of this process' own time. tests/bench/page.py measures."""
     history, seconds = History(), np.arange(0, 7 * DAY_S, 5)
     for index in range(30):
         history.fill(f"device.{index}", T0 + seconds * NS_PER_S, np.sin(seconds / 1000 + index), "degC")
-    began_s = time.perf_counter()
+    began_s = time.process_time()
     history.columns(T0, T0 + 7 * DAY_S * NS_PER_S, 1200)
-    assert time.perf_counter() - began_s < 0.5
+    assert time.process_time() - began_s < 0.5
 
 
 def test_a_history_of_before_is_put_under_the_present_one():

@@ -14,6 +14,7 @@ from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.estimating.run_estimate import small_disk
 from stand.running.order import load_order
+from tests.addresses import move_to_free
 
 runner = CliRunner()
 
@@ -123,7 +124,7 @@ def test_a_usage_error_is_said_in_plain_lines():
 
 
 def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_path: Path):
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = move_to_free(yaml.safe_load(packaged("", "simulated").read_text()), tmp_path)
     data["bus"]["address"] = f"serial:{tmp_path / 'unplugged'}"
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(data))

@@ -15,7 +15,7 @@ from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import Order
 from stand.simulator import Simulator, laboratory_of
-from tests.addresses import camera_address, free_port
+from tests.addresses import move_to_free
 from tests.sections import change
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
@@ -82,13 +82,10 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
     frame, polled = (CORNER, getattr(request.module, "POLLED", CALM)) if by_day else (WHOLE_SENSOR, AS_INSTALLED)
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
-        data: Any = yaml_data(packaged("", "simulated").read_text(), "simulated")
-        data["bus"]["address"] = f"tcp:127.0.0.1:{free_port()}" if wire == "tcp" else f"serial:{tmp_path / 'bus'}"
-        for name, axis in data["axes"].items():
-            axis["address"] = f"serial:{tmp_path / name}"
-        data["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
-        data["cameras"]["camera"] |= {"address": camera_address(), **frame}
-        data["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"
+        data: Any = move_to_free(yaml_data(packaged("", "simulated").read_text(), "simulated"), tmp_path)
+        if wire == "serial":
+            data["bus"]["address"] = f"serial:{tmp_path / 'bus'}"
+        data["cameras"]["camera"] |= frame
         data["recording"]["alert_below_percent"] = 0  # of this machine's disk
         change(data, polled)
         change(data, sections)

@@ -113,7 +113,7 @@ async def test_a_silent_controller_is_told_in_bounded_time_and_answers_again_by_
     begun_s = time.monotonic()
     with pytest.raises(Unreachable, match=r"^linear: "):
         await axis.read()
-    assert time.monotonic() - begun_s < 3.0
+    assert time.monotonic() - begun_s < 10.0
     bench.faults.silent = False
     bench.tap.requests.clear()
     assert (await bench.position()).value == 0

@@ -21,6 +21,7 @@ from stand.config.stand_config import packaged
 from stand.running.order import Order, load_order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual
+from tests.addresses import move_to_free
 from tests.asking import ask
 from tests.system.test_run import fault
 
@@ -97,7 +98,7 @@ def on_the_way(do: Callable[[], object], batches: int = 5) -> Callable[[Hub], No
 def far(folder: Path) -> Order:
     """Of a stand that knows its laboratory's temperature from its file only: 18 degC, where a new simulated chamber is
     at 24, so that a resumed run has a way to go, too."""
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = move_to_free(yaml.safe_load(packaged("", "simulated").read_text()), folder)
     data["cameras"], data["axes"] = {}, {}
     data["thermometers"].pop("laboratory")
     data["ending"] = {"to_ambient": True, "ambient_degC": 18.0}
