@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import cv2
 import numpy as np
@@ -106,7 +107,10 @@ def back_project(scene: Scene, u: Float, v: Float) -> tuple[Float, Float]:
     for _ in range(30 if scene.k1 or scene.k2 else 0):
         r2 = x * x + y * y
         bend = 1 + scene.k1 * r2 + scene.k2 * r2**2
-        x, y = xd / bend, yd / bend
+        x, before = xd / bend, x
+        y = yd / bend
+        if abs(x - before).max() < 1e-15:
+            break
     rotation, translation = scene.pose()
     to_plane = np.linalg.inv(np.column_stack([rotation[:, :2], translation]))
     w = to_plane[2, 0] * x + to_plane[2, 1] * y + to_plane[2, 2]
@@ -117,24 +121,51 @@ def true_centres_px(scene: Scene) -> Float:
     """Centroid of each marker's exact projected outline (N, 2)."""
     angle = np.arange(720) * (2 * np.pi / 720)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.array([_centroid(project(scene, disc[:2] + disc[2] / 2 * circle)) for disc in scene.discs_mm()])
+    discs = scene.discs_mm()[:, None]
+    return _centroids(project(scene, (discs[..., :2] + discs[..., 2:] / 2 * circle).reshape(-1, 2)).reshape(-1, 720, 2))
 
 
-def _centroid(polygon: Float) -> Float:
-    origin = polygon.mean(axis=0)
-    p, q = polygon - origin, np.roll(polygon, -1, axis=0) - origin
-    cross = p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]
-    return origin + ((p + q) * cross[:, None]).sum(axis=0) / (3 * cross.sum())
+def _centroids(polygons: Float) -> Float:
+    """Of polygons (N, K, 2) -> (N, 2)."""
+    origin = polygons.mean(axis=1)
+    p = polygons - origin[:, None]
+    q = np.roll(p, -1, axis=1)
+    cross = p[..., 0] * q[..., 1] - q[..., 0] * p[..., 1]
+    return origin + ((p + q) * cross[..., None]).sum(axis=1) / (3 * cross.sum(axis=1)[:, None])
 
 
 def _coverage(level: Float) -> Float:
-    """Part of each cell where `level` < 0, the cell's boundary taken as a straight line (exact for one)."""
-    slope_y, slope_x = np.gradient(level)
-    wide, narrow = np.maximum(abs(slope_x), abs(slope_y)), np.minimum(abs(slope_x), abs(slope_y))
-    narrow = np.maximum(narrow, 1e-4 * wide)
-    long, short, t = (wide + narrow) / 2, (wide - narrow) / 2, -level
+    """Part of each cell where `level` < 0, its boundary taken as a straight line (exact for one). The cells along
+    the border of the array are not crossed by it."""
+    inside = level < 0
+    cover = inside.astype(np.float64)
+    crossed = np.zeros_like(inside)  # the line runs between this cell's centre and one of its eight neighbours'
+    rows = inside[:-1] != inside[1:]
+    crossed[:-1] |= rows
+    crossed[1:] |= rows
+    columns = crossed[:, :-1] | crossed[:, 1:] | (inside[:, :-1] != inside[:, 1:])
+    crossed[:, :-1] |= columns
+    crossed[:, 1:] |= columns
+    at = np.flatnonzero(crossed)
+    flat, width = level.reshape(-1), level.shape[1]
+    slopes = [abs(flat[at + next_] - flat[at - next_]) / 2 for next_ in (1, width)]
+    wide = np.maximum(*slopes)
+    narrow = np.maximum(np.minimum(*slopes), 1e-4 * wide)
+    long, short, t = (wide + narrow) / 2, (wide - narrow) / 2, -flat[at]
     ramp = [np.maximum(t + offset, 0) ** 2 for offset in (long, short, -short, -long)]
-    return np.clip((ramp[0] - ramp[1] - ramp[2] + ramp[3]) / (2 * wide * narrow), 0, 1)
+    cover.reshape(-1)[at] = np.clip((ramp[0] - ramp[1] - ramp[2] + ramp[3]) / (2 * wide * narrow), 0, 1)
+    return cover
+
+
+@cache
+def _blur(pixels: int, psf_px: float) -> Float:
+    """What each of so many pixels in a line sees of the cells of all: the PSF and the pixel's box (pixels, cells)."""
+    sigma = psf_px * SUB
+    half = int(np.ceil(6 * sigma))
+    kernel = cv2.getGaussianKernel(2 * half + 1, sigma)[:, 0]
+    away = np.subtract.outer(np.arange(pixels * SUB), np.arange(pixels * SUB)) + half
+    seen = np.where((away >= 0) & (away <= 2 * half), kernel[np.clip(away, 0, 2 * half)], 0.0)
+    return seen.reshape(pixels, SUB, pixels * SUB).mean(axis=1)
 
 
 def render(scene: Scene) -> Float:
@@ -164,11 +195,8 @@ def _draw(scene: Scene, image: Float, disc: Float, contrast_DN: float) -> None:
     x, y = back_project(scene, u, v)
     cover = _coverage(np.hypot(x - disc[0], y - disc[1]) - disc[2] / 2)
     radiance = scene.light(u, v) * contrast_DN * cover
-    sigma = scene.psf_px * SUB
-    kernel = 2 * int(np.ceil(6 * sigma)) + 1
-    blurred = cv2.GaussianBlur(radiance, (kernel, kernel), sigma, borderType=cv2.BORDER_CONSTANT)
-    rows, columns = blurred.shape[0] // SUB, blurred.shape[1] // SUB
-    pixels = blurred.reshape(rows, SUB, columns, SUB).mean(axis=(1, 3))
+    columns, rows = (_blur(int(high[i] - low[i]), scene.psf_px) for i in (0, 1))
+    pixels = rows @ radiance @ columns.T
     top, left = max(low[1], 0), max(low[0], 0)
     bottom, right = min(high[1], image.shape[0]), min(high[0], image.shape[1])
     if top < bottom and left < right:
