@@ -53,13 +53,34 @@ class ThermalState:
         """taus_s: time constants, s. plays_K: radii. self_heating_K: over the air of a camera that has been on for
         long."""
         self._taus_s = np.array([RATE_TAU_S, *taus_s])
-        self._radii_K = np.array(plays_K, float)
+        self._radii_K = [float(radius_K) for radius_K in plays_K]
         self._self_heating_K = self_heating_K
         self._dt_s = self._gained = math.nan
         self.begun = self._unseen = False
         self.settled_s = self.on_s = self.air_degC = self.camera_degC = math.nan
-        self.ambient_lag = self.power_lag = self.camera_lag = np.full(len(self._taus_s), math.nan)
-        self.plays = np.full(len(self._radii_K), math.nan)
+        # Lists: for so few numbers numpy takes three times as long.
+        self._ambient = self._power = self._camera = [math.nan] * len(self._taus_s)
+        self._plays = [math.nan] * len(self._radii_K)
+
+    @property
+    def ambient_lag(self):
+        """(1 + K,)."""
+        return np.array(self._ambient)
+
+    @property
+    def power_lag(self):
+        """(1 + K,)."""
+        return np.array(self._power)
+
+    @property
+    def camera_lag(self):
+        """(1 + K,)."""
+        return np.array(self._camera)
+
+    @property
+    def plays(self):
+        """(P,)."""
+        return np.array(self._plays)
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them
@@ -78,13 +99,15 @@ class ThermalState:
         # First-order followers of a constant input, exactly: z + (s - z)(1 - exp(-dt/tau)); and Prandtl-Ishlinskii
         # plays, which stay where they are until the camera is further away than their radius.
         if dt_s != self._dt_s:
-            self._dt_s, self._gained = dt_s, -np.expm1(-dt_s / self._taus_s)
-        gained = self._gained
-        self.ambient_lag = self.ambient_lag + (ambient_degC - self.ambient_lag) * gained
-        self.power_lag = self.power_lag + (power_on - self.power_lag) * gained
-        self.camera_lag = self.camera_lag + ((before_degC + self.camera_degC) / 2 - self.camera_lag) * gained
-        lowest, highest = self.camera_degC - self._radii_K, self.camera_degC + self._radii_K
-        self.plays = np.minimum(np.maximum(self.plays, lowest), highest)
+            self._dt_s, self._gained = dt_s, (-np.expm1(-dt_s / self._taus_s)).tolist()
+        self._ambient = _followed(self._ambient, ambient_degC, self._gained)
+        self._power = _followed(self._power, power_on, self._gained)
+        self._camera = _followed(self._camera, (before_degC + self.camera_degC) / 2, self._gained)
+        now_degC = self.camera_degC
+        self._plays = [
+            min(max(play, now_degC - radius_K), now_degC + radius_K)
+            for play, radius_K in zip(self._plays, self._radii_K, strict=True)
+        ]
         if self._unseen and not math.isnan(camera_degC):
             self._unseen = False
             self.settled_s = math.inf if abs(camera_degC - ambient_degC) < COLD_K else self.settled_s
@@ -94,7 +117,7 @@ class ThermalState:
     @property
     def rate_K_per_h(self):
         """How fast the ambient changes."""
-        return 3600 / RATE_TAU_S * (self.air_degC - self.ambient_lag[0])
+        return 3600 / RATE_TAU_S * (self.air_degC - self._ambient[0])
 
     def _begin(self, ambient_degC, power_on, camera_degC):
         excess_K = 0.0 if math.isnan(camera_degC) else camera_degC - ambient_degC
@@ -105,10 +128,14 @@ class ThermalState:
         self.settled_s = math.inf if cold else 0.0
         self.on_s = 0.0 if cold or power_on == 0 else math.inf
         self.air_degC, self.camera_degC = ambient_degC, ambient_degC + excess_K
-        self.ambient_lag = np.full(len(self._taus_s), float(ambient_degC))
-        self.power_lag = np.full(len(self._taus_s), warmed)
-        self.camera_lag = np.full(len(self._taus_s), self.camera_degC)
-        self.plays = np.full(len(self._radii_K), self.camera_degC)
+        self._ambient, self._power, self._camera = (
+            [float(at)] * len(self._taus_s) for at in (ambient_degC, warmed, self.camera_degC)
+        )
+        self._plays = [self.camera_degC] * len(self._radii_K)
+
+
+def _followed(lags, value, gained):
+    return [lag + (value - lag) * part for lag, part in zip(lags, gained, strict=True)]
 
 
 class Drift:
