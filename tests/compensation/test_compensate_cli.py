@@ -88,6 +88,7 @@ def test_detect_takes_photographs_and_an_installed_target(image: Path, target: P
     assert (rows[0]["marker"], rows[0]["row"], rows[0]["column"]) == ("1", "0", "0")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_fit_then_report_then_analyse_agree(recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     fitted = run("fit", recorded.path, "-o", tmp_path / "model.json")
     assert fitted.exit_code == 0

@@ -28,6 +28,7 @@ NOTEBOOK = (ROOT / "docs" / "notebook.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", NOTEBOOK, re.DOTALL)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_the_notebook_page_shows_runs(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert len(BLOCKS) == 5
     (tmp_path / "night").symlink_to(recorded.path)
