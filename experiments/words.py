@@ -67,9 +67,11 @@ def mark_in_words(kind: str, parameters: Mapping[str, object]) -> str:
 
 
 def _span(duration_s: float) -> str:
-    """`45 s`, `45 min`, `2 h 30 min`."""
+    """`45 s`, `3 min 30 s`, `45 min`, `2 h 30 min`."""
     if duration_s < 120.0:
         return f"{duration_s:g} s"
+    if duration_s < 600.0 and round(duration_s) % 60:
+        return f"{round(duration_s) // 60} min {round(duration_s) % 60} s"
     minutes = round(duration_s / 60.0)
     if minutes < 120:
         return f"{minutes} min"

@@ -109,6 +109,9 @@ def _invalid(_: Request, error: Exception) -> Response:
     faults = cast("RequestValidationError", error).errors()
     sentences: list[str] = []
     for fault in faults[:5]:
+        if fault["type"] == "json_invalid":
+            sentences.append(f"the body: is no JSON from character {int(fault['loc'][-1]) + 1} on")
+            continue
         where = ".".join(str(part) for part in fault["loc"] if part not in ("body", "query", "path", "header"))
         sentences.append(f"{where or 'the body'}: {_SENTENCES.get(fault['type'], fault['msg'])}")
     return _error(422, "; ".join(sentences) or "the request is not understood")
