@@ -44,7 +44,7 @@ def try_them(
         check_alerts(stand.alerts)
         found = load_secrets(stand.alerts.secrets)
         text = "This is a test: alerts of this stand arrive here."
-        failures = deliver(stand.alerts.secrets, f"{stand.name}: test", text, _LIMIT_S)
+        failures = [said for _, said in deliver(stand.alerts.secrets, f"{stand.name}: test", text, _LIMIT_S)]
         failures += [failure] if (failure := ping(stand.alerts.secrets, _LIMIT_S)) else []
         for failure in failures:
             typer.echo(one_line(failure), err=True)

@@ -12,9 +12,11 @@ import queue
 from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
+from typing import cast
 
 from foundation.clock import Clock, VirtualClock, boot_time_ns, seconds_ns
 from foundation.errors import ConfigError
@@ -70,6 +72,17 @@ async def alerting(
         await asyncio.to_thread(alerts.close)
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A message to be sent, not before at_ns (of the time since boot). tried: how often it was; only: the numbers of
+    those that have not taken it, () for all."""
+
+    message: Message
+    at_ns: int = 0
+    tried: int = 0
+    only: tuple[int, ...] = ()
+
+
 class Alerts:
     """A subscriber of the hub."""
 
@@ -80,7 +93,7 @@ class Alerts:
         self._loop, self._hub, self._clock = loop, hub, clock
         self._book = AlertBook(name, config.causes, seconds_ns(config.grace_s), config.most_per_h)
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._waiting: deque[tuple[int, int, Message]] = deque()  # when to try, how often it was tried
+        self._waiting: deque[_Waiting] = deque()
         self._ending = Flag()
         self._beat_ns = 0
         self._helpers: dict[str, Helper] = {}
@@ -117,25 +130,28 @@ class Alerts:
             with suppress(queue.Empty):
                 while True:
                     found += self._book.receive(self._events.get_nowait(), now_ns)
-            self._waiting.extend((0, 0, message) for message in found)
+            self._waiting.extend(_Waiting(message) for message in found)
             while len(self._waiting) > _MOST_WAITING:
                 self._waiting.popleft()
             for _ in range(len(self._waiting)):
-                self._try(*self._waiting.popleft(), is_last=is_last)
+                self._try(self._waiting.popleft(), is_last=is_last)
             if is_last:
                 return
 
-    def _try(self, at_ns: int, tried: int, message: Message, *, is_last: bool) -> None:
-        if boot_time_ns() < at_ns and not is_last:
-            self._waiting.append((at_ns, tried, message))
+    def _try(self, due: _Waiting, *, is_last: bool) -> None:
+        """Who has taken a message does not get it again because another one has not."""
+        if boot_time_ns() < due.at_ns and not is_last:
+            self._waiting.append(due)
             return
-        failures = self._ask(_TELL, deliver, self._secrets, message.title, message.text, _LIMIT_S)
+        message = due.message
+        failures = self._ask(_TELL, deliver, self._secrets, message.title, message.text, _LIMIT_S, due.only)
         if not failures:
             self._failed.clear()
-        elif tried < len(_AGAIN_S):
-            self._waiting.append((boot_time_ns() + seconds_ns(_AGAIN_S[tried]), tried + 1, message))
-        for failure in failures:
-            self._warn(str(failure))
+        elif due.tried < len(_AGAIN_S):
+            at_ns, of = boot_time_ns() + seconds_ns(_AGAIN_S[due.tried]), tuple(number for number, _ in failures)
+            self._waiting.append(_Waiting(message, at_ns, due.tried + 1, due.only if 0 in of else of))
+        for _, failure in failures:
+            self._warn(failure)
 
     def _ping_on(self) -> None:
         """The thread that gives the sign of life."""
@@ -144,18 +160,20 @@ class Alerts:
             now_ns = boot_time_ns()
             if now_ns >= due_ns and now_ns - self._beat_ns < _LATE_NS and self._book.is_well:
                 due_ns = now_ns + seconds_ns(self._config.alive_every_s)
-                for failure in self._ask(_ALIVE, ping, self._secrets, _LIMIT_S):
-                    self._warn(str(failure))
+                for _, failure in self._ask(_ALIVE, ping, self._secrets, _LIMIT_S):
+                    self._warn(failure)
 
-    def _ask(self, line: str, function: Callable[..., object], *args: object) -> list[object]:
-        """In a process of its own, which is started again when it has ended; what failed."""
+    def _ask(self, line: str, function: Callable[..., object], *args: object) -> list[tuple[int, str]]:
+        """In a process of its own, which is started again when it has ended; what failed, with whose it is."""
         try:
             if line not in self._helpers or self._helpers[line].ended:
                 self._helpers[line] = Helper(MODULE, (line,), "the process that sends alerts has ended")
             found = self._helpers[line].line(line).run(function, *args)
         except OSError as error:
             found = str(error)
-        return [found] if isinstance(found, str) and found else found if isinstance(found, list) else []
+        if isinstance(found, str):
+            return [(0, found)] if found else []
+        return cast("list[tuple[int, str]]", found)
 
     def _warn(self, failure: str) -> None:
         """An event on the loop, once until a message has got through."""

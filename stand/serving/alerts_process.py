@@ -10,7 +10,7 @@ import importlib
 import importlib.util
 import logging
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Thread
 
@@ -22,19 +22,27 @@ LEFT_NAME = "stand-alert-left"  # of a process whose daemon has gone
 MISSING = "alerts need Apprise: pip install 'thermostand[alerts]'"
 
 
-def deliver(secrets: Path, title: str, text: str, limit_s: float) -> list[str]:
-    """Send to every address; of each that did not take it within limit_s a sentence. Nobody waits for them together:
-    each has the whole time."""
+def deliver(secrets: Path, title: str, text: str, limit_s: float, only: Sequence[int] = ()) -> list[tuple[int, str]]:
+    """Send to every address, or to those of these numbers (from 1) only; of each that did not take it within limit_s
+    its number and a sentence. Number 0: nothing was sent to anybody. Nobody waits for them together: each has the
+    whole time."""
     try:
         urls = load_secrets(secrets).urls
     except ConfigError as error:
-        return [str(error)]
+        return [(0, str(error))]
     if importlib.util.find_spec("apprise") is None:
-        return [MISSING]
+        return [(0, MISSING)]
     _load()
-    names = [f"receiver {number} of {len(urls)} ({_scheme(url)})" for number, url in enumerate(urls, 1)]
-    works = [_Work(lambda url=url: _send(url, title, text)) for url in urls]
-    return [f"{name} {failure}" for name, work in zip(names, works, strict=True) if (failure := work.result(limit_s))]
+    works = {
+        number: _Work(lambda url=url: _send(url, title, text))
+        for number, url in enumerate(urls, 1)
+        if not only or number in only
+    }
+    return [
+        (number, f"receiver {number} of {len(urls)} ({_scheme(urls[number - 1])}) {failure}")
+        for number, work in works.items()
+        if (failure := work.result(limit_s))
+    ]
 
 
 def ping(secrets: Path, limit_s: float) -> str:

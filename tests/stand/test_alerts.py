@@ -107,6 +107,27 @@ async def test_what_a_receiver_refused_is_sent_again_and_told_once_without_its_a
     ]
 
 
+async def test_who_has_a_message_does_not_get_it_again_because_another_receiver_fails(
+    receiver, tmp_path: Path, monkeypatch
+):
+    monkeypatch.setattr(module, "_AGAIN_S", (0.1,) * 3)
+    tried: list[tuple[int, ...]] = []
+    ask = module.Alerts._ask
+
+    def noted(self, line, function, *args):
+        tried.extend(args[4:])
+        return ask(self, line, function, *args)
+
+    monkeypatch.setattr(module.Alerts, "_ask", noted)
+    config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml", "json://127.0.0.1:9/closed"))
+    hub, clock = Hub(), WallClock()
+    async with alerting("lab", config, hub, clock):
+        publish(hub, clock, "prompt", text="close the door")
+        await reached(lambda: len(tried) == 4)
+    assert tried == [(), (2,), (2,), (2,)]
+    assert len(receiver.messages) == 1
+
+
 async def test_a_run_that_fails_before_it_begins_is_told(receiver, tmp_path: Path):
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml"))
     with pytest.raises(ConfigError):
@@ -133,16 +154,16 @@ def test_each_receiver_has_its_own_sentence(receiver, tmp_path: Path, caplog, ca
     failures = deliver(secrets, "title", "text", 60.0)
     assert (receiver.messages, failures[:1]) == (
         [("title", "text")],
-        ["receiver 2 of 4 (json) did not take the message"],
+        [(2, "receiver 2 of 4 (json) did not take the message")],
     )
     assert failures == [
-        "receiver 2 of 4 (json) did not take the message",
-        "receiver 3 of 4 (no address) has an address that Apprise does not understand",
-        "receiver 4 of 4 (noscheme) has an address that Apprise does not understand",
+        (2, "receiver 2 of 4 (json) did not take the message"),
+        (3, "receiver 3 of 4 (no address) has an address that Apprise does not understand"),
+        (4, "receiver 4 of 4 (noscheme) has an address that Apprise does not understand"),
     ]
     assert "TOKEN" not in caplog.text + "".join(capfd.readouterr())
     receiver.let_go.clear()
-    assert deliver(secrets, "title", "text", 0.3)[0] == "receiver 1 of 4 (json) did not answer in time"
+    assert deliver(secrets, "title", "text", 0.3)[0][1] == "receiver 1 of 4 (json) did not answer in time"
     assert ping(secrets, 0.3).startswith("alive_url ")
 
 
