@@ -73,7 +73,8 @@ def _send(url: str, title: str, text: str) -> str:
     sender = apprise.Apprise()
     if not sender.add(url):
         return "has an address that Apprise does not understand"
-    return "" if sender.notify(body=text, title=title) else "did not take the message"
+    is_taken = sender.notify(body=text, title=title, body_format=apprise.NotifyFormat.TEXT)
+    return "" if is_taken else "did not take the message"
 
 
 def _called(url: str, limit_s: float) -> str:

@@ -147,6 +147,17 @@ async def test_in_virtual_time_and_without_secrets_nothing_is_sent(receiver, tmp
     assert receiver.messages == []
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_what_is_said_is_text_also_for_a_receiver_of_html(receiver, tmp_path: Path):
+    """As a mail is: a prompt, a name or a reason may be anybody's."""
+    secrets = receiver.secrets(tmp_path / "s.yaml")
+    secrets.write_text(secrets.read_text().replace("/TOKEN", "/TOKEN?format=html"))
+    assert deliver(secrets, "lab: <b>", "<script>alert(1)</script>", 60.0) == []
+    ((_, text),) = receiver.messages
+    assert "<script" not in text
+    assert "&lt;script" in text
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of a library that Apprise uses, sent from this process
 def test_each_receiver_has_its_own_sentence(receiver, tmp_path: Path, caplog, capfd):
     closed = "json://127.0.0.1:9/TOKEN"
