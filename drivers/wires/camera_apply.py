@@ -27,6 +27,7 @@ EXPOSURE_TOLERANCE, EXPOSURE_TOLERANCE_S = 0.01, 50e-6
 GAIN_TOLERANCE_DB = 0.5
 FRAME_RATE_TOLERANCE = 0.02
 
+LEAST_HEARTBEAT_S = 1.2  # Aravis asks each second
 LEAST_RECEIVE_BUFFER_BYTES = 1 << 20
 RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
@@ -49,7 +50,9 @@ def apply_settings(name: str, device: GigeDevice, settings: AravisCameraSettings
     for feature in words.NECESSARY:
         if not device.kind(feature):
             raise Refused(name, f"the camera has no {feature}, without which there are no frames")
-    heartbeat_s = _set_heartbeat(device, settings.heartbeat_s) if isinstance(settings, GigeCameraSettings) else 0.0
+    heartbeat_s = (
+        _set_heartbeat(name, device, settings.heartbeat_s) if isinstance(settings, GigeCameraSettings) else 0.0
+    )
     _trigger_off(device)  # first: some features are there without a trigger only
     width, height = _set_region(name, device, settings)
     _set_modes(device)
@@ -120,10 +123,15 @@ def _offered(device: GigeDevice, feature: str) -> tuple[str, ...]:
     return device.entries(feature) if device.kind(feature) == "Enumeration" else ()
 
 
-def _set_heartbeat(device: GigeDevice, heartbeat_s: float) -> float:
-    """Through the bootstrap register: not every camera names it as a feature."""
+def _set_heartbeat(name: str, device: GigeDevice, heartbeat_s: float) -> float:
+    """Through the bootstrap register: not every camera names it as a feature. Refused when it would free itself between
+    two of Aravis' requests."""
     device.write_register(HEARTBEAT_TIMEOUT_MS, round(heartbeat_s * 1000))
-    return device.read_register(HEARTBEAT_TIMEOUT_MS) / 1000
+    taken_s = device.read_register(HEARTBEAT_TIMEOUT_MS) / 1000
+    if taken_s < LEAST_HEARTBEAT_S:
+        text = f"a heartbeat of {heartbeat_s:g} s was asked for, the camera took {taken_s:g} s"
+        raise Refused(name, f"{text}, and is asked once a second: it would be lost again and again")
+    return taken_s
 
 
 def _trigger_off(device: GigeDevice) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, parse
-from drivers.devices.imager.radiometry import temperatures_degC
-from drivers.devices.imager.thermal_imager import ThermalImagerSettings
+from drivers.devices.imager.thermal_imager import ThermalImagerSettings, place_of, spot_degC
 from stand.commissioning.finding import Finding
 
 _NAME = "imager"
@@ -45,10 +44,11 @@ def _of_picture(settings: ThermalImagerSettings, file: Path, image: RadiometricI
     height, width = image.counts.shape
     seen: dict[str, object] = {}
     for name, spot in settings.spots.items():
-        x, y = image.spots.get(spot.label, (spot.x_px, spot.y_px))
-        if not (0 <= x < width and 0 <= y < height):
-            text = f"the spot {name} at {x}, {y} px is outside of its {width} x {height} px"
+        mean_degC = spot_degC(image, spot)
+        if mean_degC is None:
+            x, y = place_of(image, spot)
+            text = f"the 3 x 3 px of the spot {name} at {x}, {y} px are not within its {width} x {height} px"
             return Finding(_NAME, "settings", "failed", text, f"correct imager.spots.{name}")
-        seen[name] = round(float(temperatures_degC(image.counts, image.planck, image.around, spot.emissivity)[y, x]), 1)
+        seen[name] = round(mean_degC, 1)
     texts = ", ".join(f"{name} {degC} degC" for name, degC in seen.items())
     return Finding(_NAME, "reading", "ok", f"{which}; its newest picture, {file.name}, shows {texts}", data=seen)

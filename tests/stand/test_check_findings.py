@@ -31,6 +31,15 @@ def test_the_newest_picture_of_an_imager_is_looked_at(tmp_path: Path):
     assert text == "FLIR E40, serial number 49001234; its newest picture, IR_0001.jpg, shows lens 31.0 degC"
     assert looked(tmp_path, serial_number="5")[:2] == ("identity", "failed")
     assert looked(tmp_path, spots={"lens": {"x_px": 500, "y_px": 60}})[:2] == ("settings", "failed")
+    assert looked(tmp_path, spots={"lens": {"x_px": WIDTH - 1, "y_px": 60}})[:2] == (
+        "settings",
+        "failed",
+    )  # nor by a run
+    odd = Shot(
+        WARM - np.where(np.arange(WIDTH) < 9, 10.0, 0.0), 1.7e9, spots={"": (4, 4)}
+    )  # a measurement without a name
+    (tmp_path / "IR_0001.jpg").write_bytes(jpeg_of(odd))
+    assert looked(tmp_path)[2].endswith("lens 31.0 degC")
     (tmp_path / "IR_0001.jpg").write_bytes(b"\xff\xd8\xff\xd9")
     assert looked(tmp_path)[:2] == ("reading", "failed")
 

@@ -263,7 +263,11 @@ async def test_the_temperature_is_a_reading_and_belongs_to_each_frame(
 
 async def test_a_broken_temperature_is_bad_and_the_frames_go_on(fake: FakeCamera):
     async with opened() as camera:
-        faults: dict[Literal["zero", "access"], str] = {"zero": "exactly 0 degC", "access": "DeviceTemperature"}
+        faults: dict[Literal["zero", "access", "nan"], str] = {
+            "zero": "exactly 0 degC",
+            "access": "DeviceTemperature",
+            "nan": "nan degC is outside -40..120",
+        }
         for fault, reason in faults.items():
             fake.faults.temperature = fault
             (reading,) = await camera.read()
@@ -272,6 +276,16 @@ async def test_a_broken_temperature_is_bad_and_the_frames_go_on(fake: FakeCamera
             assert np.isnan((await camera.grab()).camera_degC)
         fake.faults.temperature = None
         assert (await camera.grab()).camera_degC == 41.5
+
+
+async def test_a_camera_that_would_free_itself_between_two_requests_is_refused(fake: FakeCamera):
+    fake.faults.heartbeat_most_ms = 600
+    with pytest.raises(Refused, match=r"a heartbeat of 1\.5 s was asked for, the camera took 0\.6 s"):
+        async with opened():
+            pass
+    fake.faults.heartbeat_most_ms = 1300
+    async with opened() as camera:
+        assert camera.effective.heartbeat_s == 1.3
 
 
 @pytest.mark.usefixtures("fake")

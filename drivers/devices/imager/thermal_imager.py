@@ -52,6 +52,22 @@ class SpotSettings(Document):
     emissivity: float = Field(default=0.95, gt=0.05, le=1)
 
 
+def place_of(image: RadiometricImage, spot: SpotSettings) -> tuple[int, int]:
+    """Where a spot is in a picture, x and y in px."""
+    here = spot.x_px, spot.y_px
+    return image.spots.get(spot.label, here) if spot.label else here
+
+
+def spot_degC(image: RadiometricImage, spot: SpotSettings) -> float | None:
+    """The mean of the 3 x 3 px of a spot; NaN where the counts are of no temperature, None when they are not all within
+    the picture."""
+    (x, y), (height, width) = place_of(image, spot), image.counts.shape
+    if not (1 <= x < width - 1 and 1 <= y < height - 1):
+        return None
+    around = image.counts[y - 1 : y + 2, x - 1 : x + 2]
+    return float(temperatures_degC(around, image.planck, image.around, spot.emissivity).mean())
+
+
 class ThermalImagerSettings(Polled):
     """folder: where its pictures arrive. serial_number: of the imager; pictures of another one are not read, none takes
     any. settled_s: for so long a file must not have changed. incomplete_s: a file without its end is given up after
@@ -296,6 +312,8 @@ class ThermalImager:
             "reflected_K": around.reflected_K,
             "atmosphere_K": around.air.temperature_K,
             "humidity": around.air.humidity,
+            "window_K": around.window_K,
+            "window_transmission": around.window_transmission,
         }
         if np.isfinite(plain).any():
             data |= {"lowest_degC": float(np.nanmin(plain)), "highest_degC": float(np.nanmax(plain))}
@@ -305,14 +323,11 @@ class ThermalImager:
         height, width = image.counts.shape
         for spot, settings in self._settings.spots.items():
             channel = f"{self.name}.{spot}"
-            here = settings.x_px, settings.y_px
-            x, y = image.spots.get(settings.label, here) if settings.label else here
-            if not (1 <= x < width - 1 and 1 <= y < height - 1):
+            mean_degC = spot_degC(image, settings)
+            if mean_degC is None:
+                x, y = place_of(image, settings)
                 yield bad_reading(channel, "degC", time_ns, f"({x}, {y}) is not within the {width} x {height} px")
-                continue
-            around = image.counts[y - 1 : y + 2, x - 1 : x + 2]
-            mean_degC = float(temperatures_degC(around, image.planck, image.around, settings.emissivity).mean())
-            if math.isfinite(mean_degC):
+            elif math.isfinite(mean_degC):
                 yield Reading(channel, mean_degC, "degC", time_ns)
             else:
                 yield bad_reading(channel, "degC", time_ns, "the counts there are of no temperature")

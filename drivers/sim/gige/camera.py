@@ -6,6 +6,7 @@ are for the peer. One lock, the plant's, guards the camera's state; rendering an
 
 from __future__ import annotations
 
+import math
 import socket
 import threading
 from collections.abc import Callable
@@ -138,6 +139,7 @@ class FakeCamera:
             "GevTimestampControlLatch": self._latch_timestamp,
             "GevTimestampControlReset": self._reset_timestamp,
             "DeviceReset": self._restart,
+            "GevHeartbeatTimeout": self._shorten_heartbeat,
             **dict.fromkeys(("Width", "Height", "PixelFormat"), self._resize),
             **dict.fromkeys(_TIMING, self._schedule.reschedule),
         }
@@ -256,7 +258,9 @@ class FakeCamera:
         sensor = self._registers.integer("DeviceTemperatureSelector") == 0
         chip_degC = self._thermometers.sensor_degC if sensor else self._thermometers.body_degC
         chip_degC += self.faults.temperature_offset_K
-        shown_degC = 0.0 if fault == "zero" else round(chip_degC / _RESOLUTION_K) * _RESOLUTION_K
+        shown_degC = (
+            {"zero": 0.0, "nan": math.nan}[fault] if fault else round(chip_degC / _RESOLUTION_K) * _RESOLUTION_K
+        )
         self._registers.put("DeviceTemperature", shown_degC)
 
     def after_write(self, name: str) -> None:
@@ -283,6 +287,10 @@ class FakeCamera:
         pixels = self._registers.integer("Width") * self._registers.integer("Height")
         pixel_format = gvsp.PixelFormat(self._registers.integer("PixelFormat"))
         self._registers.put("PayloadSize", pixel_format.size_bytes(pixels) - self.faults.payload_short_bytes)
+
+    def _shorten_heartbeat(self, now_ns: int) -> None:
+        asked_ms = self._registers.integer("GevHeartbeatTimeout")
+        self._registers.put("GevHeartbeatTimeout", min(asked_ms, self.faults.heartbeat_most_ms))
 
     def _latch_timestamp(self, now_ns: int) -> None:
         self._registers.put("GevTimestampValue", now_ns - self._ticks_from_ns)

@@ -9,7 +9,7 @@ import zlib
 from drivers.sim.gige.genicam import XML_ADDRESS, XML_NAME, Feature, to_xml
 from drivers.sim.gige.gvcp import Nack, Status
 
-CAN_CONCATENATE, CAN_WRITE_MEMORY, CAN_RESEND = 1 << 0, 1 << 1, 1 << 2
+CAN_CONCATENATE, CAN_WRITE_MEMORY, CAN_RESEND, CAN_PEND = 1 << 0, 1 << 1, 1 << 2, 1 << 5
 HAS_USER_NAME, HAS_SERIAL = 1 << 31, 1 << 30
 DISCOVERY_bytes = 0xF8
 
@@ -64,7 +64,9 @@ class Registers:
 
     def offer_resend(self, offered: bool) -> None:
         """Set the capability register, with or without PACKETRESEND."""
-        capability = CAN_CONCATENATE | CAN_WRITE_MEMORY | HAS_USER_NAME | HAS_SERIAL | (CAN_RESEND if offered else 0)
+        capability = (
+            CAN_CONCATENATE | CAN_WRITE_MEMORY | CAN_PEND | HAS_USER_NAME | HAS_SERIAL | (CAN_RESEND if offered else 0)
+        )
         struct.pack_into(">I", self._segments[0], _CAPABILITY, capability)
 
     def offer_stream(self, offered: bool) -> None:

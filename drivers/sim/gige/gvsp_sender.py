@@ -34,8 +34,9 @@ class CameraFaults:
     can. leader_early_s: the leader is so long ahead of the payload; stretch_s: which takes so long. drop_leader,
     drop_trailer: missing from every frame until asked for again. trigger_twice: every software
     trigger gives two frames. no_stream_channel: it says that it has none, as one that is not ready yet. temperature:
-    DeviceTemperature reads 0, is refused, or keeps its last value; temperature_offset_K: it is wrong by so much.
-    payload_short_bytes: PayloadSize is too small by so much from the next change of region on.
+    DeviceTemperature reads 0, is refused, keeps its last value, or is no number; temperature_offset_K: it is wrong by
+    so much. heartbeat_most_ms: the longest heartbeat time-out that it takes. payload_short_bytes: PayloadSize is too
+    small by so much from the next change of region on.
     switch: what it shares with other cameras on the way to the computer.
     """
 
@@ -55,13 +56,14 @@ class CameraFaults:
     drop_trailer: bool = False
     trigger_twice: bool = False
     no_stream_channel: bool = False
-    temperature: Literal["zero", "access", "stuck"] | None = None
+    temperature: Literal["zero", "access", "stuck", "nan"] | None = None
     temperature_offset_K: float = 0.0
     stamp: Literal["zero", "backwards"] | None = None
     no_ticks: bool = False
     acks_twice: bool = False
     pending: int = 0
     payload_short_bytes: int = 0
+    heartbeat_most_ms: int = 60_000
     switch: Switch | None = None
 
 
