@@ -325,6 +325,21 @@ async def test_without_resend_a_frame_with_holes_is_never_used(plant: WarmPlant,
     assert (frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)).all()
 
 
+async def test_three_missing_frames_of_a_free_run_are_a_lost_camera(plant: WarmPlant, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 0.5)  # what each of three frames is waited for
+    async with virtual(plant) as (clock, fake), opened(clock, trigger="free_run", frame_rate_hz=2) as camera:
+        await camera.grab()
+        fake.faults.silent_gvsp = True
+        with pytest.raises(Unreachable, match="3 frame periods brought no complete frame"):
+            await camera.grab()
+        with pytest.raises(Unreachable, match="3 frame periods"):  # until it is opened again
+            await camera.read()
+        assert (camera.is_usable, camera.counters()["lost"]) == (False, 1)
+        fake.faults.silent_gvsp = False
+        await camera.open()
+        assert (await camera.grab()).image.shape == (HEIGHT_px, WIDTH_px)
+
+
 async def test_a_lost_frame_is_counted_and_the_next_trigger_brings_the_frame(fake: FakeCamera):
     async with opened() as camera:
         await camera.grab()
