@@ -93,7 +93,7 @@ def apply_model(
             _refuse(("--time", time), why="the points have a column time_ns")
             check_writable(out)
             recorded = None if session is None else _opened(session, used, camera, incomplete)
-            _correct_points(used, source, out, recorded, camera_degC)
+            used = _correct_points(used, source, out, recorded, camera_degC)
         else:
             _refuse(("--frames", frames), why="it selects frames of a session")
             recorded = None if session is None else _opened(session, used, camera, incomplete)
@@ -102,7 +102,7 @@ def apply_model(
             image = read_image(source)
             write_image(out, corrected_image(image, used, states), form, image.dtype)
             _warn(middle_flags(used, states))
-        show({"out": out}, ())
+        show({"out": out, "form": used.form}, ())
 
 
 def _opened(path: Path, model: DriftModel, camera: str | None, incomplete: bool) -> Session:
@@ -192,7 +192,8 @@ def _refuse(*options: tuple[str, object], why: str) -> None:
 
 def _correct_points(
     model: DriftModel, source: Path, out: Path, session: Session | None, camera_degC: float | None
-) -> None:
+) -> DriftModel:
+    """The form that it was done with."""
     rows = read_points(source)
     xy_px = np.column_stack([numbers(source, rows, X), numbers(source, rows, Y)])
     if session is not None:
@@ -209,6 +210,7 @@ def _correct_points(
     outside = int((model.flags(xy_px, states) != 0).sum())
     if outside:
         say(f"warning: {outside} of {len(rows)} points are outside the model's valid range")
+    return model
 
 
 def _without_history(model: DriftModel) -> DriftModel:
@@ -230,6 +232,7 @@ def _without_history(model: DriftModel) -> DriftModel:
 
 def _recorded_states(model: DriftModel, session: Session, time_ns: Sequence[int]) -> States:
     """The thermal state at each instant, of which the same may come many times and in any order."""
+    say(f"corrected with the {model.form} form of the model ({model.title}), by what {session.path.name} recorded")
     recorded_degC = {frame_ns: meta.camera_degC for frame_ns, meta in session.frame_metas}
     instants, where = np.unique(np.array(time_ns, np.int64), return_inverse=True)
     camera_degC = np.array([recorded_degC.get(instant, math.nan) for instant in instants.tolist()])

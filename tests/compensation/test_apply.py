@@ -368,7 +368,8 @@ def test_a_session_is_corrected_with_the_form_in_use_and_so_is_an_export(
     run("detect", recorded.path, "-o", tmp_path / "found.csv")
     for name in ("both", "thermal"):
         model = tmp_path / f"{name}.json"
-        run("apply", model, tmp_path / "found.csv", "--session", recorded.path, "-o", tmp_path / f"{name}.csv")
+        said = run("apply", model, tmp_path / "found.csv", "--session", recorded.path, "-o", tmp_path / f"{name}.csv")
+        assert said.startswith("corrected with the thermal form of the model (")
         run("export", model, "-o", tmp_path / name)
     assert (tmp_path / "both.csv").read_bytes() == (tmp_path / "thermal.csv").read_bytes()
     assert (tmp_path / "both" / "drift.json").read_bytes() == (tmp_path / "thermal" / "drift.json").read_bytes()
