@@ -5,6 +5,7 @@ no form was chosen on. Forms are not to be changed in view of these cameras: num
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from tests.compensation.plant_night import Dwell, Published, Seen, WarmUp, night
 
 PRESETS = ("nac", "navcam", "dic", "phone")
 NUMBERS = range(200, 203)
-GOAL_MPX = {"what repeats": 5.0, "and what does not": 10.0}
+HELD_OUT, SWITCHED_ON = "held-out temperatures", "switching on, another night"
+GOAL_MPX = {"what repeats": {HELD_OUT: 5.0, SWITCHED_ON: 6.4}, "and what does not": {HELD_OUT: 10.0}}
 REPEATING: tuple[Effect, ...] = ("sag", "dead_zone", "creep", "coarse_sensor", "far_air")
 UNREPEATING: tuple[Effect, ...] = ("stick_slip", "unrepeated")
 _CHANCE = 0.4
@@ -38,8 +40,8 @@ def cameras(group: str) -> Iterator[Published]:
 def figures() -> Iterator[Figure]:
     """Medians of the cameras at held-out temperatures and when switched on at 20 degC on another night, and how often
     the 95 % intervals of the answers without a flag hold."""
-    for group, goal_mpx in GOAL_MPX.items():
-        found: dict[str, list[tuple[float, float, float, float]]] = {"held-out temperatures": [], "switching on": []}
+    for group, goals_mpx in GOAL_MPX.items():
+        found: dict[str, list[_Score]] = {HELD_OUT: [], SWITCHED_ON: []}
         for camera in cameras(group):
             progress(f"drift, {camera.preset} {camera.drawn}, {', '.join(camera.effects)}")
             first = night(camera, camera.drawn, warm_up_and_cycles())
@@ -48,23 +50,44 @@ def figures() -> Iterator[Figure]:
             second = night(camera, camera.drawn + 1000, [WarmUp(20.0), Dwell(24.0, "reference", 2700, 20)], "night-2")
             at_reference_px = first[1][first[0].of(Role.REFERENCE)].mean(axis=0)
             for what, seen, role in (
-                ("held-out temperatures", first, Role.VALIDATION),
-                ("switching on", second, Role.WARM_UP),
+                (HELD_OUT, first, Role.VALIDATION),
+                (SWITCHED_ON, second, Role.WARM_UP),
             ):
                 ours, covered, unflagged = _left(model, seen, role, at_reference_px)
-                found[what].append((ours, _left(paper, seen, role, at_reference_px)[0], covered, unflagged))
+                peer = _left(paper, seen, role, at_reference_px)[0]
+                found[what].append(_Score(ours, peer, covered, unflagged, "dead_zone" in camera.effects))
         for what, scores in found.items():
-            yield from _lines(f"drift, presets, {group}, {what}", goal_mpx, scores)
+            yield from _lines(f"drift, presets, {group}, {what}", goals_mpx.get(what), scores)
 
 
-def _lines(what: str, goal_mpx: float, scores: list[tuple[float, float, float, float]]) -> Iterator[Figure]:
-    ours, paper, covered, unflagged = zip(*scores, strict=True)
-    yield at_most(goal_mpx, side_by_side(what, "mpx RMS", "paper's form", ours, paper))
+@dataclass(frozen=True, slots=True)
+class _Score:
+    """Of one camera: what the model in use and the paper's form leave, mpx; of its answers without a flag the share in
+    their 95 % interval, and the share of these answers."""
+
+    left_mpx: float
+    paper_mpx: float
+    covered: float
+    unflagged: float
+    has_dead_zone: bool
+
+
+def _lines(what: str, goal_mpx: float | None, scores: list[_Score]) -> Iterator[Figure]:
+    ours, paper = [one.left_mpx for one in scores], [one.paper_mpx for one in scores]
+    median = side_by_side(what, "mpx RMS", "paper's form", ours, paper)
+    yield median if goal_mpx is None else at_most(goal_mpx, median)
     yield absolute("  the worst camera", "mpx RMS", [max(ours)])
-    weights = np.array(unflagged)
-    share = 100 * float(np.average(np.nan_to_num(covered), weights=weights)) if weights.any() else np.nan
-    yield absolute("  95 % intervals of unflagged answers; 92 to 98 is right", "%", [share])
-    yield absolute("  answers without a flag", "%", [100 * float(weights.mean())])
+    yield _holds("", scores)
+    yield absolute("  answers without a flag", "%", [100 * float(np.mean([one.unflagged for one in scores]))])
+    few = [one for one in scores if not one.has_dead_zone]
+    yield absolute(f"  the {len(few)} cameras without a dead zone", "mpx RMS", [one.left_mpx for one in few])
+    yield _holds(" of these", few)
+
+
+def _holds(whose: str, scores: list[_Score]) -> Figure:
+    weights = [one.unflagged for one in scores]
+    share = float(np.average(np.nan_to_num([one.covered for one in scores]), weights=weights))
+    return absolute(f"  95 % intervals of unflagged answers{whose}; 92 to 98 is right", "%", [100 * share])
 
 
 def _left(model: DriftModel, seen: Seen, role: str, reference_px: np.ndarray) -> tuple[float, float, float]:

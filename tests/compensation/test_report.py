@@ -197,6 +197,13 @@ def test_an_interval_that_claims_too_much_is_told(numbers: Numbers):
     assert "thermal lag, hysteresis" in page_of("", list(result_section(too_few)))
 
 
+def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers):
+    assert numbers.model is not None
+    two = replace(numbers, model=replace(numbers.model, session_ids=("night-1", "night-2")))
+    for given, is_said in ((numbers, True), (two, False)):
+        assert ("A second night over the same set-points" in page_of("", list(uncertainty_section(given)))) == is_said
+
+
 def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
     cold = warm_up_only()
     assert not can_be_fitted(cold)
