@@ -16,6 +16,7 @@ from markers.compiled import compiled
 from markers.noise import Image
 
 Float = NDArray[np.float64]
+Columns = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 """An image (height, width, 1 or 2 bytes of a pixel, the low one first)."""
 
@@ -25,6 +26,8 @@ U, V, VALUE, SHARE, RESIDUAL, RISE = range(6)
 what the model writes: residual over its standard deviation, and how it changes per px that the outline moves."""
 
 CLIPPED_PART = 0.25
+_PARTS = np.array([GROUND, CORE, CORE, DISC, -1, DISC, CORE, CORE, GROUND])
+"""The regions that a row goes through, from left to right; -1 is within all of them."""
 
 
 class Pixels(NamedTuple):
@@ -80,34 +83,25 @@ def gather(
     count[:] = 0
     seen, cut = 0, False
     burnt, side = np.zeros(2, np.int64), np.zeros(2, np.int64)
-    levels = (limits.core_out**2, 1.0, limits.core_in**2)
     reach = limits.ground * scale * math.sqrt(shape[0] / (shape[0] * shape[2] - shape[1] * shape[1]))
+    ends = np.empty(len(_PARTS) + 1, np.int64)
     for row in range(math.ceil(centre[1] - reach), math.floor(centre[1] + reach) + 1):
-        y = (row - centre[1]) / scale
-        first, last = _columns(centre[0], shape, scale, y, limits.ground)
-        hole_first, hole_last = _columns(centre[0], shape, scale, y, limits.disc)
-        if hole_first > hole_last:
-            hole_first, hole_last = last + 1, last
-        if first <= last and (row < 0 or row >= height or first < 0 or last >= width):
+        _set_ends(ends, centre[0], shape, scale, (row - centre[1]) / scale, limits)
+        if ends[0] < ends[-1] and (row < 0 or row >= height or ends[0] < 0 or ends[-1] > width):
             cut = True
         if row < 0 or row >= height:
             continue
-        for begin, end in ((first, min(last, hole_first - 1)), (max(first, hole_last + 1), last)):
-            begin, end = max(begin, 0), min(end, width - 1) + 1
-            while begin < end:
-                depth = _depth(begin, centre[0], shape, scale, y, levels)
-                behind = begin + 1
-                while behind < end and _depth(behind, centre[0], shape, scale, y, levels) == depth:
-                    behind += 1
-                region = GROUND if depth == 0 else DISC if depth == 3 else CORE
-                if count[region] + behind - begin > pixels.table.shape[2]:
-                    return Gathered(-1, -1, cut)
-                outside = 1 if depth < 2 else 0
-                seen += behind - begin
-                side[outside] += behind - begin
-                burnt[outside] += _copy_run(image, row, begin, behind, ceiling, pixels.table[region], count[region])
-                count[region] += behind - begin
-                begin = behind
+        for part in range(len(_PARTS)):
+            begin, end, region = max(ends[part], 0), min(ends[part + 1], width), _PARTS[part]
+            if begin >= end or region < 0:
+                continue
+            if count[region] + end - begin > pixels.table.shape[2]:
+                return Gathered(-1, -1, cut)
+            outside = 1 if part < 2 or part > 6 else 0
+            seen += end - begin
+            side[outside] += end - begin
+            burnt[outside] += _copy_run(image, row, begin, end, ceiling, pixels.table[region], int(count[region]))
+            count[region] += end - begin
     if burnt[0] + burnt[1] > 0:
         clipped = burnt[0] > CLIPPED_PART * side[0], burnt[1] > CLIPPED_PART * side[1]
         _set_burnt_aside(pixels, centre, shape, scale, ceiling, clipped)
@@ -115,11 +109,16 @@ def gather(
 
 
 @compiled
-def _depth(column: int, cx: float, shape: Float, scale: float, y: float, levels: tuple[float, float, float]) -> int:
-    """How many of the levels, F squared, a pixel is inside of."""
-    x = (column - cx) / scale
-    q = shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y
-    return (q <= levels[0]) + (q <= levels[1]) + (q <= levels[2])
+def _set_ends(ends: Columns, cx: float, shape: Float, scale: float, y: float, limits: Limits) -> None:
+    """Where the parts of a row at height y begin, and the last one ends: into the ellipses, one inside the other, and
+    out of them again. A part is empty where the row misses its ellipse."""
+    begin, end = -(1 << 40), 1 << 40
+    for i, F in enumerate((limits.ground, limits.core_out, 1.0, limits.core_in, limits.disc)):
+        first, last = _columns(cx, shape, scale, y, F)
+        if first > last:
+            first, last = end, end
+        begin, end = min(max(first, begin), end), max(min(last + 1, end), begin)
+        ends[i], ends[len(_PARTS) - i] = begin, end
 
 
 @compiled

@@ -29,14 +29,18 @@ from markers.edge_model import (
     ERROR,
     F0,
     PARAMETERS,
-    PIXEL,
     ROWS,
+    SHARES,
+    VALUES,
     Float,
+    Single,
     Variance,
+    X,
+    Y,
     derivatives,
     load_block,
 )
-from markers.pixels import CORE, DISC, GROUND, SHARE, VALUE, Pixels, U, V
+from markers.pixels import CORE, DISC, GROUND, Pixels
 
 MOST_CLUSTERS = 6
 _LEAST_CLUSTERS = 2
@@ -48,13 +52,13 @@ SAMPLED_MARKERS = 27
 _LEAST_MARKERS = 8
 """With fewer the growth of a frame's variances is a guess."""
 _DOUBT_OF_LESS = 2.0
-_TINY = 1e-12
+_TINY, _ZERO, _ONE, _THREE = np.float32(1e-12), np.float32(0), np.float32(1), np.float32(3)
 
 _MOVED, _TAKEN, _SQUARE = range(3)
 """Of each cluster with weights w: the sums of w g e, of w g^2 and of w^2 g^2."""
-_X, _Y, _G, _H, _E, _CLUSTER, _SEEN = range(7)
-"""Rows of a block of pixels: place, then the weights in its two clusters; influences on cx and cy; residual; the first
-of the clusters; how many rows."""
+_X, _Y, _G, _H, _E, _PLACE, _SEEN = range(7)
+"""Rows of a block of pixels: place in the image; influences on cx and cy; residual; place in the quadrant, in clusters;
+how many rows."""
 
 
 @compiled
@@ -70,15 +74,17 @@ def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inve
     `inverse` by what the fit takes from the residuals of each cluster, by the square of the part of all influence that
     is the cluster's.
     """
-    sums, rows, seen = np.zeros((2, 3, parts + 1)), np.empty((ROWS, BLOCK)), np.empty((_SEEN, BLOCK))
+    sums, seen = np.zeros((2, 3, parts + 1)), np.empty((_SEEN, BLOCK), np.float32)
+    rows = np.empty((ROWS, BLOCK), np.float32)
+    block = rows.ravel()
     for region, level in ((CORE, -1), (GROUND, B0), (DISC, F0)):
         table, count = pixels.table[region], pixels.counts[region]
         for first in range(0, count, BLOCK):
-            size = load_block(rows, table, first, count)
+            size = load_block(block, table, first, count, p, scale)
             for k in range(size):
-                seen[_X, k], seen[_Y, k] = (rows[PIXEL + U, k] - p[CX]) / scale, (rows[PIXEL + V, k] - p[CY]) / scale
+                seen[_X, k], seen[_Y, k] = rows[X, k], rows[Y, k]
             if region == CORE:
-                derivatives(rows.ravel(), size, p, scale, noise)
+                derivatives(block, size, p, scale, noise)
                 _core_influences(rows, inverse, size, seen)
             else:
                 _level_influences(rows, p, noise, inverse, level, size, seen)
@@ -95,12 +101,12 @@ def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inve
 
 
 @compiled
-def _core_influences(rows: Float, inverse: Float, size: int, seen: Float) -> None:
+def _core_influences(rows: Single, inverse: Float, size: int, seen: Single) -> None:
     """What pixels near the outline move the centre by, and their residuals, from their derivatives."""
     for k in range(size):
-        seen[_G, k], seen[_H, k], seen[_E, k] = 0.0, 0.0, rows[ERROR, k]
+        seen[_G, k], seen[_H, k], seen[_E, k] = _ZERO, _ZERO, rows[ERROR, k]
     for i in range(PARAMETERS):
-        a, b = inverse[CX, i], inverse[CY, i]
+        a, b = np.float32(inverse[CX, i]), np.float32(inverse[CY, i])
         for k in range(size):
             seen[_G, k] += a * rows[i, k]
             seen[_H, k] += b * rows[i, k]
@@ -108,42 +114,45 @@ def _core_influences(rows: Float, inverse: Float, size: int, seen: Float) -> Non
 
 @compiled
 def _level_influences(
-    rows: Float, p: Float, noise: Variance, inverse: Float, level: int, size: int, seen: Float
+    rows: Single, p: Float, noise: Variance, inverse: Float, level: int, size: int, seen: Single
 ) -> None:
     """The same for pixels that see only the plane whose parameters begin at `level`."""
-    a, b, c = p[level], p[level + 1], p[level + 2]
-    g0, gx, gy = inverse[CX, level], inverse[CX, level + 1], inverse[CX, level + 2]
-    h0, hx, hy = inverse[CY, level], inverse[CY, level + 1], inverse[CY, level + 2]
+    a, b, c = np.float32(p[level]), np.float32(p[level + 1]), np.float32(p[level + 2])
+    floor, gain = np.float32(noise[0]), np.float32(noise[1])
     for k in range(size):
-        x, y = seen[_X, k], seen[_Y, k]
-        model = a + b * x + c * y
-        root = math.sqrt(rows[PIXEL + SHARE, k] / (noise[0] + noise[1] * max(model, 0.0)))
-        seen[_G, k], seen[_H, k] = root * (g0 + gx * x + gy * y), root * (h0 + hx * x + hy * y)
-        seen[_E, k] = root * (rows[PIXEL + VALUE, k] - model)
+        model = a + b * seen[_X, k] + c * seen[_Y, k]
+        root = math.sqrt(rows[SHARES, k] / (floor + gain * max(model, _ZERO)))
+        seen[_E, k] = root * (rows[VALUES, k] - model)
+        seen[_PLACE, k] = root
+    for row, axis in ((_G, CX), (_H, CY)):
+        g = np.float32(inverse[axis, level])
+        gx, gy = np.float32(inverse[axis, level + 1]), np.float32(inverse[axis, level + 2])
+        for k in range(size):
+            seen[row, k] = seen[_PLACE, k] * (g + gx * seen[_X, k] + gy * seen[_Y, k])
 
 
 @compiled
-def _add_block(seen: Float, size: int, sums: Float) -> None:
-    """Add pixels to the two clusters of each."""
+def _add_block(seen: Single, size: int, sums: Float) -> None:
+    """Add pixels to the two clusters of each. It is looked at all the clusters of all pixels, several pixels at a time:
+    to add each to its own two, one after the other, takes three times as long."""
     parts = sums.shape[2] - 1
     for k in range(size):
         x, y = abs(seen[_X, k]), abs(seen[_Y, k])
-        place = parts * y / (x + y + _TINY)
-        cluster = min(math.floor(place), parts - 1.0)
-        far = place - cluster
-        near = 1 - far
-        seen[_X, k], seen[_Y, k] = near * math.sqrt(1 + 2 * far), far * math.sqrt(1 + 2 * near)
-        seen[_CLUSTER, k] = cluster
-    for k in range(size):
-        cluster = int(seen[_CLUSTER, k])
-        for axis in range(2):
-            g = seen[_G + axis, k]
-            moved, taken = g * seen[_E, k], g * g
-            for side in range(2):
-                weight = seen[_X + side, k]
-                sums[axis, _MOVED, cluster + side] += weight * moved
-                sums[axis, _TAKEN, cluster + side] += weight * taken
-                sums[axis, _SQUARE, cluster + side] += weight * weight * taken
+        seen[_PLACE, k] = np.float32(parts) * y / (x + y + _TINY)
+    for cluster in range(parts + 1):
+        middle = np.float32(cluster)
+        gx = gy = gxx = gyy = wxx = wyy = _ZERO
+        for k in range(size):
+            near = max(_ONE - abs(seen[_PLACE, k] - middle), _ZERO)
+            square = near * near * (_THREE - near - near)
+            weight = math.sqrt(square)
+            g, h, e = seen[_G, k], seen[_H, k], seen[_E, k]
+            gx, gy = gx + weight * g * e, gy + weight * h * e
+            gxx, gyy = gxx + weight * g * g, gyy + weight * h * h
+            wxx, wyy = wxx + square * g * g, wyy + square * h * h
+        for axis, found in enumerate(((gx, gxx, wxx), (gy, gyy, wyy))):
+            for row in range(3):
+                sums[axis, row, cluster] += found[row]
 
 
 def variance_growth(scatter: Float, clean: NDArray[np.bool_]) -> Float:

@@ -29,7 +29,7 @@ from markers.edge_model import (
     normal_equations,
 )
 from markers.noise import Noise
-from markers.pixels import VALUE, Limits, U, V, bytes_of, empty_pixels, gather
+from markers.pixels import CORE, DISC, GROUND, VALUE, Limits, U, V, bytes_of, empty_pixels, gather
 
 from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
 
@@ -112,6 +112,25 @@ def test_the_normal_equations_are_those_of_the_model():
     assert squares == pytest.approx(np.sum(residual**2), rel=1e-3)
     np.testing.assert_allclose(right / size, slopes @ residual / size, atol=0.02 * float(np.linalg.norm(residual)))
     np.testing.assert_allclose(normal / np.outer(size, size), slopes @ slopes.T / np.outer(size, size), atol=0.07)
+
+
+@pytest.mark.parametrize("centre", [(20.3, 19.8), (3.0, 38.6)])
+def test_pixels_are_gathered_by_where_they_lie_round_the_outline(centre: tuple[float, float]):
+    """Each once, in the region that its F says, also where the image cuts them off."""
+    shape, scale, limits = np.array([1.1, 0.08, 0.9]), 9.0, Limits(0.4, 0.7, 1.3, 1.7)
+    pixels = empty_pixels(41 * 41)
+    gathered = gather(bytes_of(np.zeros((41, 41), np.uint8)), np.array(centre), shape, scale, limits, 255, pixels)
+    v, u = np.mgrid[:41, :41]
+    x, y = (u - centre[0]) / scale, (v - centre[1]) / scale
+    F = np.sqrt(shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y)
+    region = np.select([F <= 0.4, F <= 0.7, F <= 1.3, F <= 1.7], [-1, DISC, CORE, GROUND], -1)
+    for which in (CORE, GROUND, DISC):
+        found = pixels.table[which, :, : pixels.counts[which]].astype(int)
+        assert sorted(zip(found[U], found[V], strict=True)) == sorted(
+            zip(u[region == which], v[region == which], strict=True)
+        )
+    assert gathered.seen == np.count_nonzero(region >= 0)
+    assert gathered.cut == (centre[0] < 10)
 
 
 def model(p: Float, pixels: Float) -> Float:
