@@ -25,7 +25,7 @@ from markers.bootstrap import Candidates, disc_sizes_px, find_candidates
 from markers.edge_fit import EdgeFit, Flag, fit_edges
 from markers.edge_model import B0, F0, M11, M12, M22, SIGMA, EdgeState
 from markers.expected import expected_edges, implied_edges
-from markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px
+from markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px, project
 from markers.light import under_common_light
 from markers.noise import Image, Noise
 from markers.refit import refit_edges
@@ -51,6 +51,8 @@ _POOR_MISFIT = 1.6
 _LEAST_CONTRAST_SIGMA = 5.0
 _SIZE_TOLERANCE = 1.35
 _PLACE_TOLERANCE_PITCH = 0.2
+_FLAT_PART = 0.25
+"""Of the tolerance: when all are so near to the homography, nothing has to be bent to tell which are in their place."""
 _TRACKED_PART = 0.9
 _TRACKED_STEP_PX = 5.0
 _GLANCE_BLURS = 3.0
@@ -214,11 +216,14 @@ def _fit_in_band(
     if good.sum() < target.least_markers:
         return None
     homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
-    good &= _in_its_place(fit.state, homography, target, good) & _within_image(fit.state, grey)
-    if good.sum() < target.least_markers:
+    expected = expected_edges(homography, target)
+    placed = good & _in_its_place(fit.state, homography, expected, target, good) & _within_image(fit.state, grey)
+    if placed.sum() < target.least_markers:
         return None
-    homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
-    detection = _judged(fit, good, homography, target, band_sigma, relative=noise is None)
+    if placed.sum() < good.sum():
+        homography = fit_homography(target.coordinates_mm()[placed], fit.state.centres_px()[placed])
+        expected = expected_edges(homography, target)
+    detection = _judged(fit, placed, homography, expected, band_sigma, relative=noise is None)
     return _refitted(detection, fit, grey, target, model), fit
 
 
@@ -232,9 +237,9 @@ def _doubted(detection: Detection, excess: Float) -> Detection:
 
 
 def _judged(
-    fit: EdgeFit, good: NDArray[np.bool_], homography: Float, target: Target, band_sigma: float, relative: bool
+    fit: EdgeFit, good: NDArray[np.bool_], homography: Float, expected: EdgeState, band_sigma: float, relative: bool
 ) -> Detection:
-    """The detection of a fit whose markers are `good` or missing; missing ones are expected where the others say."""
+    """The detection of a fit whose markers are `good` or missing; missing ones are `expected` where the others say."""
     chi, misfit = np.where(good, fit.chi, np.nan), np.where(good, fit.misfit, np.nan)
     usual = max(float(np.nanmedian(chi)), 1e-9)
     # A print or a lens that the model does not know makes all markers worse; a bad one is worse than the others.
@@ -244,9 +249,8 @@ def _judged(
     if relative:
         chi = chi / usual
     flags = np.where(good, fit.flags, fit.flags | Flag.MISSING) | np.where(poor, Flag.POOR_FIT, 0)
-    expected = expected_edges(homography, target)
     scale = np.median(fit.state.radii_px()[good] / expected.radii_px()[good])
-    parameters = expected.parameters
+    parameters = expected.parameters.copy()
     parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
     believed = good & ~poor
     centres, covariance = under_common_light(fit, believed)
@@ -316,15 +320,19 @@ def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.
     return sign * state.contrast_DN() > _LEAST_CONTRAST_SIGMA * np.sqrt(noise.variance_DN2(level))
 
 
-def _in_its_place(state: EdgeState, homography: Float, target: Target, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _in_its_place(
+    state: EdgeState, homography: Float, expected: EdgeState, target: Target, good: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Whether each ellipse has about the place and the size that the other markers imply."""
-    expected = expected_edges(homography, target)
-    known = np.where(good[:, None], state.centres_px(), np.nan)
-    off = np.linalg.norm(state.centres_px() - expected_px(target.coordinates_mm(), known, homography), axis=1)
+    limit_px = _PLACE_TOLERANCE_PITCH * pitch_px(homography, target)
+    off_px = np.linalg.norm(state.centres_px() - project(homography, target.coordinates_mm()), axis=1)
+    if np.any(off_px[good] > _FLAT_PART * limit_px):  # a wide lens, or a wrong one among them
+        known = np.where(good[:, None], state.centres_px(), np.nan)
+        bent_px = expected_px(target.coordinates_mm(), known, homography)
+        off_px = np.linalg.norm(state.centres_px() - bent_px, axis=1)
     ratio = state.radii_px() / expected.radii_px()
     ratio = ratio / np.median(ratio[good])
-    near = off < _PLACE_TOLERANCE_PITCH * pitch_px(homography, target)
-    return near & (ratio < _SIZE_TOLERANCE) & (ratio > 1 / _SIZE_TOLERANCE)
+    return (off_px < limit_px) & (ratio < _SIZE_TOLERANCE) & (ratio > 1 / _SIZE_TOLERANCE)
 
 
 def _within_image(state: EdgeState, grey: Image) -> NDArray[np.bool_]:
