@@ -145,7 +145,9 @@ def test_a_cluster_finds_the_same_bits_also_when_a_worker_is_killed(pieces: list
     dask = pytest.importorskip("dask")
     with (
         dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as here,
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
+        ) as here,
     ):
         found: dict[int, FoundMarkers] = {}
         for index, markers in on_cluster(here.scheduler_address)(pieces):
