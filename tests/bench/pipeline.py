@@ -57,9 +57,9 @@ def figures(directory: Path) -> list[Figure]:
     sessions = {count: directory / f"pipeline-{count}" for count in (FEW, COUNT)}
     try:
         progress("pipeline, rendering and writing 8 GB")
-        photographs = [_photograph(index) for index in range(len(SEQUENCE))]
+        photographs = [photographed(index) for index in range(len(SEQUENCE))]
         for count, session in sessions.items():
-            _write(session, photographs, count)
+            write_session(session, photographs, count)
         progress("pipeline, 450 frames to a report")
         few = _reported(sessions[FEW])
         progress("pipeline, 3600 frames to a report")
@@ -123,14 +123,14 @@ def _peer(session: Path, first: int, end: int) -> int:
     return sum(cv2.findCirclesGrid(opened.frame(number).image, (9, 6))[0] for number in range(first, end))
 
 
-def _photograph(index: int) -> bytes:
+def photographed(index: int) -> bytes:
     """A PNG of the target, drifted by 0.009 and 0.026 px/K."""
     above_K = SEQUENCE[index][1] - 24
     scene = Scene(tilt_y_deg=3, roll_deg=1, shift_mm=(0.001 * above_K, 0.003 * above_K))
     return encode_png(photograph(scene, render(scene), index))
 
 
-def _write(session: Path, photographs: list[bytes], count: int) -> None:
+def write_session(session: Path, photographs: list[bytes], count: int) -> None:
     metadata = {"session_id": session.name, "recipe": "pipeline", "camera_serial": "TS-0001", "simulated": "true"}
     attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text(encoding="utf-8")}
     encoder = TelemetryEncoder(DEVICES)
