@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensation.budget.correction import granite_mm, indices, post_mm, refraction_px, target_strain, varied
-from compensation.budget.geometry import Geometry, StandState
+from compensation.budget.geometry import Geometry, StandTemperatures
 from compensation.budget.refraction import Index, ciddor_1996, edlen_1966, tilted_shift_mm
 from compensation.budget.repeatability import Repeatability, home_residuals, v0_repeats
 from compensation.budget.session_temperatures import capture_states, mean_state, states_at
@@ -17,7 +17,7 @@ from foundation.errors import SessionError
 from markers.target import Target
 from recording.reading.session import Session
 
-Effect = Callable[[StandState, Geometry], tuple[float, float]]
+Effect = Callable[[StandTemperatures, Geometry], tuple[float, float]]
 """(state, geometry) -> (um on or of the target, px in the image)."""
 
 
@@ -41,7 +41,7 @@ class Contribution:
 class Budget:
     """A session's contributions against its reference state; coolest and warmest air at the camera during captures."""
 
-    reference: StandState
+    reference: StandTemperatures
     air_degC: tuple[float, float]
     contributions: tuple[Contribution, ...]
 
@@ -87,32 +87,32 @@ def table(budget: Budget) -> str:
 
 
 def _thermal(
-    states: Sequence[StandState], reference: StandState, geometry: Geometry, radius_mm: float
+    states: Sequence[StandTemperatures], reference: StandTemperatures, geometry: Geometry, radius_mm: float
 ) -> list[Contribution]:
     um_per_px = 1e3 * geometry.distance_mm.value / geometry.focal_px
     corner_px = np.array([(geometry.image_px[0] - 1) / 2, (geometry.image_px[1] - 1) / 2])
 
-    def granite(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def granite(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
         away_mm = granite_mm(state, reference, stand)
         return 1e3 * away_mm, -away_mm / stand.distance_mm.value * float(np.linalg.norm(corner_px))
 
-    def post(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def post(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
         up_mm = post_mm(state, reference, stand)
         return 1e3 * up_mm, up_mm * stand.focal_px / stand.distance_mm.value
 
-    def growth(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def growth(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
         outwards_mm = target_strain(state, reference, stand) * radius_mm
         return 1e3 * outwards_mm, outwards_mm * stand.focal_px / stand.distance_mm.value
 
     def refraction(index: Index) -> Effect:
-        def of(state: StandState, stand: Geometry) -> tuple[float, float]:
+        def of(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
             moved = refraction_px(state, stand, corner_px, index) - refraction_px(reference, stand, corner_px, index)
             outwards_px = float(np.sign(moved[0]) * np.linalg.norm(moved))
             return outwards_px * um_per_px, outwards_px
 
         return of
 
-    def tilted(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def tilted(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
         tilt_rad, interface_mm = math.radians(stand.interface_tilt_deg), stand.interface_mm.value
         now, before = (
             tilted_shift_mm(tilt_rad, stand.distance_mm.value, interface_mm, *indices(at, stand))
@@ -139,7 +139,7 @@ def _thermal(
 def _largest(
     name: str,
     effect: Effect,
-    states: Sequence[StandState],
+    states: Sequence[StandTemperatures],
     geometry: Geometry,
     where: str,
     corrected: bool = False,
@@ -190,8 +190,8 @@ def _outermost_mm(target: Target) -> float:
     return float(np.linalg.norm(places - (places.min(axis=0) + places.max(axis=0)) / 2, axis=1).max())
 
 
-def _is_known(state: StandState) -> bool:
-    return all(math.isfinite(getattr(state, name)) for name in StandState.__dataclass_fields__)
+def _is_known(state: StandTemperatures) -> bool:
+    return all(math.isfinite(getattr(state, name)) for name in StandTemperatures.__dataclass_fields__)
 
 
 def _number(value: float, width: int, digits: int) -> str:

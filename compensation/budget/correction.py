@@ -16,13 +16,13 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.budget.geometry import Geometry, Quantity, StandState
+from compensation.budget.geometry import Geometry, Quantity, StandTemperatures
 from compensation.budget.refraction import Index, appears_px, ciddor_1996, saturation_Pa
 
 Float = NDArray[np.float64]
 
 
-def displacement_px(state: StandState, reference: StandState, geometry: Geometry, xy_px: Float) -> Float:
+def displacement_px(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry, xy_px: Float) -> Float:
     """The displacement of image points (..., 2) by granite, post, target and air, from `reference` to `state`."""
     centre = (np.array(geometry.image_px) - 1) / 2
     offset = np.asarray(xy_px, dtype=np.float64) - centre
@@ -34,19 +34,19 @@ def displacement_px(state: StandState, reference: StandState, geometry: Geometry
     return scale * offset + post * down + refraction
 
 
-def varied(state: StandState, geometry: Geometry) -> Iterator[tuple[StandState, Geometry]]:
+def varied(state: StandTemperatures, geometry: Geometry) -> Iterator[tuple[StandTemperatures, Geometry]]:
     """State and geometry with one uncertain input after the other larger by its standard uncertainty."""
     for name in Geometry.model_fields:
         quantity = getattr(geometry, name)
         if isinstance(quantity, Quantity) and quantity.u > 0:
             larger = Quantity(value=quantity.value + quantity.u, u=quantity.u)
             yield state, geometry.model_copy(update={name: larger})
-    for field in fields(StandState):
+    for field in fields(StandTemperatures):
         on_granite = geometry.granite_gradient_K if field.name.startswith("granite") else 0.0
         yield state.warmer_by(**{field.name: math.hypot(geometry.thermometer_K, on_granite)}), geometry
 
 
-def granite_mm(state: StandState, reference: StandState, geometry: Geometry) -> float:
+def granite_mm(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
     """How much the base has moved the target away from the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     outside_K = state.granite_outside_degC - reference.granite_outside_degC
@@ -54,24 +54,24 @@ def granite_mm(state: StandState, reference: StandState, geometry: Geometry) -> 
     return geometry.granite_per_K.value * lengths_mm_K
 
 
-def post_mm(state: StandState, reference: StandState, geometry: Geometry) -> float:
+def post_mm(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
     """How much the post has lifted the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     return geometry.granite_per_K.value * geometry.post_mm.value * inside_K
 
 
-def target_strain(state: StandState, reference: StandState, geometry: Geometry) -> float:
+def target_strain(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
     """Relative growth of the target."""
     return geometry.target_per_K.value * (state.artifact_degC - reference.artifact_degC)
 
 
-def refraction_px(state: StandState, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
+def refraction_px(state: StandTemperatures, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
     """How far points (..., 2), px from the principal point, appear outwards by the air's indices on both sides."""
     n1, n2 = indices(state, geometry, index)
     return appears_px(offset_px, geometry.focal_px, _distance_mm(geometry), geometry.interface_mm.value, n1, n2)
 
 
-def indices(state: StandState, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
+def indices(state: StandTemperatures, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
     """Refractive indices of the air at the camera and of the laboratory's."""
     pressure_Pa = geometry.pressure_Pa.value
     laboratory_Pa = geometry.relative_humidity.value * saturation_Pa(state.laboratory_degC)

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.budget.geometry import StandState
+from compensation.budget.geometry import StandTemperatures
 from foundation.errors import SessionError
 from foundation.items import StepState
 from recording.reading.interpolation import interpolated
 from recording.reading.session import Session
 
-_SENSORS = tuple(name.removesuffix("_degC") for name in StandState.__dataclass_fields__)
+_SENSORS = tuple(name.removesuffix("_degC") for name in StandTemperatures.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,25 +27,25 @@ class CaptureState:
     chamber_degC: float
     start_ns: int
     end_ns: int
-    state: StandState
+    state: StandTemperatures
 
 
-def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[StandState]:
+def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[StandTemperatures]:
     """The thermometers at each instant; NaN where one was BAD or silent for more than two minutes.
 
     SessionError when the session has no such thermometer.
     """
     columns = [interpolated(*session.readings(f"thermometers.{sensor}"), times_ns) for sensor in _SENSORS]
-    return [StandState(*map(float, row)) for row in np.stack(columns, axis=1)]
+    return [StandTemperatures(*map(float, row)) for row in np.stack(columns, axis=1)]
 
 
-def mean_state(states: Sequence[StandState]) -> StandState:
+def mean_state(states: Sequence[StandTemperatures]) -> StandTemperatures:
     """The mean of each thermometer over the states that know it; NaN when none does."""
     table = np.array([[getattr(state, f"{sensor}_degC") for sensor in _SENSORS] for state in states])
     known = np.isfinite(table)
     counts = np.maximum(known.sum(axis=0), 1)
     means = np.where(known.any(axis=0), np.where(known, table, 0.0).sum(axis=0) / counts, math.nan)
-    return StandState(*map(float, means))
+    return StandTemperatures(*map(float, means))
 
 
 def capture_states(session: Session) -> list[CaptureState]:

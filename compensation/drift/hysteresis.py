@@ -26,7 +26,7 @@ _CYCLE = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gap:
+class BranchDifference:
     """Heating minus cooling branch at one set-point: difference_px and its standard uncertainty, each (I, J); rms_px:
     over the markers, of both coordinates' difference."""
 
@@ -44,7 +44,7 @@ class Hysteresis:
     deviation of visits of the same set-point from the same side, NaN when none was repeated."""
 
     session_id: str
-    gaps: tuple[Gap, ...]
+    gaps: tuple[BranchDifference, ...]
     range_px: Float
     closure_px: Float
     repeatability_px: Float
@@ -132,7 +132,7 @@ def _of_session(session_id: str, visits: list[_Visit]) -> Hysteresis:
     )
 
 
-def _gaps(visits: list[_Visit]) -> Iterator[Gap]:
+def _gaps(visits: list[_Visit]) -> Iterator[BranchDifference]:
     """By set-point, the mean of the visits from below minus that of the visits from above."""
     for chamber_degC in sorted({visit.chamber_degC for visit in visits}):
         sides = [
@@ -145,9 +145,9 @@ def _gaps(visits: list[_Visit]) -> Iterator[Gap]:
             yield _gap(chamber_degC, up - down, np.asarray(variance))
 
 
-def _gap(chamber_degC: float, difference: Float, variance: Float) -> Gap:
+def _gap(chamber_degC: float, difference: Float, variance: Float) -> BranchDifference:
     seen: NDArray[np.bool_] = np.isfinite(difference[:, 0])
-    return Gap(
+    return BranchDifference(
         chamber_degC=chamber_degC,
         difference_px=difference[seen].mean(axis=0),
         uncertainty_px=np.sqrt(variance[seen].sum(axis=0)) / max(int(seen.sum()), 1),

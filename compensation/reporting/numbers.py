@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from compensation.budget.budget import Budget
 from compensation.drift.candidates import Candidate
 from compensation.drift.evaluation import TemperatureRms
-from compensation.drift.hysteresis import Gap
+from compensation.drift.hysteresis import BranchDifference
 from compensation.observations import Float
 from compensation.reporting.table_positions import TablePositions
 
@@ -104,7 +104,7 @@ class HysteresisNumbers:
     area_px_K: Float
     closure_px: Float
     repeatability_px: Float
-    gaps: tuple[Gap, ...]
+    gaps: tuple[BranchDifference, ...]
 
 
 @dataclass(frozen=True, slots=True)

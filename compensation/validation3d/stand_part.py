@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensation.budget.correction import displacement_px, varied
-from compensation.budget.geometry import Geometry, Quantity, StandState
+from compensation.budget.geometry import Geometry, Quantity, StandTemperatures
 from compensation.budget.session_temperatures import mean_state, states_at
 from compensation.observations import Float, Observations
 from compensation.validation3d.validation_frames import ValidationFrames
@@ -59,8 +59,8 @@ def stand_part(
     return StandPart(here[0], excess[0], here[1:] - here[0], excess[1:] - excess[0])
 
 
-def _check_known(session: Session, states: list[StandState]) -> None:
-    for name in StandState.__dataclass_fields__:
+def _check_known(session: Session, states: list[StandTemperatures]) -> None:
+    for name in StandTemperatures.__dataclass_fields__:
         if not all(math.isfinite(getattr(state, name)) for state in states):
             silent = name.removesuffix("_degC")
             raise SessionError(
@@ -73,7 +73,9 @@ def _moved(geometry: Geometry, distance_mm: float) -> Quantity:
     return Quantity(value=distance_mm, u=geometry.distance_mm.u)
 
 
-def _displacements_px(state: StandState, reference: StandState, geometry: Geometry, centres_px: Float) -> Float:
+def _displacements_px(
+    state: StandTemperatures, reference: StandTemperatures, geometry: Geometry, centres_px: Float
+) -> Float:
     """(1 + V, N, 2): nominal, and with each uncertain input larger in turn."""
     inputs = [(state, geometry), *varied(state, geometry)]
     return np.array([displacement_px(each, reference, stand, centres_px) for each, stand in inputs])

@@ -44,14 +44,14 @@ _AFTER_OPENING = re.compile(_CHUNK_HEAD, re.DOTALL)
 _HEAD_BYTES = 64  # more than any of the patterns looks at
 
 
-class ChunkPlace(NamedTuple):
+class SoundChunk(NamedTuple):
     """Where the content of a sound chunk is."""
 
     offset: int
     length: int
 
 
-class Gap(NamedTuple):
+class UnprovenBytes(NamedTuple):
     """Bytes [begin, end) that prove nothing."""
 
     begin: int
@@ -83,9 +83,9 @@ class Survey:
     attachments: dict[str, Attachment] = field(default_factory=dict[str, Attachment])
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
-    chunks: list[ChunkPlace] = field(default_factory=list[ChunkPlace])
+    chunks: list[SoundChunk] = field(default_factory=list[SoundChunk])
     messages: Counter[int] = field(default_factory=Counter[int])
-    damages: list[Gap] = field(default_factory=list[Gap])
+    damages: list[UnprovenBytes] = field(default_factory=list[UnprovenBytes])
     torn_bytes: int = 0
     is_opening_whole: bool = False
 
@@ -106,7 +106,7 @@ def survey(source: Source, to_first_chunk: bool = False, report: Callable[[int],
     return walk.found
 
 
-def stored_messages(source: Source, place: ChunkPlace) -> Iterator[StoredMessage]:
+def stored_messages(source: Source, place: SoundChunk) -> Iterator[StoredMessage]:
     """The messages of a sound chunk in their order; OSError when the disk does not give the same bytes again."""
     try:
         _, content = chunk_content(memoryview(source.read(*place)))
@@ -144,7 +144,7 @@ class _Walk:
             record = self._record_at(offset)
             if record is None:
                 record = self._next_record(offset)
-                self._note_gap(Gap(offset, record.begin if record else self._source.size))
+                self._note_gap(UnprovenBytes(offset, record.begin if record else self._source.size))
                 if record is None:
                     break
             self._take(record)
@@ -195,7 +195,7 @@ class _Walk:
                     yield window + match.start()
             window += WINDOW_BYTES
 
-    def _note_gap(self, gap: Gap) -> None:
+    def _note_gap(self, gap: UnprovenBytes) -> None:
         if gap.begin == self._index_begin and gap.end == self._source.size:
             return
         if gap.end == self._source.size and self._blocks.is_torn(self._source, gap.begin):
@@ -215,7 +215,7 @@ class _Walk:
                 found.channels.update({channel.id: channel for channel in channels})
                 found.messages.update(messages)
                 self._blocks.note(record.begin, record.end, messages)
-                found.chunks.append(ChunkPlace(record.begin + RECORD.size, record.end - record.begin - RECORD.size))
+                found.chunks.append(SoundChunk(record.begin + RECORD.size, record.end - record.begin - RECORD.size))
             case Metadata(name=name, metadata=entries) if name == SESSION_METADATA:
                 if found.chunks and not found.is_opening_whole:
                     self._forget_attached()

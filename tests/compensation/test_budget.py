@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from compensation import cli
 from compensation.budget.budget import Budget, budget
 from compensation.budget.correction import displacement_px, granite_mm, post_mm, varied
-from compensation.budget.geometry import Geometry, StandState, load_geometry
+from compensation.budget.geometry import Geometry, StandTemperatures, load_geometry
 from compensation.budget.repeatability import home_residuals
 from compensation.budget.session_temperatures import mean_state
 from drivers.sim.physics import optics
@@ -34,7 +34,7 @@ from .rendered import Scene, photograph, render
 
 PAPER = load_geometry("paper")
 TARGET = load_target(packaged("targets", "paper-9x6"))
-COOL = StandState(24.0, 24.0, 24.0, 24.0, 24.0)
+COOL = StandTemperatures(24.0, 24.0, 24.0, 24.0, 24.0)
 CENTRE_px = np.array([1223.5, 1023.5])
 CORNER_px = np.array([2447.0, 2047.0])
 
@@ -95,7 +95,9 @@ def test_the_correction_takes_out_what_the_simulated_stand_does():
     assert (np.abs(left) < 2 * sigma_px(state, COOL, geometry, after) + 1e-4).all()
 
 
-def sigma_px(state: StandState, reference: StandState, geometry: Geometry, xy_px: np.ndarray) -> np.ndarray:
+def sigma_px(
+    state: StandTemperatures, reference: StandTemperatures, geometry: Geometry, xy_px: np.ndarray
+) -> np.ndarray:
     """Of the displacement: every uncertain input larger in turn, as a validation does."""
     nominal = displacement_px(state, reference, geometry, xy_px)
     moved = [displacement_px(each, reference, other, xy_px) - nominal for each, other in varied(state, geometry)]
@@ -155,7 +157,7 @@ def test_home_checks_are_read_from_the_recorded_events():
     assert rotary.rms == pytest.approx(0.005)
 
 
-WARM = StandState(50.0, 27.0, 25.0, 52.0, 24.5)
+WARM = StandTemperatures(50.0, 27.0, 25.0, 52.0, 24.5)
 CAPTURES = (
     ("reference", COOL),
     ("pose", COOL),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from compensation.budget.budget import Budget, Contribution
-from compensation.budget.geometry import StandState
+from compensation.budget.geometry import StandTemperatures
 from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
@@ -35,7 +35,7 @@ from .test_apply import thermal
 
 Analysed = tuple[Observations, PaperModel, Evaluation]
 BUDGET = Budget(
-    reference=StandState(24.01, 24.02, 24.03, 24.04, 24.05),
+    reference=StandTemperatures(24.01, 24.02, 24.03, 24.04, 24.05),
     air_degC=(10.5, 51.5),
     contributions=(
         Contribution("granite along the axis", 25.17, 4.05, -0.04861, 0.00782, "the frame's corner", True),

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compensation.drift.hysteresis import Gap
+from compensation.drift.hysteresis import BranchDifference
 from compensation.observations import Float, Observations
 from compensation.reporting.drawing.figures import (
     CAMERA_COLOUR,
@@ -151,7 +151,7 @@ def _bands(
             shown = None
 
 
-def branches(visits: Sequence[Visit], before: Sequence[Gap], after: Sequence[Gap]) -> Figure:
+def branches(visits: Sequence[Visit], before: Sequence[BranchDifference], after: Sequence[BranchDifference]) -> Figure:
     """Mean drift at each set-point on the way up and down, and below it the gap between the two, before and after."""
     has_gaps = len(before) > 0
     with style():
@@ -182,7 +182,7 @@ def _branch(axes: Axes, visits: Sequence[Visit], index: int, name: str, colour: 
     legend_above(axes)
 
 
-def _gaps(axes: Axes, gaps: Sequence[Gap], index: int, colour: str, *, after: bool) -> None:
+def _gaps(axes: Axes, gaps: Sequence[BranchDifference], index: int, colour: str, *, after: bool) -> None:
     axes.errorbar(
         [gap.chamber_degC for gap in gaps],
         [1e3 * float(gap.difference_px[index]) for gap in gaps],

@@ -14,7 +14,7 @@ from typing import Protocol
 from drivers.sim.units.modbus import Timeline
 from foundation.clock import NS_PER_S, Now
 
-BAND_K = 3.0
+PROPORTIONAL_BAND_K = 3.0
 
 
 class Chamber(Timeline, Protocol):
@@ -98,7 +98,9 @@ class FakeClimateChamber:
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         if self._stops_ns is not None and time_ns >= self._stops_ns:
             self.running, self._stops_ns = False, None
-        share = (self.setpoint_degC - self.actual_degC) / BAND_K if self.running and not self.alarm else 0.0
+        share = (
+            (self.setpoint_degC - self.actual_degC) / PROPORTIONAL_BAND_K if self.running and not self.alarm else 0.0
+        )
         if self.is_alone:
             self._plant.heater_enabled = True
         self._plant.heater_on_fraction = min(1.0, max(0.0, share))

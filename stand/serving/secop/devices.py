@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from pydantic import JsonValue
 
+from stand.estimating.chamber_model import BAND_K
 from stand.serving.desk import DeviceState, ReadingState, RunRequest, RunStatus, StandState
 from stand.serving.secop import datainfo
 from stand.serving.secop.modules import (
@@ -29,7 +30,6 @@ from stand.serving.secop.modules import (
 )
 from stand.serving.secop.secop_lines import Refusal
 
-BAND_K = 0.5  # so close to its set-point the chamber has arrived
 CHAMBER, RUN = "chamber", "run"
 _CLOSED, _OPEN, _MOVING = 0, 1, 2
 _PHASES = {"idle": 0, "running": 1, "held": 2, "stopping": 3}
