@@ -249,8 +249,8 @@ def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: ND
     width, height = found.size_px[first].tolist()
     columns = (found.size_px.tolist(), found.reason.tolist(), camera_degC.tolist(), superseded.tolist())
     reasons: list[str] = []
-    for size_px, reason, degC, begun_anew in zip(*columns, strict=True):
-        if begun_anew:
+    for size_px, reason, degC, is_restarted in zip(*columns, strict=True):
+        if is_restarted:
             reason = "its capture was restarted"
         elif size_px != [width, height]:
             reason = f"the image has {size_px[0]} x {size_px[1]} pixels, the session's {width} x {height}"

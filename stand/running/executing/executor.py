@@ -237,7 +237,7 @@ class Executor:
             case Aim(capture):
                 await self._aim(capture)
             case TakeAgain(planned, why, frames_lost):
-                await self._begin_anew((planned,), why, frames_lost)
+                await self._begin_again((planned,), why, frames_lost)
                 await self._log.write(Step(self._clock.now_ns(), planned.step_id, "started"))
             case TakeFrame():
                 await self._take(action)
@@ -261,11 +261,11 @@ class Executor:
             case StartCold(again):
                 if planned := self._state.step(self._state.under_way):
                     self._mark(planned, StepState.FAILED)
-                await self._begin_anew(again, "from a cold camera")
+                await self._begin_again(again, "from a cold camera")
             case _:
                 pass
 
-    async def _begin_anew(self, again: Plan, how: str, frames_lost: int = 0) -> None:
+    async def _begin_again(self, again: Plan, how: str, frames_lost: int = 0) -> None:
         """These steps count as neither begun nor done, and no frame of theirs so far: reported before it is journaled,
         so that no frame is ever left out unreported."""
         now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]

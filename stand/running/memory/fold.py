@@ -182,13 +182,13 @@ def _placed(state: RunState) -> RunState:
 
 def _begun(state: RunState, entry: Step) -> RunState:
     """A camera that the plan switches is seen from then on: what follows in the plan is made for that."""
-    is_anew = state.under_way != entry.step_id
+    is_first = state.under_way != entry.step_id
     state = replace(
         state,
         begun=state.begun.plus(entry.step_id),
         under_way=entry.step_id,
-        due_ns=None if is_anew else state.due_ns,
-        is_lost=state.is_lost and not is_anew,
+        due_ns=None if is_first else state.due_ns,
+        is_lost=state.is_lost and not is_first,
     )
     planned = state.step(entry.step_id)
     if planned is None or not isinstance(planned.step, PowerCamera):
