@@ -55,7 +55,7 @@ def check(
         path = packaged("", config)
         stand = load_config(path)
         if genicam is not None:
-            _rehearse(genicam, stand)
+            _rehearse(genicam, None if _is_installed(path) else stand)
             return
         texts = {"config.yaml": read_document(path), **register_texts(stand)}
         clock = WallClock()
@@ -75,7 +75,7 @@ def check(
             raise typer.Exit(FAILED)
 
 
-def _rehearse(file: Path, stand: StandConfig) -> None:
+def _rehearse(file: Path, stand: StandConfig | None) -> None:
     """What of a GenICam file would be used."""
     found = asyncio.run(rehearse(file, stand))
     lines = [found.camera or str(file), *(f"  {purpose:<14}{name or '-'}" for purpose, name in found.features.items())]

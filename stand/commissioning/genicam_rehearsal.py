@@ -16,6 +16,9 @@ from stand.simulator import Simulator, laboratory_of
 _NAME = "camera"
 
 
+_ANY = GigeSettings(address="127.0.0.1", exposure_s=0.01)  # some make no longer one without another setting
+
+
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
     """What came of it. camera: vendor and model by the file. features: {"exposure": "ExposureTimeAbs", ...}, what would
@@ -45,9 +48,9 @@ async def rehearse(file: Path, stand: StandConfig | None = None) -> Rehearsal:
 
 
 def _settings_of(stand: StandConfig | None) -> GigeSettings:
-    """Of the stand's first GigE camera, whatever its serial number; the usual ones when there is none."""
+    """Of the stand's first GigE camera, whatever its serial number; when there is none, such as each camera can."""
     cameras = () if stand is None else stand.cameras.values()
-    first = next((each for each in cameras if isinstance(each, GigeSettings)), GigeSettings(address="127.0.0.1"))
+    first = next((each for each in cameras if isinstance(each, GigeSettings)), _ANY)
     return first.model_copy(update={"serial_number": None})
 
 

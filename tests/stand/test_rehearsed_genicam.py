@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from foundation.errors import ConfigError
 from stand.commands.command_table import app
 from stand.commissioning.genicam_rehearsal import rehearse
+from stand.config.stand_config import load_config, packaged
 from tests.dialects import DIALECTS
 from tests.system.conftest import require_aravis
 
@@ -56,3 +57,17 @@ def test_the_command_says_it_and_its_status_whether_it_opened(tmp_path: Path, di
     if status:
         told = json.loads(CliRunner().invoke(app, ["check", "--genicam", str(file), "--json"]).stdout)
         assert "ExposureTime" in told["refusal"]
+
+
+async def test_the_exposure_of_ones_own_stand_is_tried_and_without_one_such_as_each_camera_makes(tmp_path: Path):
+    """The installed file's exposure is nobody's: a camera with a shorter longest one is not refused for it."""
+    require_aravis()
+    file = tmp_path / "short.xml"
+    text = DIALECTS["abs"].xml("abs").decode()
+    begin = text.index('<Float Name="ExposureTimeAbs">')
+    end = text.index("</FloatReg>", begin) + len("</FloatReg>")
+    words = text[begin:end].replace("FloatReg", "IntReg").replace("Float", "Integer").replace("<Length>8", "<Length>2")
+    file.write_text(text[:begin] + words + text[end:])  # 16 bits: no more than 65.535 ms
+    assert (await rehearse(file)).refusal == ""
+    refused = await rehearse(file, load_config(packaged("", "simulated")))
+    assert "exposure 0.1 s was asked for" in refused.refusal
