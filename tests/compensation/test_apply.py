@@ -289,7 +289,7 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
     refused(files["paper"], recorded.path, "--frames", "3", says="give FIRST:END")
     refused(files["paper"], recorded.path, "--camera-degC", "3", says="a session has temperatures of its own")
     refused(files["paper"], tmp_path / "photo.png", says="give the camera's temperature with --camera-degC")
-    refused(tmp_path / "none.json", "POINTS", status=1, says="none.json: cannot be read")
+    refused(tmp_path / "none.json", "POINTS", status=1, says="none.json: no such file")
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((40, 50), np.uint8))
     refused(
         files["paper"],
