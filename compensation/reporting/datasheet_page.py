@@ -14,7 +14,7 @@ from compensation.datasheet.quantity import COVERAGE, Quantity
 from compensation.reporting.drawing import datasheet_figures as figures
 from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.equipment import Line, stated
-from compensation.reporting.numbers import measured, percent
+from compensation.reporting.numbers import measured, percent, significant
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 
 FORMAT = "thermostand datasheet 1"
@@ -202,6 +202,7 @@ def _budget(one: Quantity) -> Iterator[tuple[str, ...]]:
         share = percent(100 * line.amount**2 / whole) if whole > 0 else "–"
         source = f"{line.source} ({line.basis})"
         ratio = one.unit if line.unit == "1" else f"{one.unit} per {line.unit}"
-        sensitivity = "1" if line.sensitivity == 1 else f"{line.sensitivity:.3g} {ratio}"
-        yield (source, line.kind, f"{line.u:.2g} {line.unit}", sensitivity, f"{line.amount:.2g} {one.unit}", share)
-    yield ("combined standard uncertainty", "", "", "", f"{one.u:.2g} {one.unit}", "")
+        sensitivity = "1" if line.sensitivity == 1 else f"{significant(line.sensitivity, 3)} {ratio}"
+        input_u, amount = f"{significant(line.u, 2)} {line.unit}", f"{significant(line.amount, 2)} {one.unit}"
+        yield (source, line.kind, input_u, sensitivity, amount, share)
+    yield ("combined standard uncertainty", "", "", "", f"{significant(one.u, 2)} {one.unit}", "")

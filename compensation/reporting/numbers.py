@@ -213,6 +213,15 @@ def measured(value: float, expanded: float) -> tuple[str, str]:
     return f"{round(value, digits):z.{places}f}".replace("-", "−"), f"{round(expanded, digits):.{places}f}"
 
 
+def significant(value: float, digits: int) -> str:
+    """Rounded to so many digits, in decimals: 0.000081 and 1400, where a format would say 8.1e-05 and 1.4e+03."""
+    if not math.isfinite(value):
+        return f"{value:g}"
+    rounded, exponent = f"{value:.{digits - 1}e}".split("e")
+    places = max(digits - 1 - int(exponent), 0)
+    return f"{float(f'{rounded}e{exponent}'):.{places}f}".replace("-", "−")
+
+
 def compact(value: float, u: float) -> str:
     """As 0.0611(81): the digits in brackets are the standard uncertainty of the last ones."""
     if not u > 0 or not math.isfinite(value):

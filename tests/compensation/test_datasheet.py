@@ -20,7 +20,7 @@ from compensation.drift.choosing import fit
 from compensation.drift.paper_fit import fit_paper
 from compensation.observations import Observations
 from compensation.reporting.datasheet_page import datasheet_json, datasheet_page
-from compensation.reporting.numbers import compact, measured, percent
+from compensation.reporting.numbers import compact, measured, percent, significant
 from compensation.reporting.pdf import pdf_of
 from foundation.errors import ConfigError
 
@@ -239,3 +239,18 @@ def test_the_command_writes_what_the_name_says(recorded: Recorded, tmp_path: Pat
 
 def test_the_noise_of_the_markers_is_small_beside_the_rest(sheet: Datasheet):
     assert NOISE_PX / math.sqrt(54) < sheet.by_key["warm_up_shift_J"].u
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (8.12e-5, 2, "0.000081"),
+        (1400.2, 3, "1400"),
+        (-2981.0, 3, "−2980"),
+        (0.0996, 2, "0.10"),
+        (9.96, 2, "10"),
+        (0.0, 2, "0.0"),
+    ],
+)
+def test_a_number_of_a_budget_has_its_digits_and_no_exponent(value: float, digits: int, text: str):
+    assert significant(value, digits) == text
