@@ -335,7 +335,7 @@ def test_figures_are_numbered_and_those_with_a_line_of_equality_have_equal_axes(
 
 
 def test_it_has_layouts_for_paper_phones_and_dark_screens_and_says_what_nobody_stated(page: str):
-    for rule in ("prefers-color-scheme: dark", "max-width: 40rem", "@media print"):
+    for rule in ("prefers-color-scheme: dark", "max-width: 40rem", "@media print", "white-space: pre-wrap"):
         assert rule in page
     assert "<td>Lens</td><td>not stated</td>" in page
 
