@@ -177,7 +177,8 @@ def test_the_documentation_s_example_compiles_and_prints_what_python_says(tmp_pa
     program = tmp_path / "example"
     subprocess.run([COMPILER, *STRICT, tmp_path / "example.c", "-o", program, "-lm"], check=True)
     printed = subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()
-    _, corrected, flags = followed(thermal(), np.tile([10.0, 24.0, 1.0, 44.0], (2000, 1)), np.array([[320.5, 200.25]]))
+    point_px = np.array([[1320.5, 1000.25]])
+    _, corrected, flags = followed(thermal(), np.tile([10.0, 24.0, 1.0, 44.0], (2000, 1)), point_px)
     assert [float(word) for word in printed[:2]] == pytest.approx(corrected[-1, 0], abs=1e-6)
     assert printed[2] == ("extrapolated" if flags[-1, 0] else "calibrated")
 
