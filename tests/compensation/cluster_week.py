@@ -23,14 +23,15 @@ KILLED_IN = CAMERAS // 2
 
 
 class Counted(Piece):
-    """Leaves a file in the folder `received` of its session each time a worker receives it."""
+    """Leaves a file in the folder `received` of its session each time a process receives it: a worker, and before it
+    the scheduler, which is in this process."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return received, tuple(getattr(self, field.name) for field in fields(Piece))
 
 
 def received(*values: Any) -> Piece:
-    piece = Piece(*values)
+    piece = Counted(*values)
     _received(piece).mkdir(exist_ok=True)
     (_received(piece) / f"{os.getpid()}-{time.monotonic_ns()}").touch()
     return piece
@@ -38,6 +39,10 @@ def received(*values: Any) -> Piece:
 
 def _received(piece: Piece) -> Path:
     return piece.segment.parent.parent / "received"
+
+
+def _by_workers(piece: Piece) -> int:
+    return sum(not path.name.startswith(f"{os.getpid()}-") for path in _received(piece).iterdir())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +76,7 @@ def week(sessions: Iterable[Session], per_piece: int) -> Week:
                     workers[0].kill()
             found.append(joined(parts))
             if camera == KILLED_IN:
-                twice = len(list(_received(pieces[0]).iterdir())) - len(pieces)
+                twice = _by_workers(pieces[0]) - len(pieces)
                 continue
             memory_MB.append(max(worker.memory_info().rss for worker in workers) / 1e6)
             used_s += _used_s(workers) - begin_s

@@ -32,5 +32,5 @@ def test_ten_cameras_give_the_same_bits_in_flat_memory_and_a_killed_worker_costs
     for found in made.found:
         for field in fields(FoundMarkers):
             np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name), field.name)
-    assert made.twice <= 2
+    assert 0 <= made.twice <= 2
     assert made.memory_MB[-1] < 1.1 * made.memory_MB[0]
