@@ -14,6 +14,7 @@ from stand.config.stand_config import packaged
 from stand.estimating.estimate import price
 from stand.estimating.run_estimate import small_disk
 from stand.running.order import load_order
+from tests import forked
 from tests.addresses import move_to_free
 
 runner = CliRunner()
@@ -129,12 +130,11 @@ def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(data))
     # In a process of its own: asyncio.run and signal handlers belong to a main thread.
-    result = subprocess.run(
+    result = forked.run(
         [sys.executable, "-m", "stand.cli", "run", "demo", "--config", str(config), "--out", str(tmp_path / "out")],
         capture_output=True,
         text=True,
         env={**os.environ, "COLUMNS": "200"},
-        check=False,
     )
     assert result.returncode == 1
     assert "unplugged" in result.stderr
