@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 # More BLAS threads do not speed up matrices this small; they only take the other core from the simulator.
 export OPENBLAS_NUM_THREADS := 1
+# Memory of images that is given back is kept for the next: the kernel would clear each page of it again.
+export MALLOC_MMAP_THRESHOLD_ := 1073741824
+export MALLOC_TRIM_THRESHOLD_ := 1073741824
 # Tests start some hundred programs: each would compile the sources again where keeping bytecode is switched off.
 export PYTHONDONTWRITEBYTECODE :=
 BIN := $(VENV)/bin
