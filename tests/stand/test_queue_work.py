@@ -3,7 +3,6 @@
 import asyncio
 import fcntl
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from stand.queueing.queue_file import Entry, working
 from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped, work
 from stand.running.opening.stop import Interrupted
 from stand.running.order import load_order
+from tests import forked
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -182,28 +182,10 @@ async def test_a_second_worker_is_refused(tmp_path: Path):
         await runs.work()
 
 
-KILLED = """
-import asyncio, os, signal, sys
-from pathlib import Path
-from foundation.clock import WallClock
-from stand.queueing.queue_work import work
-
-async def run(entry, notes):
-    await notes.begun(Path(sys.argv[1]) / "night")
-    for _ in range(int(sys.argv[2])):
-        notes.step_done()
-    await asyncio.sleep(0)
-    await notes.begun(Path(sys.argv[1]) / "night")  # written after the steps, and on the disk now
-    os.kill(os.getpid(), signal.SIGKILL)
-
-asyncio.run(work(Path(sys.argv[1]), run, WallClock(), print))
-"""
-
-
 def worker_killed(directory: Path, steps_done: int) -> None:
     """A process that works the queue is killed when its run has finished so many steps."""
-    command = [sys.executable, "-c", KILLED, str(directory), str(steps_done)]
-    assert subprocess.run(command, check=False, timeout=60).returncode == -signal.SIGKILL
+    command = [sys.executable, "-m", "tests.stand.killed_queue", str(directory), str(steps_done)]
+    assert forked.run(command, timeout=60).returncode == -signal.SIGKILL
 
 
 async def test_a_run_whose_daemon_dies_three_times_before_another_step_is_set_aside(tmp_path: Path):

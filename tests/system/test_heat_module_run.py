@@ -13,6 +13,7 @@ import yaml
 from foundation.errors import DeviceFault
 from stand.config.stand_config import load_config, packaged
 from stand.simulator import ControlSocket, Simulator, laboratory_of
+from tests import forked
 from tests.system.virtual_stand import VirtualStand, virtual_stand
 
 LIMIT_S = 60.0  # real
@@ -106,7 +107,7 @@ async def test_a_process_that_is_killed_leaves_the_module_at_its_safe_value_afte
     path.write_text(yaml.safe_dump(data))
     (tmp_path / "recipe.yaml").write_text(RECIPE)
     run = ["run", tmp_path / "recipe.yaml", "--config", path, "--out", tmp_path / "out"]
-    process = subprocess.Popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
+    process = forked.popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
     try:
         async with asyncio.timeout(LIMIT_S):
             while await plant("heater_W") == 0:
