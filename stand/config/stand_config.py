@@ -291,8 +291,9 @@ class StandConfig(Document):
     @property
     def witnesses(self) -> list[str]:
         """The thermometers that show when the regulator's probe and the air's are wrong alike."""
-        software = isinstance(self.regulator, SoftwareRegulatorSettings)
-        return witnesses(self.thermometers, self.regulator.thermometer if software else "")
+        regulator = self.regulator
+        controlling = regulator.thermometer if isinstance(regulator, SoftwareRegulatorSettings) else ""
+        return witnesses(self.thermometers, controlling)
 
     @property
     def set_points_degC(self) -> tuple[float, float]:
