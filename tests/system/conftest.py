@@ -82,7 +82,8 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
     frame, polled = (CORNER, getattr(request.module, "POLLED", CALM)) if by_day else (WHOLE_SENSOR, AS_INSTALLED)
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
-        data: Any = move_to_free(yaml_data(packaged("", "simulated").read_text(), "simulated"), tmp_path)
+        installed: Any = yaml_data(packaged("", "simulated").read_text(), "simulated")
+        data = move_to_free(installed, tmp_path)
         if wire == "serial":
             data["bus"]["address"] = f"serial:{tmp_path / 'bus'}"
         data["cameras"]["camera"] |= frame
